@@ -1,0 +1,191 @@
+"""The Gymnasium face: what all environments share, the adapter for a dm_control environment, and the registration."""
+
+from typing import TYPE_CHECKING, Any, ClassVar, SupportsIndex
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+
+from combrel_envs.mountain_car_dynamics import MAX_EPISODE_STEPS
+
+if TYPE_CHECKING:
+    from dm_control import mujoco
+    from dm_control.rl import control
+
+# Gymnasium's checker of every single call costs more than the dynamics of Mountain Car; the tests run `check_env` instead.
+_SPECS: tuple[dict[str, Any], ...] = (
+    {
+        "id": "combrel/MountainCar2D-v0",
+        "entry_point": "combrel_envs.mountain_car_gym:MountainCar2DEnv",
+        "max_episode_steps": MAX_EPISODE_STEPS,
+        "disable_env_checker": True,
+    },
+    {
+        "id": "combrel/MountainCar4D-v0",
+        "entry_point": "combrel_envs.mountain_car_gym:MountainCar4DEnv",
+        "max_episode_steps": MAX_EPISODE_STEPS,
+        "disable_env_checker": True,
+    },
+)
+
+
+def register_envs() -> None:
+    """Register the environments with Gymnasium; a second call changes nothing."""
+    for spec in _SPECS:
+        if spec["id"] not in gymnasium.registry:
+            gymnasium.register(**spec)
+
+
+class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
+    """
+    An environment with flat float32 observations and discrete actions, drawn by MuJoCo.
+
+    :param render_mode: ``"rgb_array"`` or None
+    :param width: width of a frame in pixels
+    :param height: height of a frame in pixels
+    :param camera: name of one of ``cameras``; the first of them if None
+    :raises ValueError: when an argument isn't one of these
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 - as Gymnasium declares it
+    cameras: ClassVar[tuple[str, ...]] = ()
+    #: Names of the observation's entries and of the actions, in their order.
+    state_names: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
+    observation_space: spaces.Box
+    action_space: spaces.Discrete
+
+    def __init__(self, render_mode: str | None = None, width: int = 640, height: int = 480, camera: str | None = None) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        for name, value in (("width", width), ("height", height)):
+            if not (isinstance(value, int | np.integer) and value > 0):
+                raise ValueError(f"{name} must be a positive number of pixels, got {value!r}")
+        if camera is not None and camera not in self.cameras:
+            raise ValueError(f"camera must be one of {', '.join(map(repr, self.cameras))}, got {camera!r}")
+        self.render_mode = render_mode
+        self._width, self._height = width, height
+        self._camera: str | int = camera or (self.cameras[0] if self.cameras else -1)
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """
+        :return: the present state as an array of shape (height, width, 3), uint8; None without a render mode
+        :raises RenderingError: when OpenGL is missing; the message says what to install
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() needs a render mode, for instance gymnasium.make(..., render_mode='rgb_array')")
+            return None
+        physics = self._drawn_physics()
+        # MuJoCo fixes the largest frame when it draws the first one.
+        limits = physics.model.vis.global_
+        limits.offwidth, limits.offheight = max(limits.offwidth, self._width), max(limits.offheight, self._height)
+        return physics.render(height=self._height, width=self._width, camera_id=self._camera)
+
+    def _drawn_physics(self) -> "mujoco.Physics":
+        """The physics, in the state that is to be drawn."""
+        raise NotImplementedError
+
+
+class DmControlEnv(RenderedEnv):
+    """
+    A dm_control environment as a Gymnasium environment.
+
+    The observations, in the order of the environment's specification, become one flat float32 vector. The episode terminates
+    when the task gives a discount of 0 and is truncated at the environment's time limit; a task that ends on the very last
+    step is terminated. ``info["is_success"]`` says whether the task was solved.
+
+    :param environment: the environment; its actions must be discrete
+    :param low: least value of each entry of the observation; None takes the specification's
+    :param high: greatest value of each entry of the observation; None takes the specification's
+    :param render_mode: ``"rgb_array"`` or None
+    :param width: width of a frame in pixels
+    :param height: height of a frame in pixels
+    :param camera: name of one of ``cameras``; the first of them if None
+    :raises ValueError: when the actions aren't discrete or an argument isn't one of these
+    """
+
+    def __init__(
+        self,
+        environment: "control.Environment",
+        low: np.ndarray | None = None,
+        high: np.ndarray | None = None,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        camera: str | None = None,
+    ) -> None:
+        super().__init__(render_mode, width, height, camera)
+        self._environment = environment
+        self._running = self._closed = False
+        observations = environment.observation_spec().values()
+        low = _bounds(observations, "minimum", -np.inf) if low is None else np.asarray(low, np.float32)
+        high = _bounds(observations, "maximum", np.inf) if high is None else np.asarray(high, np.float32)
+        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+        n_actions = getattr(environment.action_spec(), "num_values", None)
+        if n_actions is None:
+            raise ValueError(f"environment must have discrete actions, got {environment.action_spec()!r}")
+        self.action_space = spaces.Discrete(n_actions)
+
+    @property
+    def environment(self) -> "control.Environment":
+        """The dm_control environment."""
+        return self._environment
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param seed: seed of the episodes to come; None goes on with the present random state
+        :param options: see :meth:`_apply_options`
+        :return: the first observation, and an empty dictionary
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self._environment.task.random.seed(int(self.np_random.integers(2**32)))
+        self._apply_options(options or {})
+        self._running = True
+        return self._flatten(self._environment.reset().observation), {}
+
+    def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
+        """
+        :param action: number of an action
+        :return: observation, reward, terminated, truncated and info
+        """
+        # dm_control would silently begin a new episode.
+        if not self._running:
+            raise ResetNeeded("call reset() before the first step and after the end of each episode")
+        time_step = self._environment.step(action)
+        self._running = not time_step.last()
+        # On the last step of the time limit dm_control doesn't ask the task whether it has ended.
+        terminated = bool(time_step.last() and self._environment.task.get_termination(self._environment.physics) == 0.0)
+        info = {"is_success": self._is_success(terminated)}
+        observation = self._flatten(time_step.observation)
+        return observation, float(time_step.reward), terminated, time_step.last() and not terminated, info
+
+    def close(self) -> None:
+        """Free MuJoCo's memory and the OpenGL context; the environment can't be used afterwards."""
+        self._running = False
+        if not self._closed:
+            self._closed = True
+            self._environment.close()
+            self._environment.physics.free()
+
+    def _drawn_physics(self) -> "mujoco.Physics":
+        return self._environment.physics
+
+    def _apply_options(self, options: dict[str, Any]) -> None:
+        """Prepare the task for the options of a reset; an environment that has some overrides this."""
+        if options:
+            raise ValueError(f"options of reset must be empty, got {options!r}")
+
+    def _is_success(self, terminated: bool) -> bool:
+        """Whether the task is solved now; an environment that can terminate without success overrides this."""
+        return terminated
+
+    def _flatten(self, observation: Any) -> np.ndarray:
+        values = np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)
+        return np.clip(values, self.observation_space.low, self.observation_space.high)
+
+
+def _bounds(specs: Any, side: str, otherwise: float) -> np.ndarray:
+    parts = [np.broadcast_to(getattr(spec, side, otherwise), spec.shape).ravel() for spec in specs]
+    return np.concatenate(parts).astype(np.float32)

@@ -1,0 +1,167 @@
+"""Mountain Car as a dm_control domain: an underpowered car that must first drive away from its goal.
+
+``climb_2d`` is the car in a valley between two hills (Singh and Sutton 1996), ``climb_4d`` the car on a surface with hills
+along two axes. One control step is one second of simulated time, so that the default time limit, 4000, is in steps too.
+The dynamics are those of :mod:`combrel_envs.mountain_car_dynamics`; MuJoCo holds the state and draws it.
+"""
+
+import collections
+from typing import Any
+
+import numpy as np
+
+from combrel_envs import mountain_car_dynamics as dynamics
+from combrel_envs import rendering
+
+rendering.import_dm_control()
+
+import dm_env  # noqa: E402
+import mujoco as mujoco_bindings  # noqa: E402
+from dm_control import mujoco  # noqa: E402
+from dm_control.rl import control  # noqa: E402
+from dm_control.suite import base  # noqa: E402
+from dm_control.utils import containers  # noqa: E402
+
+from combrel_envs import mountain_car_scene as scene  # noqa: E402
+
+_DEFAULT_TIME_LIMIT = dynamics.MAX_EPISODE_STEPS
+SUITE = containers.TaggedTasks()
+
+
+def get_model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
+    """Returns a tuple containing the model XML string and a dict of assets."""
+    return scene.model_and_assets(n_axes)
+
+
+@SUITE.add("benchmarking")
+def climb_2d(
+    time_limit: float = _DEFAULT_TIME_LIMIT,
+    random: np.random.RandomState | int | None = None,
+    start: str = "offset",
+    environment_kwargs: dict[str, Any] | None = None,
+) -> control.Environment:
+    """Returns the Mountain Car task with state (x, v): climb the right hill."""
+    return _climb(1, time_limit, random, start, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def climb_4d(
+    time_limit: float = _DEFAULT_TIME_LIMIT,
+    random: np.random.RandomState | int | None = None,
+    start: str = "offset",
+    environment_kwargs: dict[str, Any] | None = None,
+) -> control.Environment:
+    """Returns the Mountain Car task with state (x, y, vx, vy): climb the hill in the north-east corner."""
+    return _climb(2, time_limit, random, start, environment_kwargs)
+
+
+def _climb(
+    n_axes: int,
+    time_limit: float,
+    random: np.random.RandomState | int | None,
+    start: str,
+    environment_kwargs: dict[str, Any] | None,
+) -> control.Environment:
+    task = Climb(start=start, random=random)
+    return control.Environment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
+
+
+def make_physics(n_axes: int) -> "Physics":
+    """Returns the `Physics` of a car on one axis (2D) or on two (4D)."""
+    return Physics.from_xml_string(*get_model_and_assets(n_axes))
+
+
+class Physics(mujoco.Physics):
+    """The car's state in MuJoCo's joints, moved by the task's own equations instead of MuJoCo's."""
+
+    @property
+    def n_axes(self) -> int:
+        """Number of axes along which the car moves: 1 in 2D, 2 in 4D."""
+        return self.model.nq
+
+    def car_position(self) -> np.ndarray:
+        """Returns the car's position on each axis."""
+        return self.data.qpos.copy()
+
+    def car_velocity(self) -> np.ndarray:
+        """Returns the car's velocity on each axis."""
+        return self.data.qvel.copy()
+
+    def push(self) -> np.ndarray:
+        """Returns what the engine does on each axis: -1, 0 or 1."""
+        return self.data.ctrl.copy()
+
+    def at_goal(self) -> bool:
+        """Returns whether the car is at the goal."""
+        return dynamics.at_goal(tuple(self.data.qpos.tolist()))
+
+    def set_car(self, positions: dynamics.Axes, velocities: dynamics.Axes) -> None:
+        """Sets the car's position and velocity on each axis. As always, a call of `forward` must follow."""
+        self.data.qpos[:] = positions
+        self.data.qvel[:] = velocities
+
+    def step(self, nstep: int = 1) -> None:
+        """Advances the car by `nstep` steps of its equations, with the control that was set last."""
+        state = tuple(self.data.qpos.tolist()), tuple(self.data.qvel.tolist())
+        pushes = tuple(self.data.ctrl.tolist())
+        for _ in range(nstep):
+            state = dynamics.step_car(*state, pushes)
+        self.set_car(*state)
+        self.data.time += nstep * self.timestep()
+        self.forward()
+
+    def forward(self) -> None:
+        """Puts the drawn car where the state says, and brings MuJoCo's derived quantities up to date."""
+        position, rotation = scene.car_pose(tuple(self.data.qpos.tolist()), tuple(self.data.qvel.tolist()))
+        self.data.mocap_pos[0] = position
+        mujoco_bindings.mju_mat2Quat(self.data.mocap_quat[0], rotation.ravel())
+        super().forward()
+
+    def render(self, *args: Any, **kwargs: Any) -> np.ndarray:
+        """Returns a camera view, see `mujoco.Physics.render`; raises `RenderingError` when there is no OpenGL."""
+        rendering.open_gl(self)
+        return super().render(*args, **kwargs)
+
+
+class Climb(base.Task):
+    """A Mountain Car `Task`: reach the goal. Each step costs 1, the last included."""
+
+    def __init__(self, start: str = "offset", random: np.random.RandomState | int | None = None):
+        """Initializes an instance of `Climb`.
+
+        Args:
+          start: Where an episode begins: "offset" (at rest at the bottom, moved by a random offset in [-0.005, 0.005], the
+            same on every axis), "fixed" (at rest at the bottom) or "random" (anywhere but at the goal, at any velocity).
+          random: Optional, either a `numpy.random.RandomState` instance, an integer seed for creating a new `RandomState`,
+            or None to select a seed automatically (default).
+        """
+        self._start = dynamics.check_start(start)
+        super().__init__(random=random)
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Puts the car where the start option says."""
+        physics.set_car(*dynamics.sample_start(self._start, physics.n_axes, self.random.uniform))
+        super().initialize_episode(physics)
+
+    def action_spec(self, physics: Physics) -> dm_env.specs.DiscreteArray:
+        """Returns the spec of the discrete action; `dynamics.ACTION_NAMES` says what each number does."""
+        return dm_env.specs.DiscreteArray(len(dynamics.PUSHES[physics.n_axes]), dtype=np.int64, name="action")
+
+    def before_step(self, action: Any, physics: Physics) -> None:
+        """Turns the action into a push of the engine."""
+        physics.set_control(dynamics.push_of(action, physics.n_axes))
+
+    def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
+        """Returns the state: the car's position and velocity."""
+        observation = collections.OrderedDict()
+        observation["position"] = physics.car_position()
+        observation["velocity"] = physics.car_velocity()
+        return observation
+
+    def get_reward(self, physics: Physics) -> float:
+        """Returns the cost of a step."""
+        return -1.0
+
+    def get_termination(self, physics: Physics) -> float | None:
+        """Returns a discount of 0 at the goal."""
+        return 0.0 if physics.at_goal() else None

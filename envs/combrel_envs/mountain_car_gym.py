@@ -1,0 +1,307 @@
+"""Mountain Car's Gymnasium face: the equations stepped directly, without MuJoCo, which is loaded for pictures only."""
+
+from typing import TYPE_CHECKING, Any, ClassVar, SupportsIndex
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+
+from combrel_envs import mountain_car_dynamics as dynamics
+from combrel_envs.gym_env import RenderedEnv
+
+if TYPE_CHECKING:
+    from combrel_envs.mountain_car import Physics
+
+
+class MountainCarEnv(RenderedEnv):
+    """
+    What the 2D and the 4D car share; see :class:`MountainCar2DEnv` and :class:`MountainCar4DEnv`.
+
+    :param start: where an episode begins: ``"offset"``, ``"fixed"`` or ``"random"``
+    :param render_mode: ``"rgb_array"`` or None
+    :param width: width of a frame in pixels
+    :param height: height of a frame in pixels
+    :param camera: name of one of ``cameras``; the first of them if None
+    :raises ValueError: when an argument isn't one of these
+    """
+
+    n_axes: ClassVar[int]
+
+    def __init__(
+        self,
+        start: str = "offset",
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        camera: str | None = None,
+    ) -> None:
+        super().__init__(render_mode, width, height, camera)
+        self._start = dynamics.check_start(start)
+        self._state: dynamics.State | None = None
+        self._physics: Physics | None = None
+        self._low, self._high = _bounds(self.n_axes)
+        self.observation_space = spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32))
+        self.action_space = spaces.Discrete(len(self.action_names))
+
+    @property
+    def state(self) -> np.ndarray:
+        """The present state in float64, in the order of ``state_names``; the observation is its rounding to float32."""
+        positions, velocities = self._running_state()
+        return np.array(positions + velocities)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        Begin an episode.
+
+        :param seed: seed of the starts to come; None goes on with the present generator
+        :param options: ``{"start": ...}`` overrides the environment's start option for this episode,
+            ``{"state": [...]}`` begins in exactly that state, in the order of ``state_names``
+        :return: the first observation, and an empty dictionary
+        :raises ValueError: when an option is unknown or its value isn't possible
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = sorted(set(options) - {"start", "state"}, key=str)
+        if unknown or len(options) > 1:
+            raise ValueError(f"options of reset must be either 'start' or 'state', got {options!r}")
+        if "state" in options:
+            self._state = self._checked_state(options["state"])
+        else:
+            start = dynamics.check_start(options.get("start", self._start))
+            self._state = dynamics.sample_start(start, self.n_axes, self.np_random.uniform)
+        return self._observation(self._state), {}
+
+    def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
+        """
+        Drive for one step.
+
+        :param action: number of an action
+        :return: observation, reward -1, whether the car is at the goal, False (the step limit is a wrapper's), and a
+            dictionary with ``is_success``
+        :raises ValueError: when there is no such action
+        """
+        state = dynamics.step_car(*self._running_state(), dynamics.push_of(action, self.n_axes))
+        self._state = state
+        terminated = dynamics.at_goal(state[0])
+        return self._observation(state), -1.0, terminated, False, {"is_success": terminated}
+
+    def close(self) -> None:
+        """Free MuJoCo's memory and the OpenGL context, if a picture was drawn."""
+        if self._physics is not None:
+            self._physics.free()
+            self._physics = None
+
+    def _running_state(self) -> dynamics.State:
+        if self._state is None:
+            raise ResetNeeded("call reset() before the first step")
+        return self._state
+
+    def _observation(self, state: dynamics.State) -> np.ndarray:
+        # Rounding to float32 is monotonic, so a state within the bounds stays within the space's rounded bounds.
+        return np.array(state[0] + state[1], dtype=np.float32)
+
+    def _checked_state(self, state: Any) -> dynamics.State:
+        names = f"({', '.join(self.state_names)})"
+        try:
+            values = np.asarray(state, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"options['state'] must be numbers {names}, got {state!r}") from error
+        if values.shape != self._low.shape:
+            raise ValueError(f"options['state'] must have the {len(self._low)} entries {names}, got {state!r}")
+        # Compared in float32: every observation can be given back as a state, though float32(0.6) is more than 0.6.
+        if not self.observation_space.contains(values.astype(np.float32)):
+            raise ValueError(
+                f"options['state'] must lie between {self._low.tolist()} and {self._high.tolist()}, got {state!r}"
+            )
+        entries = tuple(np.clip(values, self._low, self._high).tolist())
+        return entries[: self.n_axes], entries[self.n_axes :]
+
+    def _drawn_physics(self) -> "Physics":
+        if self._physics is None:
+            from combrel_envs.mountain_car import make_physics
+
+            self._physics = make_physics(self.n_axes)
+        self._physics.set_car(*self._running_state())
+        self._physics.forward()
+        return self._physics
+
+
+class MountainCar2DEnv(MountainCarEnv):
+    """
+    ## Description
+
+    A car stands in a valley. Its engine is weaker than gravity, so it can't just drive up the hill on the right: it must
+    first go left, away from the goal, and swing up. This is the task of Singh and Sutton, *Reinforcement Learning with
+    Replacing Eligibility Traces* (Machine Learning, 1996).
+
+    ```python
+    import gymnasium
+    import combrel_envs
+
+    env = gymnasium.make("combrel/MountainCar2D-v0")
+    ```
+
+    ## Observation Space
+
+    A `Box` of float32 with shape (2,); `env.unwrapped.state` is the same in float64.
+
+    | Num | Observation | Name | Min   | Max  |
+    |-----|-------------|------|-------|------|
+    | 0   | position    | x    | -1.2  | 0.6  |
+    | 1   | velocity    | v    | -0.07 | 0.07 |
+
+    ## Action Space
+
+    `Discrete(3)`.
+
+    | Num | Action  | Push |
+    |-----|---------|------|
+    | 0   | Neutral | 0    |
+    | 1   | Left    | -1   |
+    | 2   | Right   | +1   |
+
+    Gymnasium's own `MountainCar-v0` has another order: 0 is left, 1 is none, 2 is right.
+
+    ## Transition Dynamics
+
+    v' = v + 0.001 push - 0.0025 cos(3x), clipped to [-0.07, 0.07]
+
+    x' = x + v', clipped to [-1.2, 0.6]
+
+    At either wall a velocity that points into the wall becomes 0.
+
+    ## Rewards
+
+    -1 on every step, the last included.
+
+    ## Starting State
+
+    At rest at the bottom of the valley, x = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset. The
+    argument `start` changes this.
+
+    ## Episode End
+
+    - Termination: x >= 0.5.
+    - Truncation: after 4000 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
+      this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
+      truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
+
+    `info["is_success"]` says after every step whether the car is at the goal. From the bottom the goal can be reached in 103
+    steps.
+
+    ## Arguments
+
+    - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
+      goal, any velocity, uniformly).
+    - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
+    - `width`, `height`: size of the pictures, 640 x 480 by default.
+    - `camera`: `"side"` (the default) or `"close"`, which follows the car.
+
+    `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, v]}`, to begin in
+    exactly that state.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    n_axes = 1
+    state_names = dynamics.STATE_NAMES[1]
+    action_names = dynamics.ACTION_NAMES[1]
+    cameras = ("side", "close")
+
+
+class MountainCar4DEnv(MountainCarEnv):
+    """
+    ## Description
+
+    A car stands at the bottom of a basin with hills along two axes, of height sin(3x) + sin(3y). Its engine is weaker than
+    gravity and pushes along one axis at a time; the goal is the hill in the north-east corner. The two axes move
+    independently, each as in `combrel/MountainCar2D-v0`, but must be at the goal together.
+
+    ```python
+    import gymnasium
+    import combrel_envs
+
+    env = gymnasium.make("combrel/MountainCar4D-v0")
+    ```
+
+    ## Observation Space
+
+    A `Box` of float32 with shape (4,); `env.unwrapped.state` is the same in float64. Some other versions of this task order
+    it (x, vx, y, vy).
+
+    | Num | Observation             | Name | Min   | Max  |
+    |-----|-------------------------|------|-------|------|
+    | 0   | position, west to east  | x    | -1.2  | 0.6  |
+    | 1   | position, south to north| y    | -1.2  | 0.6  |
+    | 2   | velocity along x        | vx   | -0.07 | 0.07 |
+    | 3   | velocity along y        | vy   | -0.07 | 0.07 |
+
+    ## Action Space
+
+    `Discrete(5)`.
+
+    | Num | Action  | Push along x | Push along y |
+    |-----|---------|--------------|--------------|
+    | 0   | Neutral | 0            | 0            |
+    | 1   | West    | -1           | 0            |
+    | 2   | East    | +1           | 0            |
+    | 3   | South   | 0            | -1           |
+    | 4   | North   | 0            | +1           |
+
+    ## Transition Dynamics
+
+    For x, and in the same way for y; gravity acts on both on every step:
+
+    vx' = vx + 0.001 push - 0.0025 cos(3x), clipped to [-0.07, 0.07]
+
+    x' = x + vx', clipped to [-1.2, 0.6]
+
+    At a wall a velocity that points into the wall becomes 0.
+
+    ## Rewards
+
+    -1 on every step, the last included.
+
+    ## Starting State
+
+    At rest at the bottom of the basin, x = y = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset and
+    is the same for x and y. The argument `start` changes this.
+
+    ## Episode End
+
+    - Termination: x >= 0.5 and y >= 0.5.
+    - Truncation: after 4000 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
+      this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
+      truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
+
+    `info["is_success"]` says after every step whether the car is at the goal. From the bottom the goal can be reached in 146
+    steps, which the tests replay; whether fewer are possible isn't known.
+
+    ## Arguments
+
+    - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
+      goal, any velocities, uniformly).
+    - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
+    - `width`, `height`: size of the pictures, 640 x 480 by default.
+    - `camera`: `"perspective"` (the default), `"top"`, or `"close"`, which follows the car.
+
+    `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, y, vx, vy]}`, to begin
+    in exactly that state.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    n_axes = 2
+    state_names = dynamics.STATE_NAMES[2]
+    action_names = dynamics.ACTION_NAMES[2]
+    cameras = ("perspective", "top", "close")
+
+
+def _bounds(n_axes: int) -> tuple[np.ndarray, np.ndarray]:
+    low = [dynamics.MIN_POSITION] * n_axes + [-dynamics.MAX_SPEED] * n_axes
+    high = [dynamics.MAX_POSITION] * n_axes + [dynamics.MAX_SPEED] * n_axes
+    return np.array(low), np.array(high)

@@ -1,0 +1,228 @@
+"""What Mountain Car looks like: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
+
+The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale of the picture (the dynamics know no height).
+The meshes are made from these formulas when a scene is built, so the picture can't disagree with the task.
+"""
+
+import functools
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from combrel_envs import mountain_car_dynamics as dynamics
+
+#: Height of the picture's hills for each number of axes. One third in 2D is the true scale: gravity along the slope of
+#: sin(3x) / 3 is proportional to cos(3x).
+HEIGHT_SCALE = {1: 1 / 3, 2: 0.2}
+#: How far the ground goes on beyond the walls: half a car.
+MARGIN = 0.1
+LOW, HIGH = dynamics.MIN_POSITION - MARGIN, dynamics.MAX_POSITION + MARGIN
+STRIP_HALF_WIDTH = 0.13
+WHEELBASE, TRACK = 0.096, 0.062
+_WHEELS = np.array([(a * WHEELBASE / 2, b * TRACK / 2, 0.0) for a in (-1, 1) for b in (-1, 1)])
+
+_ASSETS = Path(__file__).parent / "assets"
+_GROUND_CELLS = 90
+_TEXTURE_SIZE = 1024
+
+_GRASS = np.array([[0.20, 0.42, 0.36], [0.36, 0.58, 0.38], [0.64, 0.71, 0.44], [0.80, 0.72, 0.52], [0.88, 0.84, 0.76]])
+_SOIL = np.array([[0.60, 0.48, 0.37], [0.42, 0.33, 0.27]])
+_TURF = np.array([0.36, 0.55, 0.33])
+_GOAL = np.array([0.90, 0.28, 0.10])
+_LINE = np.array([0.98, 0.98, 0.96])
+
+
+def height(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> np.ndarray:
+    """
+    :param x: position along x
+    :param y: position along y (in 2D across the strip, where the ground is level)
+    :param n_axes: number of axes, 1 or 2
+    :return: height of the ground in the picture, of the shape of ``x`` and ``y`` broadcast together
+    """
+    hills = np.sin(3 * np.asarray(x)) + (np.sin(3 * np.asarray(y)) if n_axes == 2 else 0 * np.asarray(y))
+    return HEIGHT_SCALE[n_axes] * hills
+
+
+def gradient(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param x: position along x
+    :param y: position along y
+    :param n_axes: number of axes, 1 or 2
+    :return: derivatives of :func:`height` with respect to x and to y
+    """
+    scale = 3 * HEIGHT_SCALE[n_axes]
+    along_y = np.cos(3 * np.asarray(y)) if n_axes == 2 else 0 * np.asarray(y)
+    return scale * np.cos(3 * np.asarray(x)), scale * along_y
+
+
+def model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
+    """
+    :param n_axes: number of axes, 1 or 2
+    :return: the MJCF model and the files that it asks for, as ``Physics.from_xml_string`` takes them
+    """
+    return (_ASSETS / f"mountain_car_{2 * n_axes}d.xml").read_bytes(), dict(_assets(n_axes))
+
+
+@functools.cache
+def _assets(n_axes: int) -> dict[str, bytes]:
+    return {
+        "mountain_car_common.xml": (_ASSETS / "mountain_car_common.xml").read_bytes(),
+        "ground.obj": _ground_mesh(n_axes),
+        "soil.obj": _soil_mesh(n_axes),
+        "ground.png": _png(_ground_texture(n_axes)),
+        "soil.png": _png(_soil_texture()),
+    }
+
+
+def car_pose(positions: dynamics.Axes, velocities: dynamics.Axes) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Where the car is drawn: wheels on the ground, roof along the ground's normal.
+
+    In 2D the nose points right, as the car can reverse; in 4D it points where the car is going (north-east at rest).
+
+    :param positions: position on each axis
+    :param velocities: velocity on each axis
+    :return: position, and rotation as a matrix whose columns are the car's nose, left side and roof
+    """
+    n_axes = len(positions)
+    x, y = (positions[0], 0.0) if n_axes == 1 else positions
+    slope_x, slope_y = (3 * HEIGHT_SCALE[n_axes] * math.cos(3 * axis) if i < n_axes else 0.0 for i, axis in enumerate((x, y)))
+    east, north = (1.0, 0.0) if n_axes == 1 else _heading(velocities)
+    nose = _unit(east, north, slope_x * east + slope_y * north)
+    roof = _unit(-slope_x, -slope_y, 1.0)
+    left = (
+        roof[1] * nose[2] - roof[2] * nose[1],
+        roof[2] * nose[0] - roof[0] * nose[2],
+        roof[0] * nose[1] - roof[1] * nose[0],
+    )
+    rotation = np.array((nose, left, roof)).T
+    wheels = _WHEELS @ rotation.T
+    # The ground is curved: the mean over the wheels, not the ground below the middle, keeps them on it.
+    z = (height(x + wheels[:, 0], y + wheels[:, 1], n_axes) - wheels[:, 2]).sum() / len(wheels)
+    return np.array((x, y, z)), rotation
+
+
+def _heading(velocities: dynamics.Axes) -> tuple[float, float]:
+    east, north = velocities
+    speed = math.hypot(east, north)
+    return (east / speed, north / speed) if speed > 0 else (math.sqrt(0.5), math.sqrt(0.5))
+
+
+def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def _extent(n_axes: int) -> tuple[float, float]:
+    return (-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH) if n_axes == 1 else (LOW, HIGH)
+
+
+def _floor(n_axes: int) -> float:
+    return -n_axes * HEIGHT_SCALE[n_axes] - 0.12
+
+
+def _ground_mesh(n_axes: int) -> bytes:
+    """The surface on which the car drives, its texture spread over it as seen from above."""
+    xs = np.linspace(LOW, HIGH, _GROUND_CELLS + 1)
+    ys = np.linspace(*_extent(n_axes), _GROUND_CELLS + 1 if n_axes == 2 else 3)
+    x, y = (grid.ravel() for grid in np.meshgrid(xs, ys, indexing="ij"))
+    slope_x, slope_y = gradient(x, y, n_axes)
+    vertices = np.column_stack([x, y, height(x, y, n_axes)])
+    normals = np.column_stack([-slope_x, -slope_y + 0 * x, np.ones_like(x)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    uv = np.column_stack([(x - xs[0]) / (xs[-1] - xs[0]), (y - ys[0]) / (ys[-1] - ys[0])])
+    return _obj(vertices, normals, uv, _grid_faces(len(xs), len(ys)))
+
+
+def _soil_mesh(n_axes: int) -> bytes:
+    """The four sides of the block and its underside; the texture's v is the depth under the surface."""
+    y_low, y_high = _extent(n_axes)
+    corners = np.array([[LOW, y_low], [HIGH, y_low], [HIGH, y_high], [LOW, y_high]])
+    parts = [_side(corners[i], corners[(i + 1) % 4], n_axes) for i in range(4)]
+    floor = np.column_stack([corners[[0, 3, 1, 2]], np.full(4, _floor(n_axes))])
+    parts.append((floor, np.tile([0.0, 0.0, -1.0], (4, 1)), np.zeros((4, 2)), _grid_faces(2, 2)[:, ::-1]))
+    starts = np.cumsum([0, *(len(part[0]) for part in parts)])
+    faces = np.concatenate([part[3] + start for part, start in zip(parts, starts, strict=False)])
+    vertices, normals, uv = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    return _obj(vertices, normals, uv, faces)
+
+
+def _side(start: np.ndarray, end: np.ndarray, n_axes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """One vertical side from ``start`` to ``end``, which has its outside on the right of that way."""
+    share = np.linspace(0, 1, _GROUND_CELLS + 1)
+    foot = start + share[:, None] * (end - start)
+    top = height(foot[:, 0], foot[:, 1], n_axes)
+    levels = np.linspace(0, 1, 9)
+    depth = (top - _floor(n_axes))[:, None] * levels
+    vertices = np.column_stack([np.repeat(foot, len(levels), axis=0), (top[:, None] - depth).ravel()])
+    way = (end - start) / np.linalg.norm(end - start)
+    normals = np.tile([way[1], -way[0], 0.0], (len(vertices), 1))
+    uv = np.column_stack([np.repeat(share, len(levels)), 1 - depth.ravel()])
+    return vertices, normals, uv, _grid_faces(len(share), len(levels))[:, ::-1]
+
+
+def _grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Two triangles for each cell of a grid of vertices, counter-clockwise when rows go right and columns go up."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, up, across = corner + columns, corner + 1, corner + columns + 1
+    return np.concatenate([np.column_stack([corner, right, across]), np.column_stack([corner, across, up])])
+
+
+def _obj(vertices: np.ndarray, normals: np.ndarray, uv: np.ndarray, faces: np.ndarray) -> bytes:
+    lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices.tolist()]
+    lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals.tolist()]
+    lines += [f"vt {u:.5f} {v:.5f}" for u, v in uv.tolist()]
+    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (faces + 1).tolist()]
+    return "\n".join(lines).encode()
+
+
+def _ground_texture(n_axes: int) -> np.ndarray:
+    """Colour by height, contour lines, the walls as pale lines, the goal as a patch; rows from north to south."""
+    y_low, y_high = _extent(n_axes)
+    # Square texels: a texture that is squeezed in one direction gets blurred in the other.
+    rows = round(_TEXTURE_SIZE * (y_high - y_low) / (HIGH - LOW))
+    x, y = np.linspace(LOW, HIGH, _TEXTURE_SIZE), np.linspace(y_high, y_low, rows)[:, None]
+    z = height(x, y, n_axes)
+    top = n_axes * HEIGHT_SCALE[n_axes]
+    image = _colours((z + top) / (2 * top), _GRASS)
+    slope = np.hypot(*np.broadcast_arrays(*gradient(x, y, n_axes)))
+    image = _draw(image, _near(z, top / 6, slope), 0.82 * image)
+    axes = (x, y) if n_axes == 2 else (x,)
+    image = _draw(image, _everywhere(image, [axis >= dynamics.GOAL_POSITION for axis in axes]), 0.1 * image + 0.9 * _GOAL)
+    inside = [(axis >= dynamics.MIN_POSITION) & (axis <= dynamics.MAX_POSITION) for axis in axes]
+    return _draw(image, ~_everywhere(image, inside), 0.45 * image + 0.55 * _LINE)
+
+
+def _near(z: np.ndarray, spacing: float, slope: np.ndarray) -> np.ndarray:
+    """Where a contour line passes: the same width on steep and on level ground."""
+    distance = np.abs((z + spacing / 2) % spacing - spacing / 2)
+    return distance < np.minimum(0.0028 * slope, 0.05 * spacing)
+
+
+def _everywhere(image: np.ndarray, conditions: list[np.ndarray]) -> np.ndarray:
+    return np.logical_and.reduce([np.broadcast_to(condition, image.shape[:2]) for condition in conditions])
+
+
+def _draw(image: np.ndarray, where: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    return np.where(np.broadcast_to(where, image.shape[:2])[..., None], colour, image)
+
+
+def _soil_texture() -> np.ndarray:
+    """A thin turf over soil that darkens with depth; the picture's height is one unit of length."""
+    depth = np.linspace(0, 1, _TEXTURE_SIZE)[:, None] * np.ones(8)
+    image = _colours(np.minimum(depth / 0.6, 1), _SOIL)
+    return _draw(image, depth < 0.018, _TURF)
+
+
+def _colours(share: np.ndarray, stops: np.ndarray) -> np.ndarray:
+    at = np.linspace(0, 1, len(stops))
+    return np.stack([np.interp(share, at, stops[:, channel]) for channel in range(3)], axis=-1)
+
+
+def _png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(np.round(255 * image).astype(np.uint8)).save(buffer, format="PNG")
+    return buffer.getvalue()

@@ -1,0 +1,85 @@
+"""dm_control with or without OpenGL: the choice of a rendering backend, and a clear word when there is none."""
+
+import ctypes
+import importlib
+import os
+import sys
+from typing import Any
+
+_ADVICE = (
+    "Rendering needs OpenGL, and none could be started (MUJOCO_GL={gl!r}: {reason}). "
+    "On a machine without a display install Mesa's EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) "
+    "and set MUJOCO_GL=egl before Python starts, or install libosmesa6 and set MUJOCO_GL=osmesa."
+)
+#: Why OpenGL doesn't start in this process, once that is known.
+_failure: Exception | None = None
+
+
+class RenderingError(RuntimeError):
+    """No picture can be drawn, because OpenGL is missing or doesn't start."""
+
+
+def import_dm_control() -> None:
+    """
+    Import dm_control; call this before the first import of it.
+
+    dm_control reads ``MUJOCO_GL`` when it is imported, and fails at once if that backend doesn't start. The dynamics don't
+    need OpenGL, so a failure is kept for the day when a picture is asked for, and dm_control is imported without a renderer.
+    On Linux without a display EGL is the default; a value that the user set is never changed.
+    """
+    global _failure
+    if "dm_control.mujoco" in sys.modules:
+        return
+    chosen = os.environ.get("MUJOCO_GL")
+    if chosen is None and _is_headless_linux():
+        os.environ["MUJOCO_GL"] = _headless_backend()
+    try:
+        importlib.import_module("dm_control.mujoco")
+    except Exception as error:
+        # The kind of exception depends on backend and driver: ImportError, AttributeError and RuntimeError all occur.
+        if isinstance(error, ModuleNotFoundError) and error.name in ("dm_control", "mujoco"):
+            advice = f"{error.name} is missing; install it with pip install 'sb3-combrel[envs]'"
+            raise ModuleNotFoundError(advice, name=error.name) from error
+        _failure = error
+        _import_without_renderer(chosen)
+
+
+def open_gl(physics: Any) -> None:
+    """
+    Start OpenGL for a physics, if it isn't yet started.
+
+    :param physics: a ``dm_control.mujoco.Physics``
+    :raises RenderingError: if that fails; the message says what to install and which variable to set
+    """
+    global _failure
+    # No second attempt after a failure: with some drivers it ends the process.
+    if _failure is None:
+        try:
+            _ = physics.contexts
+        except Exception as error:
+            _failure = error
+    if _failure is not None:
+        raise RenderingError(_ADVICE.format(gl=os.environ.get("MUJOCO_GL"), reason=_failure)) from _failure
+
+
+def _is_headless_linux() -> bool:
+    return sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _headless_backend() -> str:
+    for backend, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return backend
+    return "disable"
+
+
+def _import_without_renderer(chosen: str | None) -> None:
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        importlib.import_module("dm_control.mujoco")
+    finally:
+        if chosen is not None:
+            os.environ["MUJOCO_GL"] = chosen

@@ -1,0 +1,81 @@
+"""Experience of one task, in unit coordinates, kept by action for compiled code."""
+
+from typing import NamedTuple
+
+import numpy as np
+from sb3_combrel.common.compiled import compiled
+
+BLOCK = 32
+
+
+class InstanceArrays(NamedTuple):
+    """Instances by action; those of action ``a`` are the first ``count[a]`` along the second axis.
+
+    Experience comes as trajectories, so ``BLOCK`` instances in a row lie close together: the box around each block
+    lets a search for near instances pass over most blocks unseen.
+
+    :param state: float64, shape (n_actions, capacity, n_variables), unit coordinates
+    :param effect: float64, same shape: next state minus state, unit coordinates
+    :param reward: float64, shape (n_actions, capacity)
+    :param terminated: bool, same shape: the episode ended in a terminal state (not by a time limit)
+    :param count: int64, shape (n_actions,)
+    :param block_low: float64, shape (n_actions, capacity / BLOCK, n_variables), lower corners of the blocks' boxes
+    :param block_high: the same for the upper corners
+    """
+
+    state: np.ndarray
+    effect: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    count: np.ndarray
+    block_low: np.ndarray
+    block_high: np.ndarray
+
+    @classmethod
+    def empty(cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK) -> "InstanceArrays":
+        """No instances yet, with room for ``capacity`` (a multiple of BLOCK) of each action."""
+        n_blocks = capacity // BLOCK
+        return cls(
+            state=np.empty((n_actions, capacity, n_variables)),
+            effect=np.empty((n_actions, capacity, n_variables)),
+            reward=np.empty((n_actions, capacity)),
+            terminated=np.zeros((n_actions, capacity), dtype=np.bool_),
+            count=np.zeros(n_actions, dtype=np.int64),
+            block_low=np.full((n_actions, n_blocks, n_variables), np.inf),
+            block_high=np.full((n_actions, n_blocks, n_variables), -np.inf),
+        )
+
+    @property
+    def capacity(self) -> int:
+        """Instances of one action for which there is room."""
+        return self.state.shape[1]
+
+    def grown(self) -> "InstanceArrays":
+        """The same instances with twice the room."""
+        n_actions, capacity, n_variables = self.state.shape
+        larger = InstanceArrays.empty(n_actions, n_variables, 2 * capacity)
+        for old, new in zip(self, larger, strict=True):
+            if old.ndim > 1:
+                new[:, : old.shape[1]] = old
+            else:
+                new[:] = old
+        return larger
+
+    def with_room(self, action: int) -> "InstanceArrays":
+        """Itself, or grown if one more instance of ``action`` would not fit."""
+        return self if self.count[action] < self.capacity else self.grown()
+
+
+@compiled
+def put_instance(instances, action, slot, state, next_state, reward, terminated):
+    """Write one instance of ``action`` to ``slot``, at or before the end of that action's instances."""
+    block = slot // BLOCK
+    for k in range(len(state)):
+        instances.state[action, slot, k] = state[k]
+        instances.effect[action, slot, k] = next_state[k] - state[k]
+        instances.block_low[action, block, k] = min(instances.block_low[action, block, k], state[k])
+        instances.block_high[action, block, k] = max(instances.block_high[action, block, k], state[k])
+    instances.reward[action, slot] = reward
+    instances.terminated[action, slot] = terminated
+    if slot == instances.count[action]:
+        instances.count[action] += 1

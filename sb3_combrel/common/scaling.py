@@ -1,0 +1,168 @@
+"""Box coordinates to unit coordinates and back: every state variable divided by its range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from gymnasium import spaces
+
+Bounds = tuple[ArrayLike, ArrayLike]
+
+
+# A limit of the order of the largest float stands for "unbounded" (3.4e38 in older Gymnasium spaces): a range that
+# dwarfs every state would put all states at one unit coordinate.
+_LARGEST_BOUND = 1e30
+
+
+@dataclass(frozen=True, eq=False)
+class StateScaling:
+    """
+    The affine map between a box of states and the unit cube, in which all distances are measured.
+
+    A state outside the box is not clipped: it gets a unit coordinate outside [0, 1], so that the map stays invertible.
+
+    :param low: lower bound of each state variable, raw units, shape (n_variables,)
+    :param high: upper bound of each state variable, raw units, shape (n_variables,)
+    :raises ValueError: if the bounds are not two finite vectors of the same length with ``low < high``
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        # Copies that cannot be written to: a scaling is shared by the grid, the instances and the transfer method.
+        low, high = (_as_vector(name, getattr(self, name)) for name in ("low", "high"))
+        if low.shape != high.shape:
+            raise ValueError(f"low and high must have the same length, got {low.size} and {high.size} values")
+        _check_order(low, high, "low, high")
+        for name, vector in (("low", low), ("high", high)):
+            vector.flags.writeable = False
+            object.__setattr__(self, name, vector)
+
+    @classmethod
+    def from_space(cls, space: spaces.Space[Any], bounds: Bounds | None = None) -> StateScaling:
+        """
+        Take the scaling from an observation space.
+
+        :param space: a one-dimensional ``Box`` of floating-point numbers
+        :param bounds: ``(low, high)`` in raw units to use in place of the space's own; each is one number for all
+            variables or one number a variable. Needed where the space is unbounded.
+        :return: the scaling, with one coordinate for each variable of the space
+        :raises ValueError: if the space is not such a box, if it has infinite bounds and ``bounds`` is not given, or if
+            ``bounds`` does not fit the space
+        """
+        n_variables = _count_variables(space)
+        if bounds is not None:
+            return cls(*_check_bounds(bounds, n_variables))
+        low = np.asarray(space.low, dtype=np.float64)  # type: ignore[attr-defined]
+        high = np.asarray(space.high, dtype=np.float64)  # type: ignore[attr-defined]
+        unbounded = np.flatnonzero(~(np.maximum(np.abs(low), np.abs(high)) < _LARGEST_BOUND))
+        if unbounded.size:
+            raise ValueError(
+                f"the observation space {space} has no finite bounds for the state variable(s) {unbounded.tolist()}; "
+                f"pass bounds=(low, high), each a finite number or a sequence of {n_variables} finite numbers"
+            )
+        return cls(low, high)
+
+    @property
+    def n_variables(self) -> int:
+        """Number of state variables."""
+        return int(self.low.size)
+
+    def to_unit(self, states: ArrayLike) -> NDArray[np.float64]:
+        """
+        Divide each state variable by its range.
+
+        :param states: raw units, shape (..., n_variables)
+        :return: unit coordinates of the same shape, in [0, 1] for states in the box
+        """
+        return (np.asarray(states, dtype=np.float64) - self.low) / (self.high - self.low)
+
+    def to_raw(self, units: ArrayLike) -> NDArray[np.float64]:
+        """
+        Undo :meth:`to_unit`.
+
+        :param units: unit coordinates, shape (..., n_variables)
+        :return: states in raw units, same shape
+        """
+        return self.low + np.asarray(units, dtype=np.float64) * (self.high - self.low)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, StateScaling):
+            return NotImplemented
+        return np.array_equal(self.low, other.low) and np.array_equal(self.high, other.high)
+
+    def __hash__(self) -> int:
+        return hash((self.low.tobytes(), self.high.tobytes()))
+
+    def __repr__(self) -> str:
+        return f"StateScaling(low={self.low.tolist()}, high={self.high.tolist()})"
+
+
+def _as_vector(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """A float64 copy of ``values``, shape (n,) with n > 0, all finite."""
+    try:
+        vector = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a sequence of numbers, one a state variable, got {values!r}") from error
+    if vector.ndim != 1 or vector.size == 0:
+        raise ValueError(f"{name} must be a one-dimensional sequence of at least one number, got {values!r}")
+    if not np.all(np.isfinite(vector)):
+        raise ValueError(f"{name} must hold finite numbers only, got {vector.tolist()}")
+    return vector
+
+
+def _check_order(low: NDArray[np.float64], high: NDArray[np.float64], name: str) -> None:
+    wrong = np.flatnonzero(~(low < high))
+    if wrong.size:
+        i = int(wrong[0])
+        raise ValueError(
+            f"{name}: the lower bound of every state variable must be below its upper bound, "
+            f"got low={low[i]} and high={high[i]} for variable {i}"
+        )
+    if not np.all(np.isfinite(high - low)):
+        raise ValueError(f"{name}: the range high - low overflows, got low={low.tolist()} and high={high.tolist()}")
+
+
+def _count_variables(space: spaces.Space[Any]) -> int:
+    """Number of variables of a one-dimensional continuous box; anything else is refused."""
+    from gymnasium import spaces as gym_spaces
+
+    if isinstance(space, gym_spaces.Dict | gym_spaces.Tuple):
+        raise ValueError(
+            f"the observation space must be a one-dimensional Box, got {space}; "
+            "flatten it first, for example with gymnasium.wrappers.FlattenObservation"
+        )
+    if not isinstance(space, gym_spaces.Box):
+        raise ValueError(f"the observation space must be a one-dimensional Box, got {space}")
+    if len(space.shape) != 1 or space.shape[0] == 0:
+        kind = "images are not supported; " if len(space.shape) == 3 else ""
+        raise ValueError(
+            f"the observation space must be a Box of shape (n_variables,), got shape {space.shape}; {kind}"
+            "pass a vector of state variables"
+        )
+    if not np.issubdtype(space.dtype, np.floating):
+        raise ValueError(f"the observation space must be a Box of floating-point numbers, got dtype {space.dtype}")
+    return int(space.shape[0])
+
+
+def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """``(low, high)`` of the ``bounds`` argument, each broadcast to one number a variable."""
+    right = f"bounds must be (low, high), each a finite number or a sequence of {n_variables} finite numbers"
+    try:
+        low, high = (np.array(bound, dtype=np.float64) for bound in bounds)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{right}, got bounds={bounds!r}") from error
+    for name, bound in (("low", low), ("high", high)):
+        if bound.shape not in ((), (n_variables,)):
+            raise ValueError(f"{right}, got a {name} of shape {bound.shape} in bounds={bounds!r}")
+        if not np.all(np.isfinite(bound)):
+            raise ValueError(f"{right}, got a {name} of {bound.tolist()} in bounds={bounds!r}")
+    low, high = np.broadcast_to(low, n_variables), np.broadcast_to(high, n_variables)
+    _check_order(low, high, "bounds")
+    return low, high

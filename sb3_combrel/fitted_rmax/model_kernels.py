@@ -1,0 +1,313 @@
+"""Compiled loops of the kernel model: which instances stand behind each state-action pair, and what they predict."""
+
+from typing import NamedTuple
+
+import numpy as np
+from sb3_combrel.common.compiled import compiled
+
+from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
+from sb3_combrel.common.pool import Pool, reserve
+
+
+class ModelArrays(NamedTuple):
+    """The state of the kernel model; pair ``action * n_points + point`` is one state-action pair of the grid.
+
+    :param lists: kept instances of each pair, heaviest first, with their kernel weights
+    :param rows: what each settled pair leads to: grid points, with discounted probabilities (see ``build_row``)
+    :param entry: float64, shape (n_pairs,): the weight that a further instance needs to enter the pair's list
+    :param total: float64, shape (n_pairs,): sum of the kept weights
+    :param known: bool, shape (n_pairs,): the target's own instances settle the pair
+    :param settled: bool, shape (n_pairs,): the pair has a row, from its own or with transferred instances
+    :param reward: float64, shape (n_pairs,): reward of the pair until its state is left
+    :param n_optimistic: int64, shape (n_points,): actions of a grid point without a row
+    :param members: int32, shape (n_actions, capacity): in how many lists each instance stands
+    """
+
+    lists: Pool
+    rows: Pool
+    entry: np.ndarray
+    total: np.ndarray
+    known: np.ndarray
+    settled: np.ndarray
+    reward: np.ndarray
+    n_optimistic: np.ndarray
+    members: np.ndarray
+
+
+class Supply(NamedTuple):
+    """Transferred instances for a number of state-action pairs, one pair a row (see ``Transfer.supply``).
+
+    :param count: int64, shape (n,): instances for each pair, 0 if the pair cannot be settled
+    :param weight: float64, shape (n, most)
+    :param effect: float64, shape (n, most, n_variables): predicted displacement, unit coordinates of the target
+    :param reward: float64, shape (n, most)
+    :param terminated: bool, shape (n, most)
+    """
+
+    count: np.ndarray
+    weight: np.ndarray
+    effect: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+
+    @classmethod
+    def none(cls, n: int, n_variables: int) -> "Supply":
+        """Nothing for any of ``n`` pairs."""
+        return cls(
+            count=np.zeros(n, dtype=np.int64),
+            weight=np.empty((n, 0)),
+            effect=np.empty((n, 0, n_variables)),
+            reward=np.empty((n, 0)),
+            terminated=np.empty((n, 0), dtype=np.bool_),
+        )
+
+
+class Scratch(NamedTuple):
+    """Work space of the compiled loops, allocated once.
+
+    :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
+    :param first: int64, shape (n_variables,): first grid coordinate within reach; ``last``: one past the last
+    :param at: int64, shape (n_variables,): a grid coordinate
+    :param position: float64, shape (n_variables,)
+    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
+    :param dense: float64, shape (n_points,), all 0 between calls
+    :param touched: int64, shape (n_points,)
+    :param point: int64, shape (n_points,); ``weight``: float64, same shape: pairs that an instance reaches
+    """
+
+    kernel: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    at: np.ndarray
+    position: np.ndarray
+    corner_index: np.ndarray
+    corner_weight: np.ndarray
+    dense: np.ndarray
+    touched: np.ndarray
+    point: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def for_grid(cls, grid) -> "Scratch":
+        """Work space for a :class:`StateGrid`."""
+        d, n_points = grid.n_variables, grid.n_points
+        return cls(
+            kernel=np.empty((d, int(grid.arrays.shape.max()))),
+            first=np.empty(d, dtype=np.int64),
+            last=np.empty(d, dtype=np.int64),
+            at=np.empty(d, dtype=np.int64),
+            position=np.empty(d),
+            corner_index=np.empty(2**d, dtype=np.int64),
+            corner_weight=np.empty(2**d),
+            dense=np.zeros(n_points),
+            touched=np.empty(n_points, dtype=np.int64),
+            point=np.empty(n_points, dtype=np.int64),
+            weight=np.empty(n_points),
+        )
+
+
+@compiled
+def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
+    """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
+
+    The kernel is a product of one factor a variable, so the exponentials are few: one for each grid coordinate.
+
+    :param entry: float64, shape (n_points,)
+    :return: how many; they and the weights are in ``scratch.point`` and ``scratch.weight``
+    """
+    d = len(state)
+    reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
+    for k in range(d):
+        scratch.first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k])))
+        scratch.last[k] = min(grid.shape[k], int(np.floor((state[k] + reach) * grid.cells[k])) + 1)
+        if scratch.first[k] >= scratch.last[k]:
+            return 0
+        for j in range(scratch.first[k], scratch.last[k]):
+            apart = (j / grid.cells[k] - state[k]) / breadth
+            scratch.kernel[k, j] = np.exp(-apart * apart)
+        scratch.at[k] = scratch.first[k]
+    found = 0
+    inner = d - 1
+    while True:
+        outer_weight = 1.0
+        base = 0
+        for k in range(inner):
+            outer_weight *= scratch.kernel[k, scratch.at[k]]
+            base += scratch.at[k] * grid.strides[k]
+        if outer_weight >= min_weight:
+            for j in range(scratch.first[inner], scratch.last[inner]):
+                w = outer_weight * scratch.kernel[inner, j]
+                if w >= entry[base + j] and w >= min_weight:
+                    scratch.point[found] = base + j
+                    scratch.weight[found] = w
+                    found += 1
+        k = inner - 1
+        while k >= 0:
+            scratch.at[k] += 1
+            if scratch.at[k] < scratch.last[k]:
+                break
+            scratch.at[k] = scratch.first[k]
+            k -= 1
+        if k < 0:
+            return found
+
+
+@compiled
+def enter_lists(arrays, action, slot, n_found, done, min_fraction, threshold, scratch):
+    """Put an instance into the lists of the pairs found by :func:`points_in_reach`.
+
+    :param done: how many of them are done already
+    :return: how many are done now; fewer than ``n_found`` if the lists' pool must grow first
+    """
+    first_pair = action * len(arrays.n_optimistic)
+    lists = arrays.lists
+    while done < n_found:
+        pair = first_pair + scratch.point[done]
+        length = lists.length[pair]
+        if not reserve(lists, pair, length + 1):
+            return done
+        start = lists.start[pair]
+        kept, total = insert_by_weight(
+            lists.index, lists.weight, start, length, slot, scratch.weight[done], min_fraction
+        )
+        arrays.members[action, slot] += 1
+        for k in range(start + kept, start + length + 1):
+            arrays.members[action, lists.index[k]] -= 1
+        lists.length[pair] = kept
+        arrays.total[pair] = total
+        arrays.entry[pair] = min(lists.weight[start + kept - 1], min_fraction * total)
+        if total >= threshold:
+            arrays.known[pair] = True
+        done += 1
+    return done
+
+
+@compiled
+def leave_lists(arrays, action, slot, n_found, min_fraction, scratch):
+    """Take an instance out of the lists in which it stands.
+
+    :param n_found: number of pairs in its reach, from :func:`points_in_reach`
+    :return: how many lists changed; their points are moved to the front of ``scratch.point``
+    """
+    first_pair = action * len(arrays.n_optimistic)
+    lists = arrays.lists
+    changed = 0
+    for f in range(n_found):
+        point = scratch.point[f]
+        pair = first_pair + point
+        start = lists.start[pair]
+        length = lists.length[pair]
+        k = 0
+        while k < length and lists.index[start + k] != slot:
+            k += 1
+        if k == length:
+            continue
+        for j in range(start + k, start + length - 1):
+            lists.index[j] = lists.index[j + 1]
+            lists.weight[j] = lists.weight[j + 1]
+        lists.length[pair] = length - 1
+        _, arrays.total[pair] = cut_by_fraction(lists.weight, start, length - 1, min_fraction)
+        if length == 1:
+            arrays.known[pair] = False
+            arrays.entry[pair] = 0.0
+        else:
+            arrays.entry[pair] = min(lists.weight[start + length - 2], min_fraction * arrays.total[pair])
+        scratch.point[changed] = point
+        changed += 1
+    arrays.members[action, slot] = 0
+    return changed
+
+
+@compiled
+def scatter(p, effect, scratch, grid, n_touched):
+    """Spread probability ``p`` of moving by ``effect`` from the grid coordinate ``scratch.at`` over grid points."""
+    for k in range(len(effect)):
+        scratch.position[k] = scratch.at[k] + effect[k] * grid.cells[k]
+    n_corners = corners_of(scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
+    for c in range(n_corners):
+        point = scratch.corner_index[c]
+        if scratch.dense[point] == 0.0:
+            scratch.touched[n_touched] = point
+            n_touched += 1
+        scratch.dense[point] += p * scratch.corner_weight[c]
+    return n_touched
+
+
+@compiled
+def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
+    """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
+
+    A grid point is often its own successor. Staying is summed as the geometric series it is: reward and
+    probabilities are divided by 1 - gamma * P(stay), which leaves the fixed point of the value function as it was
+    and saves most of the sweeps. A pair that never leaves gets an infinite reward (of the reward's sign), which the
+    planner cuts to its bounds; so does one whose instances are all that is known of a terminal reward of 0.
+
+    :param s: row of ``supply`` that belongs to the pair; counts only while the pair is not known
+    :return: False if the rows' pool must grow first (nothing was changed then)
+    """
+    n_points = len(arrays.n_optimistic)
+    action = pair // n_points
+    point = pair - action * n_points
+    start = arrays.lists.start[pair]
+    n_own = arrays.lists.length[pair]
+    n_supplied = 0 if arrays.known[pair] else supply.count[s]
+    total = arrays.total[pair] if n_own > 0 else 0.0
+    for j in range(n_supplied):
+        total += supply.weight[s, j]
+    rest = point
+    for k in range(len(grid.shape)):
+        scratch.at[k] = rest // grid.strides[k]
+        rest -= scratch.at[k] * grid.strides[k]
+    reward = 0.0
+    n_touched = 0
+    for k in range(start, start + n_own):
+        i = arrays.lists.index[k]
+        p = arrays.lists.weight[k] / total
+        reward += p * instances.reward[action, i]
+        if not instances.terminated[action, i]:
+            n_touched = scatter(p, instances.effect[action, i], scratch, grid, n_touched)
+    for j in range(n_supplied):
+        p = supply.weight[s, j] / total
+        reward += p * supply.reward[s, j]
+        if not supply.terminated[s, j]:
+            n_touched = scatter(p, supply.effect[s, j], scratch, grid, n_touched)
+    if not reserve(arrays.rows, pair, n_touched):
+        for t in range(n_touched):
+            scratch.dense[scratch.touched[t]] = 0.0
+        return False
+    leave = 1.0 - gamma * scratch.dense[point]
+    stays_for_ever = leave < 1e-9
+    slot = arrays.rows.start[pair]
+    length = 0
+    for t in range(n_touched):
+        to = scratch.touched[t]
+        if to != point and not stays_for_ever:
+            arrays.rows.index[slot + length] = to
+            arrays.rows.weight[slot + length] = gamma * scratch.dense[to] / leave
+            length += 1
+        scratch.dense[to] = 0.0
+    arrays.rows.length[pair] = length
+    if stays_for_ever:
+        arrays.reward[pair] = 0.0 if reward == 0.0 else np.inf * reward
+    else:
+        arrays.reward[pair] = reward / leave
+    return True
+
+
+@compiled
+def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
+    """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
+
+    :return: how many of them are done; fewer than all if the rows' pool must grow first
+    """
+    n_points = len(arrays.n_optimistic)
+    while done < len(pairs):
+        pair = pairs[done]
+        has_row = arrays.known[pair] or supply.count[done] > 0
+        if has_row and not build_row(arrays, instances, grid, gamma, pair, supply, done, scratch):
+            return done
+        if has_row != arrays.settled[pair]:
+            arrays.settled[pair] = has_row
+            arrays.n_optimistic[pair % n_points] += -1 if has_row else 1
+        done += 1
+    return done

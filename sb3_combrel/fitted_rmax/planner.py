@@ -1,0 +1,152 @@
+"""Dynamic programming on the grid: prioritized sweeping with a bound on the work of each step."""
+
+from typing import NamedTuple
+
+import numpy as np
+from sb3_combrel.common.compiled import compiled
+
+N_LEVELS = 24
+
+
+class SweepQueue(NamedTuple):
+    """Grid points that wait for a backup, in a ring for each power of two of the change that called for it.
+
+    :param ring: int32, shape (N_LEVELS, n_points)
+    :param head: int64, shape (N_LEVELS,); ``size``: int64, same shape
+    :param level: int8, shape (n_points,): where a point waits, -1 if nowhere
+    :param queued: bool, shape (N_LEVELS, n_points): the point stands in that ring, waiting or passed over
+    :param announced: float64, shape (n_points,): the value that the point's predecessors were last told
+    """
+
+    ring: np.ndarray
+    head: np.ndarray
+    size: np.ndarray
+    level: np.ndarray
+    queued: np.ndarray
+    announced: np.ndarray
+
+    @classmethod
+    def empty(cls, values: np.ndarray) -> "SweepQueue":
+        """Nothing waits, and everybody knows ``values``."""
+        n_points = len(values)
+        return cls(
+            ring=np.empty((N_LEVELS, n_points), dtype=np.int32),
+            head=np.zeros(N_LEVELS, dtype=np.int64),
+            size=np.zeros(N_LEVELS, dtype=np.int64),
+            level=np.full(n_points, -1, dtype=np.int8),
+            queued=np.zeros((N_LEVELS, n_points), dtype=np.bool_),
+            announced=values.copy(),
+        )
+
+
+@compiled
+def push(queue, point, level):
+    """Let ``point`` wait for a backup; points of higher levels come first."""
+    queue.level[point] = level
+    if not queue.queued[level, point]:
+        n_points = queue.ring.shape[1]
+        end = queue.head[level] + queue.size[level]
+        queue.ring[level, end - n_points if end >= n_points else end] = point
+        queue.size[level] += 1
+        queue.queued[level, point] = True
+
+
+@compiled
+def pop(queue):
+    """The point to back up next, -1 if none waits."""
+    n_points = queue.ring.shape[1]
+    level = N_LEVELS - 1
+    while level >= 0:
+        if queue.size[level] == 0:
+            level -= 1
+            continue
+        point = queue.ring[level, queue.head[level]]
+        queue.head[level] = queue.head[level] + 1 if queue.head[level] + 1 < n_points else 0
+        queue.size[level] -= 1
+        queue.queued[level, point] = False
+        if queue.level[point] == level:
+            queue.level[point] = -1
+            return point
+    return -1
+
+
+@compiled
+def backed_up_value(values, arrays, point, max_value, min_value):
+    """max over a of Q(point, a), Fitted R-Max's backup; ``max_value`` while an action is optimistic."""
+    if arrays.n_optimistic[point] > 0:
+        return max_value
+    n_points = len(values)
+    best = min_value
+    for pair in range(point, len(arrays.reward), n_points):
+        q = arrays.reward[pair]
+        start = arrays.rows.start[pair]
+        for k in range(start, start + arrays.rows.length[pair]):
+            q += arrays.rows.weight[k] * values[arrays.rows.index[k]]
+        best = max(best, q)
+    return min(best, max_value)
+
+
+@compiled
+def announce(values, n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at):
+    """Have every grid point that may lead to ``point`` wait for a backup, the sooner the larger the change."""
+    change = abs(values[point] - queue.announced[point])
+    if change <= tolerance:
+        return
+    queue.announced[point] = values[point]
+    level = min(N_LEVELS - 1, int(np.log2(change / tolerance)))
+    d = len(grid.shape)
+    inner = d - 1
+    rest = point
+    base = 0
+    for k in range(d):
+        c = rest // grid.strides[k]
+        rest -= c * grid.strides[k]
+        at[0, k] = max(0, c - reach_high[k])
+        at[1, k] = min(grid.shape[k] - 1, c - reach_low[k])
+        at[2, k] = at[0, k]
+        if k < inner:
+            base += at[0, k] * grid.strides[k]
+    while True:
+        for j in range(at[0, inner], at[1, inner] + 1):
+            if queue.level[base + j] < level and n_optimistic[base + j] == 0 and base + j != point:
+                push(queue, base + j, level)
+        k = inner - 1
+        while k >= 0:
+            at[2, k] += 1
+            base += grid.strides[k]
+            if at[2, k] <= at[1, k]:
+                break
+            base -= (at[2, k] - at[0, k]) * grid.strides[k]
+            at[2, k] = at[0, k]
+            k -= 1
+        if k < 0:
+            return
+
+
+@compiled
+def sweep(values, arrays, queue, changed, reach_low, reach_high, grid, bounds, tolerance, max_backups, at):
+    """Back up the points of ``changed``, then those that wait, largest change first.
+
+    :param values: float64, shape (n_points,), updated in place
+    :param reach_low: int64, shape (n_variables,): farthest that one effect leads down each variable, in cells (<= 0);
+        ``reach_high``: the same upwards
+    :param bounds: (min_value, max_value)
+    :param max_backups: of those that wait; the rest waits for the next call
+    :param at: int64 scratch, shape (3, n_variables)
+    :return: backups done
+    """
+    for c in range(len(changed)):
+        point = changed[c]
+        values[point] = backed_up_value(values, arrays, point, bounds[1], bounds[0])
+        announce(values, arrays.n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at)
+    backups = 0
+    while backups < max_backups:
+        point = pop(queue)
+        if point < 0:
+            break
+        if arrays.n_optimistic[point] > 0 and values[point] == bounds[1]:
+            continue
+        values[point] = backed_up_value(values, arrays, point, bounds[1], bounds[0])
+        backups += 1
+        announce(values, arrays.n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at)
+    return backups + len(changed)

@@ -1,0 +1,271 @@
+"""One inter-task mapping: which source variable and source action each target variable and action stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from operator import index as as_index
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+UNMAPPED = -1
+"""Stands for None in integer arrays of state mappings."""
+
+
+class MappingNames(NamedTuple):
+    """Names of the variables and actions on both sides of a mapping, in the order of the spaces; for display only."""
+
+    source_variables: tuple[str, ...]
+    target_variables: tuple[str, ...]
+    source_actions: tuple[str, ...]
+    target_actions: tuple[str, ...]
+
+
+@dataclass(frozen=True, repr=False)
+class InterTaskMapping:
+    """
+    A pair (X_S, X_A) of a state and an action mapping, from the target task to the source task (Section 2.2).
+
+    All coordinates are unit coordinates (:class:`~sb3_combrel.common.scaling.StateScaling`), so the ranges of the two
+    tasks may differ. A target variable that is mapped to None keeps the value of the current target state, and a
+    translated instance predicts no change for it; distances are taken over the mapped variables only.
+
+    :param state: for each target variable the index of its source variable, or None
+    :param action: for each target action its source action
+    :param sign: for each target variable +1, or -1 to mirror it in its range (unit coordinate u becomes 1 - u and
+        displacements change sign); None for +1 throughout. The sign of an unmapped variable has no effect and is
+        stored as +1.
+    :param names: names for ``repr``; they play no part in comparisons, see :meth:`with_names`
+    :raises ValueError: if an entry is not of the kind above, if no variable is mapped, or if there is no action
+    """
+
+    state: tuple[int | None, ...]
+    action: tuple[int, ...]
+    sign: tuple[int, ...] | None = None
+    names: MappingNames | None = field(default=None, compare=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        state = tuple(None if i is None else _index("state", i) for i in _entries("state", self.state))
+        if all(i is None for i in state):
+            raise ValueError(f"state must map at least one target variable to a source variable, got state={self.state!r}")
+        action = tuple(_index("action", a) for a in _entries("action", self.action))
+        if not action:
+            raise ValueError("action must hold one source action for each target action, got action=()")
+        object.__setattr__(self, "state", state)
+        object.__setattr__(self, "action", action)
+        object.__setattr__(self, "sign", _signs(self.sign, state))
+        if self.names is not None:
+            object.__setattr__(self, "names", _checked_names(self.names, state, action))
+
+    @property
+    def n_target_variables(self) -> int:
+        """Number of variables of the target task."""
+        return len(self.state)
+
+    @property
+    def n_target_actions(self) -> int:
+        """Number of actions of the target task."""
+        return len(self.action)
+
+    @property
+    def state_index(self) -> Ints:
+        """``state`` as an array for compiled loops, shape (n_target_variables,), -1 for None."""
+        return np.array([UNMAPPED if i is None else i for i in self.state], dtype=np.int64)
+
+    @property
+    def state_sign(self) -> Floats:
+        """``sign`` as an array for compiled loops, shape (n_target_variables,)."""
+        return np.array(self.sign, dtype=np.float64)
+
+    @property
+    def mapped(self) -> NDArray[np.bool_]:
+        """Which target variables have a source variable, shape (n_target_variables,)."""
+        return self.state_index != UNMAPPED
+
+    def target_to_source(self, target_units: ArrayLike, n_source_variables: int) -> Floats:
+        """
+        Express target states in the coordinates of the source task.
+
+        Where several target variables map to one source variable, the source coordinate is their mean, the point with
+        the smallest squared distance to all of them. A source variable that no target variable maps to is NaN: the
+        mapping says nothing of it.
+
+        :param target_units: unit coordinates, shape (..., n_target_variables)
+        :param n_source_variables: number of variables of the source task
+        :return: unit coordinates, shape (..., n_source_variables)
+        :raises ValueError: if the shape does not fit, or if ``state`` names a source variable that does not exist
+        """
+        target = _columns("target_units", target_units, self.n_target_variables)
+        if n_source_variables <= self.state_index.max():
+            raise ValueError(
+                f"n_source_variables must be above {self.state_index.max()}, the largest source variable in "
+                f"state={self.state}, got {n_source_variables}"
+            )
+        mirrored = np.where(self.state_sign < 0, 1.0 - target, target)
+        source = np.full((*target.shape[:-1], n_source_variables), np.nan)
+        for variable in np.unique(self.state_index[self.mapped]):
+            source[..., variable] = mirrored[..., self.state_index == variable].mean(axis=-1)
+        return source
+
+    def source_to_target(self, source_units: ArrayLike, target_state: ArrayLike) -> Floats:
+        """
+        Express source states in the coordinates of the target task.
+
+        Both the start and the outcome of a source instance are translated by this function with the same
+        ``target_state``: unmapped variables are then equal in both, so the instance predicts no change for them.
+
+        :param source_units: unit coordinates, shape (..., n_source_variables)
+        :param target_state: unit coordinates of the current target state, which unmapped variables keep;
+            shape (n_target_variables,) or any that broadcasts with the source states
+        :return: unit coordinates, shape (..., n_target_variables)
+        :raises ValueError: if a shape does not fit
+        """
+        source = self._source_columns("source_units", source_units)
+        current = _columns("target_state", target_state, self.n_target_variables)
+        return np.where(self.mapped, np.where(self.state_sign < 0, 1.0 - source, source), current)
+
+    def displacement_to_target(self, source_displacements: ArrayLike) -> Floats:
+        """
+        Express changes of the source state (s'_j - s_j of Eq. 2) as changes of the target state.
+
+        :param source_displacements: differences of unit coordinates, shape (..., n_source_variables)
+        :return: differences of unit coordinates, shape (..., n_target_variables), 0 for unmapped variables
+        :raises ValueError: if the shape does not fit
+        """
+        source = self._source_columns("source_displacements", source_displacements)
+        return np.where(self.mapped, self.state_sign * source, 0.0)
+
+    def source_action(self, target_action: int) -> int:
+        """The source action that a target action maps to."""
+        return self.action[target_action]
+
+    def target_actions(self, source_action: int) -> Ints:
+        """The target actions that map to a source action, ascending; a source instance is translated to each of them."""
+        return np.flatnonzero(np.array(self.action) == source_action).astype(np.int64)
+
+    def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
+        """
+        Check the mapping against the spaces of the two tasks.
+
+        :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
+        """
+        _check_length("state", self.state, n_target_variables, "variables")
+        _check_length("action", self.action, n_target_actions, "actions")
+        _check_range("state", self.state, n_source_variables, "variables")
+        _check_range("action", self.action, n_source_actions, "actions")
+
+    def with_names(
+        self,
+        source_variables: Iterable[str],
+        target_variables: Iterable[str],
+        source_actions: Iterable[str],
+        target_actions: Iterable[str],
+    ) -> InterTaskMapping:
+        """
+        The same mapping with names for ``repr``.
+
+        :param source_variables: names of the source task's variables
+        :param target_variables: names of the target task's variables
+        :param source_actions: names of the source task's actions
+        :param target_actions: names of the target task's actions
+        :raises ValueError: if there are fewer names than the mapping uses
+        """
+        names = MappingNames(tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions))
+        return replace(self, names=names)
+
+    def __repr__(self) -> str:
+        if self.names is None:
+            mirrored = f", sign={self.sign}" if -1 in self.state_sign else ""
+            return f"InterTaskMapping(state={self.state}, action={self.action}{mirrored})"
+        variables = []
+        for target, source, sign in zip(self.names.target_variables, self.state, self.state_sign, strict=True):
+            if source is not None:
+                name = self.names.source_variables[source]
+                variables.append(f"{target}<-{name}" if sign > 0 else f"{target}<-(-{name})")
+        actions = [
+            f"{target}<-{self.names.source_actions[source]}"
+            for target, source in zip(self.names.target_actions, self.action, strict=True)
+        ]
+        return f"InterTaskMapping({', '.join(variables)}; {', '.join(actions)})"
+
+    def _source_columns(self, name: str, values: ArrayLike) -> Floats:
+        """The source column of each target variable; unmapped ones get an arbitrary column, to be masked."""
+        array = np.asarray(values, dtype=np.float64)
+        needed = int(self.state_index.max()) + 1
+        if array.ndim == 0 or array.shape[-1] < needed:
+            raise ValueError(
+                f"{name} must have the shape (..., n_source_variables) with at least {needed} variables "
+                f"for state={self.state}, got {array.shape}"
+            )
+        return array[..., np.maximum(self.state_index, 0)]
+
+
+def _entries(name: str, values: Sequence[int | None]) -> Sequence[int | None]:
+    if isinstance(values, str) or not isinstance(values, Sequence | np.ndarray):
+        raise ValueError(f"{name} must be a sequence with one entry for each target variable or action, got {values!r}")
+    return values
+
+
+def _index(name: str, value: object) -> int:
+    """A non-negative integer; bool is refused, it would pass as 0 or 1."""
+    none = " or None" if name == "state" else ""
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        number = as_index(value)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise ValueError(f"{name} must hold integers{none}, got the entry {value!r}") from error
+    if number < 0:
+        raise ValueError(f"{name} must hold integers from 0 on{none}, got the entry {value!r}")
+    return number
+
+
+def _signs(sign: Sequence[int] | None, state: tuple[int | None, ...]) -> tuple[int, ...]:
+    if sign is None:
+        return (1,) * len(state)
+    entries = tuple(_entries("sign", sign))
+    if len(entries) != len(state):
+        raise ValueError(f"sign must have {len(state)} entries, one for each entry of state={state}, got sign={sign!r}")
+    if any(entry not in (1, -1) for entry in entries):
+        raise ValueError(f"sign must hold +1 and -1 only, got sign={sign!r}")
+    return tuple(1 if i is None or entry == 1 else -1 for i, entry in zip(state, entries, strict=True))
+
+
+def _checked_names(names: MappingNames, state: tuple[int | None, ...], action: tuple[int, ...]) -> MappingNames:
+    named = MappingNames(*(tuple(str(name) for name in group) for group in names))
+    needed = MappingNames._fields
+    used = (max(i for i in state if i is not None) + 1, len(state), max(action) + 1, len(action))
+    for kind, group, least in zip(needed, named, used, strict=True):
+        exact = kind.startswith("target")
+        if (exact and len(group) != least) or len(group) < least:
+            raise ValueError(f"{kind} must hold {'' if exact else 'at least '}{least} names, got {group}")
+    return named
+
+
+def _columns(name: str, values: ArrayLike, n_columns: int) -> Floats:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != n_columns:
+        raise ValueError(f"{name} must have the shape (..., {n_columns}), got {array.shape}")
+    return array
+
+
+def _check_length(name: str, entries: Sequence[int | None], n_target: int, kind: str) -> None:
+    if len(entries) != n_target:
+        raise ValueError(
+            f"{name} must have {n_target} entries, one for each of the target task's {kind}, "
+            f"got {len(entries)}: {name}={tuple(entries)}"
+        )
+
+
+def _check_range(name: str, entries: Sequence[int | None], n_source: int, kind: str) -> None:
+    largest = max(entry for entry in entries if entry is not None)
+    if largest >= n_source:
+        raise ValueError(
+            f"{name} must hold indices from 0 to {n_source - 1}, the source task has {n_source} {kind}, "
+            f"got {largest} in {name}={tuple(entries)}"
+        )
