@@ -1,5 +1,29 @@
-"""How the inner loops are compiled."""
+"""How the inner loops are compiled: on first use, cached on disk, with a word to the user while it lasts."""
+
+import sys
+from typing import Any
 
 from numba import njit
+from numba.core import event
 
-compiled = njit(cache=True, _nrt=False, error_model="numpy", boundscheck=False)
+# The loops allocate nothing, so they run without numba's reference counting: its atomic increments at every call with
+# an array cost more than the loops themselves, and so does wrapping every array that comes in from Python.
+compiled = njit(cache=True, _nrt=False, error_model="numpy")
+
+
+class _Announcer(event.Listener):
+    """Says once, on stderr, that compilation goes on: the first run is silent for seconds otherwise."""
+
+    def __init__(self) -> None:
+        self.announced = False
+
+    def on_start(self, event: Any) -> None:
+        if not self.announced and event.data["dispatcher"].py_func.__module__.startswith("sb3_combrel."):
+            self.announced = True
+            print("sb3_combrel: compiling inner loops for this machine, once (10-15 s) ...", file=sys.stderr, flush=True)
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Announcer())

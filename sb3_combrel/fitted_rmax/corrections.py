@@ -1,20 +1,25 @@
-"""Corrections of the interpolated value function at visited states, in the manner of LRTA*.
+"""Corrections of the interpolated value function where the agent makes no progress, in the manner of LRTA*.
 
 Between grid points the interpolated value can promise a way that does not exist: at a joint limit or a wall the grid
 points beyond were fitted to instances that moved freely. Acting greedily on such a promise can hold an agent in place
-for ever. Whenever the interpolated value at a visited state exceeds the best action value there, that action value is
-remembered, and caps the value of states in the same small cell. Each return to a place without progress lowers its
-cap, until another way looks better.
+for ever. A state to which the agent has come back ``PATIENCE`` times within an episode is such a place. There, when
+the interpolated value exceeds the best action value, that action value is remembered and caps the value of states in
+the same small cell. Each further visit lowers the cap, until another way looks better.
+
+Where the agent does make progress nothing is corrected: values that are true along the path taken and too hopeful
+beside it would make every other path look better than the one that works.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled
 
+from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.kernels import interpolate
 
 CELLS_PER_GRID_CELL = 3
+PATIENCE = 10
+VISIT_TABLE_SIZE = 1 << 14
 
 
 class CorrectionArrays(NamedTuple):
@@ -25,6 +30,8 @@ class CorrectionArrays(NamedTuple):
     :param state: float64, shape (capacity, n_variables), unit coordinates: the last state visited in the cell
     :param value: float64, shape (capacity,): the best action value there
     :param count: int64, shape (1,)
+    :param visit_key: int64, shape (VISIT_TABLE_SIZE,): cells visited lately, hashed with what tells episodes apart
+    :param visits: int32, same shape: how often
     """
 
     table: np.ndarray
@@ -32,6 +39,8 @@ class CorrectionArrays(NamedTuple):
     state: np.ndarray
     value: np.ndarray
     count: np.ndarray
+    visit_key: np.ndarray
+    visits: np.ndarray
 
     @classmethod
     def empty(cls, n_variables: int, capacity: int = 256) -> "CorrectionArrays":
@@ -42,6 +51,8 @@ class CorrectionArrays(NamedTuple):
             state=np.empty((capacity, n_variables)),
             value=np.empty(capacity),
             count=np.zeros(1, dtype=np.int64),
+            visit_key=np.full(VISIT_TABLE_SIZE, -1, dtype=np.int64),
+            visits=np.zeros(VISIT_TABLE_SIZE, dtype=np.int32),
         )
 
     def with_room(self) -> "CorrectionArrays":
@@ -53,6 +64,7 @@ class CorrectionArrays(NamedTuple):
         larger = CorrectionArrays.empty(self.state.shape[1], 2 * capacity)
         larger.key[:n], larger.state[:n], larger.value[:n] = self.key, self.state, self.value
         larger.count[0] = n
+        larger = larger._replace(visit_key=self.visit_key, visits=self.visits)
         for m in range(n):
             larger.table[find_cell(larger, larger.key[m])] = m
         return larger
@@ -89,20 +101,43 @@ def corrected_value(values, corrections, position, grid, scratch):
     if m < 0:
         return value
     for k in range(len(position)):
-        scratch.there[k] = corrections.state[m, k] * grid.cells[k]
+        scratch.there[k] = corrections.state[m, k] * grid.cells[k] + grid.margin[k]
     there = interpolate(values, scratch.there, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
     return value + min(0.0, corrections.value[m] - there)
 
 
 @compiled
-def remember(values, corrections, state, best_q, grid, tolerance, scratch):
-    """Renew what is remembered of the cell of ``state``; start where the value there exceeds ``best_q``."""
+def count_visit(corrections, key, episode):
+    """How often the cell was visited in this episode, this visit included.
+
+    A direct-mapped table: where two cells share a place, the later one starts afresh.
+    """
+    tagged = key * 1000003 + episode
+    at = (tagged * 0x9E3779B1 >> 7) & (VISIT_TABLE_SIZE - 1)
+    if corrections.visit_key[at] != tagged:
+        corrections.visit_key[at] = tagged
+        corrections.visits[at] = 0
+    corrections.visits[at] += 1
+    return corrections.visits[at]
+
+
+@compiled
+def visit(values, corrections, state, best_q, episode, grid, tolerance, scratch):
+    """Count a visit to ``state``; renew what is remembered of its cell, or start to remember it (see the module).
+
+    :param best_q: the largest action value at ``state``
+    :param episode: a number that tells episodes (of all environments) apart
+    :param tolerance: excess of the interpolated value that is not yet a wrong promise
+    """
     for k in range(len(state)):
-        scratch.position[k] = state[k] * grid.cells[k]
+        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
     key = cell_key(scratch.position, grid.shape)
     at = find_cell(corrections, key)
     m = corrections.table[at]
+    visits = count_visit(corrections, key, episode)
     if m < 0:
+        if visits <= PATIENCE:
+            return
         value = interpolate(
             values, scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight
         )

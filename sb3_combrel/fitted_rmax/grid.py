@@ -1,5 +1,7 @@
 """The finite sample of states on which Fitted R-Max plans: a uniform grid over the unit box."""
 
+import os
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,43 +16,56 @@ class GridArrays(NamedTuple):
     :param shape: int64, shape (n_variables,): points along each variable
     :param strides: int64, same shape: what one step along a variable adds to a point's number
     :param cells: float64, same shape: cells per unit
+    :param margin: float64, same shape: cells beyond either end of the unit box
+
+    A state with unit coordinates u has *grid coordinates* u * cells + margin: whole numbers at the grid points.
     """
 
     shape: np.ndarray
     strides: np.ndarray
     cells: np.ndarray
+    margin: np.ndarray
 
 
 class StateGrid:
-    """A uniform grid of 2**resolution cells along each variable of the unit box (C order, corners included).
+    """A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
+
+    Effects are relative, so a predicted successor can lie outside the box. In the margin it has a value of its own;
+    beyond that it counts as the nearest point of the grid.
 
     :param n_variables: number of state variables
     :param resolution: one number for all variables, or one for each
+    :param margin: cells beyond either end of the box
     """
 
-    def __init__(self, n_variables: int, resolution: int | Sequence[int]):
+    def __init__(self, n_variables: int, resolution: int | Sequence[int], margin: int = 0):
         per_variable = np.broadcast_to(np.asarray(resolution, dtype=np.int64), (n_variables,))
-        shape = 2**per_variable + 1
+        shape = 2**per_variable + 1 + 2 * margin
         strides = np.concatenate([np.cumprod(shape[:0:-1])[::-1], [1]]).astype(np.int64)
         self.n_variables = n_variables
         self.resolution = tuple(int(r) for r in per_variable)
+        self.margin = margin
         self.n_points = int(np.prod(shape))
-        self.arrays = GridArrays(shape=shape, strides=strides, cells=(2.0**per_variable))
+        self.arrays = GridArrays(
+            shape=shape, strides=strides, cells=2.0**per_variable, margin=np.full(n_variables, float(margin))
+        )
         self._corner_index = np.empty(2**n_variables, dtype=np.int64)
         self._corner_weight = np.empty(2**n_variables)
 
     def points(self) -> np.ndarray:
         """All grid points, unit coordinates, shape (n_points, n_variables)."""
-        axes = [np.linspace(0.0, 1.0, n) for n in self.arrays.shape]
+        axes = [
+            (np.arange(n) - self.margin) / cells for n, cells in zip(self.arrays.shape, self.arrays.cells, strict=True)
+        ]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.n_variables)
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
         """Multilinear interpolation.
 
         :param values: at the grid points, shape (n_points,)
-        :param state: unit coordinates, shape (n_variables,); outside the box the nearest point of it counts
+        :param state: unit coordinates, shape (n_variables,); outside the grid the nearest point of it counts
         """
-        position = state * self.arrays.cells
+        position = state * self.arrays.cells + self.margin
         return interpolate(
             values, position, self.arrays.shape, self.arrays.strides, self._corner_index, self._corner_weight
         )
@@ -65,3 +80,66 @@ def default_resolution(n_variables: int, reach: float) -> int:
     :param reach: distance at which the kernel falls to ``min_weight``, unit coordinates
     """
     return max(3, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
+
+
+# Arrays of a pair and of a point when all of them are settled, from the sizes of ModelArrays and SweepQueue.
+BYTES_PER_PAIR = 700
+BYTES_PER_POINT = 200
+MOST_PAIRS_BY_DEFAULT = 1_000_000
+
+
+def fitting_grid(
+    n_variables: int, n_actions: int, resolution: int | Sequence[int] | None, model_breadth: float, min_weight: float
+) -> StateGrid:
+    """The grid for a task: of the given resolution, or of one that suits the kernel.
+
+    Up to two variables it has a margin of one cell, as the original has states outside the box: there it finds the
+    shorter of two plans more often. With more variables the margin would double the grid for little.
+
+    :raises ValueError: if the grid would not fit in memory
+    """
+    reach = model_breadth * np.sqrt(-np.log(min_weight))
+    margin = 1 if n_variables <= 2 else 0
+    if resolution is None:
+        resolution = default_resolution(n_variables, reach)
+        while resolution > 1 and _n_points(n_variables, resolution, margin) * n_actions > MOST_PAIRS_BY_DEFAULT:
+            resolution -= 1
+    n_points = _n_points(n_variables, resolution, margin)
+    size = n_points * (n_actions * BYTES_PER_PAIR + BYTES_PER_POINT)
+    if size > _memory() / 2:
+        fits = int(np.max(resolution))
+        while fits > 1 and _n_points(n_variables, fits, margin) * (n_actions * BYTES_PER_PAIR) > _memory() / 2:
+            fits -= 1
+        raise ValueError(
+            f"resolution={resolution} with {n_variables} state variables and {n_actions} actions means {n_points:,} grid "
+            f"points and about {size / 2**30:,.1f} GiB of memory, more than half of what this machine has; "
+            f"resolution={fits} fits"
+        )
+    _warn_if_too_coarse(n_variables, resolution, reach, model_breadth)
+    return StateGrid(n_variables, resolution, margin)
+
+
+def _n_points(n_variables: int, resolution: int | Sequence[int], margin: int) -> int:
+    axes = np.broadcast_to(np.asarray(resolution), (n_variables,))
+    return int(np.prod([2 ** int(r) + 1 + 2 * margin for r in axes], dtype=object))
+
+
+def _memory() -> float:
+    """Physical memory in bytes."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return 8 * 2.0**30
+
+
+def _warn_if_too_coarse(n_variables: int, resolution: int | Sequence[int], reach: float, model_breadth: float) -> None:
+    sides = 0.5 ** np.broadcast_to(np.asarray(resolution, dtype=np.float64), (n_variables,))
+    diagonal = float(np.linalg.norm(sides))
+    if diagonal > reach:
+        warnings.warn(
+            f"resolution={resolution} is coarse for model_breadth={model_breadth:g}: a grid cell's diagonal is "
+            f"{diagonal:.3g}, but an instance reaches only {reach:.3g}, so some grid points may stay optimistic for "
+            f"ever; resolution={default_resolution(n_variables, reach)} or model_breadth="
+            f"{model_breadth * diagonal / reach:.3g} would be enough",
+            stacklevel=5,
+        )

@@ -5,17 +5,20 @@ import numpy as np
 from sb3_combrel.common.instances import InstanceArrays, put_instance
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.pool import Pool
+from sb3_combrel.common.supply import Supply
 from sb3_combrel.fitted_rmax.grid import StateGrid
 from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
-    Supply,
     enter_lists,
     leave_lists,
     points_in_reach,
     settle,
 )
 from sb3_combrel.transfer.base import Transfer
+
+
+MOST_PAIRS_AT_ONCE = 4096
 
 
 class KernelModel:
@@ -90,11 +93,11 @@ class KernelModel:
         :param terminated: the episode ended in a terminal state; a time limit is none
         :return: the pairs whose model changed, int64
         """
-        slot, changed = self._slot_for(action)
+        slot, without = self._slot_for(action)
         put_instance(self.instances, action, slot, state, next_state, reward, terminated)
         self._extend_reach(next_state - state)
-        changed = np.concatenate([changed, self._enter(state, action, slot)])
-        return changed
+        changed = self._enter(state, action, slot)
+        return changed if len(without) == 0 else np.union1d(without, changed)
 
     def _slot_for(self, action: int) -> tuple[int, np.ndarray]:
         """Where a new instance goes, and the pairs that lost one to make room."""
@@ -139,15 +142,35 @@ class KernelModel:
 
     def settle(self, pairs: np.ndarray) -> None:
         """Bring the rows of ``pairs`` up to date: with their lists, and with what transfer has for them."""
-        supply = self._supply_for(pairs)
-        done = 0
-        while True:
-            done = settle(
-                self.arrays, self.instances, self.grid.arrays, self.gamma, pairs, done, supply, self._scratch
-            )
-            if done == len(pairs):
-                return
-            self.arrays = self.arrays._replace(rows=self.arrays.rows.grown())
+        for first in range(0, len(pairs), MOST_PAIRS_AT_ONCE):
+            some = pairs[first : first + MOST_PAIRS_AT_ONCE]
+            supply = self._supply_for(some)
+            done = 0
+            while done < len(some):
+                done = settle(
+                    self.arrays, self.instances, self.grid.arrays, self.gamma, some, done, supply, self._scratch
+                )
+                if done < len(some):
+                    self.arrays = self.arrays._replace(rows=self.arrays.rows.grown())
 
     def _supply_for(self, pairs: np.ndarray) -> Supply:
-        return Supply.none(len(pairs), self.grid.n_variables)
+        if self.transfer is None:
+            return Supply.none(len(pairs), self.grid.n_variables)
+        return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
+
+    def restore(self, known: np.ndarray) -> None:
+        """Rebuild lists and rows after instances were written to :attr:`instances` directly.
+
+        :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
+        """
+        arrays = self.arrays
+        self.arrays = arrays._replace(members=np.zeros((self.n_actions, self.instances.capacity), dtype=np.int32))
+        for action in range(self.n_actions):
+            for slot in range(self.instances.count[action]):
+                self._enter(self.instances.state[action, slot], action, slot)
+            if self.instances.count[action]:
+                effects = self.instances.effect[action, : self.instances.count[action]]
+                self._extend_reach(effects.min(axis=0))
+                self._extend_reach(effects.max(axis=0))
+        self.arrays.known[:] |= known & (self.arrays.lists.length > 0)
+        self.settle(np.arange(len(known)))

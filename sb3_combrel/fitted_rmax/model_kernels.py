@@ -34,34 +34,6 @@ class ModelArrays(NamedTuple):
     members: np.ndarray
 
 
-class Supply(NamedTuple):
-    """Transferred instances for a number of state-action pairs, one pair a row (see ``Transfer.supply``).
-
-    :param count: int64, shape (n,): instances for each pair, 0 if the pair cannot be settled
-    :param weight: float64, shape (n, most)
-    :param effect: float64, shape (n, most, n_variables): predicted displacement, unit coordinates of the target
-    :param reward: float64, shape (n, most)
-    :param terminated: bool, shape (n, most)
-    """
-
-    count: np.ndarray
-    weight: np.ndarray
-    effect: np.ndarray
-    reward: np.ndarray
-    terminated: np.ndarray
-
-    @classmethod
-    def none(cls, n: int, n_variables: int) -> "Supply":
-        """Nothing for any of ``n`` pairs."""
-        return cls(
-            count=np.zeros(n, dtype=np.int64),
-            weight=np.empty((n, 0)),
-            effect=np.empty((n, 0, n_variables)),
-            reward=np.empty((n, 0)),
-            terminated=np.empty((n, 0), dtype=np.bool_),
-        )
-
-
 class Scratch(NamedTuple):
     """Work space of the compiled loops, allocated once.
 
@@ -118,12 +90,13 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
     d = len(state)
     reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
     for k in range(d):
-        scratch.first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k])))
-        scratch.last[k] = min(grid.shape[k], int(np.floor((state[k] + reach) * grid.cells[k])) + 1)
+        scratch.first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin[k])))
+        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin[k])) + 1
+        scratch.last[k] = min(grid.shape[k], beyond)
         if scratch.first[k] >= scratch.last[k]:
             return 0
         for j in range(scratch.first[k], scratch.last[k]):
-            apart = (j / grid.cells[k] - state[k]) / breadth
+            apart = ((j - grid.margin[k]) / grid.cells[k] - state[k]) / breadth
             scratch.kernel[k, j] = np.exp(-apart * apart)
         scratch.at[k] = scratch.first[k]
     found = 0

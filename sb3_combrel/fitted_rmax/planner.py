@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from sb3_combrel.common.compiled import compiled
+from sb3_combrel.fitted_rmax.model import KernelModel
 
 N_LEVELS = 24
 
@@ -150,3 +151,60 @@ def sweep(values, arrays, queue, changed, reach_low, reach_high, grid, bounds, t
         backups += 1
         announce(values, arrays.n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at)
     return backups + len(changed)
+
+
+class Planner:
+    """The value function at the grid points, kept near the fixed point of the model's backups.
+
+    :param model: the kernel model, whose pairs are all optimistic or will be announced to :meth:`update`
+    :param max_value: value of an optimistic pair, and upper bound of all values
+    :param min_value: lower bound of all values, reached only by states that lead nowhere
+    :param tolerance: changes up to this are not passed on
+    """
+
+    def __init__(self, model: KernelModel, *, max_value: float, min_value: float, tolerance: float):
+        self.model = model
+        self.tolerance = tolerance
+        self.bounds = (float(min_value), float(max_value))
+        self.values = np.full(model.grid.n_points, float(max_value))
+        self.queue = SweepQueue.empty(self.values)
+        self._at = np.empty((3, model.grid.n_variables), dtype=np.int64)
+
+    def update(self, pairs: np.ndarray, max_backups: int) -> int:
+        """Bring the rows of ``pairs`` up to date, then back up these points and what waits, largest change first.
+
+        :param pairs: pairs whose model changed
+        :param max_backups: of the points that wait; the others wait for the next call
+        :return: backups done
+        """
+        self.model.settle(pairs)
+        return self.sweep(pairs % self.model.grid.n_points, max_backups)
+
+    def sweep(self, points: np.ndarray, max_backups: int) -> int:
+        """Back up ``points``, then up to ``max_backups`` of those that wait; how many it did."""
+        model = self.model
+        return sweep(
+            self.values,
+            model.arrays,
+            self.queue,
+            points,
+            model.reach_low,
+            model.reach_high,
+            model.grid.arrays,
+            self.bounds,
+            self.tolerance,
+            max_backups,
+            self._at,
+        )
+
+    def restore(self, values: np.ndarray) -> None:
+        """Take over saved values; every point with a row is backed up once more when there is time."""
+        self.values[:] = np.clip(values, *self.bounds)
+        self.queue = SweepQueue.empty(self.values)
+        for point in np.flatnonzero(self.model.arrays.n_optimistic == 0):
+            push(self.queue, point, 0)
+
+    @property
+    def n_waiting(self) -> int:
+        """Grid points that wait for a backup."""
+        return int((self.queue.level >= 0).sum())

@@ -54,11 +54,11 @@ def look_around(instances, state, breadth, min_weight, min_fraction, query):
 
 @compiled
 def add_successor(p, state, effect, values, corrections, grid, query):
-    """(discountless value, probability to stay) that one instance adds to a backup at ``state``."""
+    """(undiscounted value, probability to stay) that one instance adds to a backup at ``state``."""
     moved = 0.0
     for k in range(len(state)):
         last = float(grid.shape[k] - 1)
-        here = state[k] * grid.cells[k]
+        here = state[k] * grid.cells[k] + grid.margin[k]
         there = min(max(here + effect[k] * grid.cells[k], 0.0), last)
         moved = max(moved, abs(there - here))
         query.position[k] = there

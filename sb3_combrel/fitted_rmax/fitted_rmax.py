@@ -1,0 +1,385 @@
+"""Fitted R-Max as an algorithm of Stable-Baselines3: the learning loop, nothing numerical."""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.registry import make_transfer
+
+SelfFittedRMax = TypeVar("SelfFittedRMax", bound="FittedRMax")
+
+DEFAULT_TIMESTEPS = 20_000
+
+
+class FittedRMax(BaseAlgorithm):
+    """
+    Fitted R-Max: model-based exploration in continuous state spaces.
+
+    Paper: Jong & Stone, "Model-based exploration in continuous state spaces" (SARA 2007). Transfer: Taylor, Jong &
+    Stone 2008 (TIMBREL); Fachantidis et al. (COMBREL). For small Box observation spaces (up to about five state
+    variables) and Discrete actions, where every environment step counts.
+
+    Every state variable is divided by its range. A kernel model per action predicts rewards and relative effects from
+    the instances near a state; a state-action pair with too little data is optimistic, its value is ``max_value``;
+    dynamic programming on a uniform grid of states, after every step, turns this into a value function that leads to
+    where things are unknown or good. Deviations from the original, and why:
+
+    - Successors are cut at the edge of the grid, one cell beyond the box for up to two state variables and the box
+      itself for more: far fewer states, and no worse learning.
+    - A pair that was known once stays known (the original falls back when a nearer instance shortens its list).
+    - Planning is bounded by ``max_backups`` a step, the largest changes first; the rest is done as time comes, at an
+      episode's end at the latest. Staying in a grid point is summed in closed form.
+    - Where the agent comes back to the same place again and again, a wrong promise of the interpolated value is
+      corrected (see ``sb3_combrel.fitted_rmax.corrections``): a plain implementation can stick there for ever.
+    - A time limit is not a terminal state.
+
+    ``predict(obs, deterministic=True)`` takes the best action that has a model, ``deterministic=False`` the optimistic
+    ones first, as in learning.
+
+    Cost: a step's time grows with the instances near it and in a slow line with all instances (a look at one box for
+    every 8 of them); memory is about 150 bytes an instance, and per state-action pair of the grid, once known, some
+    500 bytes. Both are bounded, by ``max_instances`` and by the grid.
+
+    :param policy: "FittedRMaxPolicy" (or "MlpPolicy", for habit's sake); may be left out: ``FittedRMax(env)``
+    :param env: the environment to learn from (if registered in Gymnasium, can be a str)
+    :param transfer: a transfer method, such as ``COMBREL(source)``; or a dict, as in RL-Zoo's YAML files, from the
+        method's name to its arguments. A copy of it is used.
+    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: 1/16 for one or two state
+        variables, 0.15 for three, 0.2 for more. Smaller is more exact and explores more.
+    :param min_fraction: an instance counts while it has this part of the weight of the nearer ones; 0.1 keeps at most
+        11 instances a pair, 0.01 (the original's) 101
+    :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach
+    :param exploration_threshold: weight of instances that makes a state-action pair known
+    :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: the
+        coarsest that suits the breadth, at least 3, as far as memory goes.
+    :param max_value: an upper bound on the return from any state, the value of what is unknown
+    :param gamma: discount factor, in (0, 1]
+    :param planning_tolerance: changes of value up to this are not passed on
+    :param max_backups: grid points backed up in a step at most, besides those whose model changed
+    :param max_instances: of one action; beyond, the instance that fewest grid points rely on gives way. None: no limit.
+    :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
+        where those are infinite
+    :param stats_window_size: window size for the rollout logging, in episodes
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: seed of all chance
+    :param device: where the tensors of a saved policy go; the work is done on the CPU
+    :param _init_setup_model: whether or not to build the model at the creation of the instance
+    :raises ValueError: if an argument is out of its range or does not fit the environment
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "FittedRMaxPolicy": FittedRMaxPolicy,
+        "MlpPolicy": FittedRMaxPolicy,
+    }
+    policy: FittedRMaxPolicy
+
+    def __init__(
+        self,
+        policy: str | type[FittedRMaxPolicy] | GymEnv = "FittedRMaxPolicy",
+        env: GymEnv | str | type[FittedRMaxPolicy] | None = None,
+        transfer: Transfer | dict[str, Any] | str | None = None,
+        model_breadth: float | None = None,
+        min_fraction: float = 0.1,
+        min_weight: float = 0.01,
+        exploration_threshold: float = 1.0,
+        resolution: int | Sequence[int] | None = None,
+        max_value: float = 0.0,
+        gamma: float = 1.0,
+        planning_tolerance: float = 0.01,
+        max_backups: int = 200,
+        max_instances: int | None = 20_000,
+        bounds: tuple[Any, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        policy, env = _policy_first(policy, env)
+        super().__init__(
+            policy,
+            env,
+            learning_rate=0.0,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        self.transfer = transfer
+        self.model_breadth = model_breadth
+        self.min_fraction = min_fraction
+        self.min_weight = min_weight
+        self.exploration_threshold = exploration_threshold
+        self.resolution = resolution
+        self.max_value = max_value
+        self.gamma = gamma
+        self.planning_tolerance = planning_tolerance
+        self.max_backups = max_backups
+        self.max_instances = max_instances
+        self.bounds = bounds
+        self._best_return = -np.inf
+        self._warned_of_max_value = False
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.env is not None:
+            _refuse_normalized_observations(self.env)
+        if self.seed is None:
+            # A script that seeds numpy is then reproducible, as with the other algorithms.
+            self._rng = np.random.default_rng(np.random.randint(2**31))
+        self.set_random_seed(self.seed)
+        names = _names(self.env)
+        self.policy = self.policy_class(
+            self.observation_space,
+            self.action_space,
+            model_breadth=self._breadth(),
+            min_fraction=self.min_fraction,
+            min_weight=self.min_weight,
+            exploration_threshold=self.exploration_threshold,
+            resolution=self.resolution,
+            max_value=self.max_value,
+            gamma=self.gamma,
+            planning_tolerance=self.planning_tolerance,
+            max_backups=self.max_backups,
+            max_instances=self.max_instances,
+            bounds=self.bounds,
+            transfer=make_transfer(self.transfer),
+            rng=self._rng,
+            **names,
+            **self.policy_kwargs,
+        )
+        self.policy = self.policy.to(self.device)
+        self._episode_rewards: list[list[float]] = []
+        self._backups = 0
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        super().set_random_seed(seed)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+            if getattr(self, "policy", None) is not None:
+                self.policy.rng = self._rng
+
+    def _breadth(self) -> float:
+        if self.model_breadth is not None:
+            return self.model_breadth
+        n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
+        return {1: 1 / 16, 2: 1 / 16, 3: 0.15}.get(n_variables, 0.2)
+
+    def _check_arguments(self) -> None:
+        if not isinstance(self.action_space, spaces.Discrete):
+            raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
+        n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
+        if self.model_breadth is not None:
+            check_positive("model_breadth", self.model_breadth)
+        check_positive("min_fraction", self.min_fraction, largest=1.0)
+        check_positive("min_weight", self.min_weight, largest=0.99)
+        check_positive("exploration_threshold", self.exploration_threshold)
+        check_positive("gamma", self.gamma, largest=1.0)
+        check_positive("planning_tolerance", self.planning_tolerance)
+        check_finite("max_value", self.max_value)
+        check_count("max_backups", self.max_backups, least=0)
+        check_count("max_instances", self.max_instances, none_allowed=True)
+        check_resolution(self.resolution, n_variables)
+
+    def learn(
+        self: SelfFittedRMax,
+        total_timesteps: int = DEFAULT_TIMESTEPS,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "FittedRMax",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFittedRMax:
+        """
+        Learn, and return the trained model.
+
+        :param total_timesteps: environment steps, of all environments together
+        :param callback: callback(s) called at every step
+        :param log_interval: episodes between two logs; None for none
+        :param tb_log_name: the name of the run for TensorBoard logging
+        :param reset_num_timesteps: whether to start the count of steps anew (what was learned stays in any case)
+        :param progress_bar: display a progress bar using tqdm and rich
+        :raises ValueError: if ``total_timesteps`` is below 1 or the environment returns something that is not finite
+        """
+        check_count("total_timesteps", total_timesteps)
+        if self.env is None:
+            raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        self._episode_rewards = [[] for _ in range(self.n_envs)]
+        self._episode_tags = np.arange(self.n_envs)
+        try:
+            while self.num_timesteps < total_timesteps:
+                if not self._step(callback, log_interval):
+                    break
+                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+        finally:
+            callback.on_training_end()
+        return self
+
+    def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
+        """One step of every environment; False if a callback wants to stop."""
+        assert self.env is not None and isinstance(self._last_obs, np.ndarray)
+        states = self.policy.to_unit(self._last_obs)
+        choices = [self.policy.explore(state, tag) for state, tag in zip(states, self._episode_tags, strict=True)]
+        actions = np.array(choices) + self.policy._first_action
+        new_obs, rewards, dones, infos = self.env.step(actions)
+        self.num_timesteps += self.env.num_envs
+        self._update_info_buffer(infos, dones)
+        raw_rewards = self._raw_rewards(rewards)
+        next_obs, terminated = _true_outcomes(new_obs, dones, infos)
+        next_states = self.policy.to_unit(next_obs)
+        for e, choice in enumerate(choices):
+            self._backups += self.policy.learn_from(
+                states[e], choice, float(raw_rewards[e]), next_states[e], bool(terminated[e])
+            )
+            self._episode_rewards[e].append(float(raw_rewards[e]))
+        self._last_obs = new_obs  # type: ignore[assignment]
+        self._last_episode_starts = dones
+        callback.update_locals(locals())
+        if not callback.on_step():
+            return False
+        for e in np.flatnonzero(dones):
+            self._end_episode(int(e), bool(terminated[e]))
+            if log_interval is not None and self._episode_num % log_interval == 0:
+                self.dump_logs()
+        return True
+
+    def _raw_rewards(self, rewards: np.ndarray) -> np.ndarray:
+        """The environment's own rewards: a normalization that drifts would mix scales in one model."""
+        raw = self._vec_normalize_env.get_original_reward() if self._vec_normalize_env is not None else rewards
+        if not np.isfinite(raw).all():
+            raise ValueError(f"the environment returned a reward that is not finite: {raw}")
+        return raw
+
+    def _end_episode(self, env_index: int, terminated: bool) -> None:
+        self._episode_num += 1
+        self._episode_tags[env_index] += self.n_envs
+        self._backups += self.policy.end_episode()
+        rewards = self._episode_rewards[env_index]
+        self._episode_rewards[env_index] = []
+        if terminated or min(rewards) >= 0.0:
+            self._compare_with_max_value(rewards)
+
+    def _compare_with_max_value(self, rewards: list[float]) -> None:
+        """Warn, once, of a ``max_value`` that is no upper bound: optimism then fails, and exploration with it."""
+        best, value = -np.inf, 0.0
+        for reward in reversed(rewards):
+            value = reward + self.gamma * value
+            best = max(best, value)
+        self._best_return = max(self._best_return, best)
+        if not self._warned_of_max_value and best > self.max_value + 1e-6 * max(1.0, abs(self.max_value)):
+            self._warned_of_max_value = True
+            warnings.warn(
+                f"max_value={self.max_value:g} must be an upper bound on the return (discounted with gamma={self.gamma:g}), "
+                f"but a return of {best:g} was observed; pass a larger max_value, or the agent will stop exploring too soon",
+                stacklevel=2,
+            )
+
+    def dump_logs(self) -> None:
+        """Write log data."""
+        assert self.ep_info_buffer is not None and self.ep_success_buffer is not None
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        self.logger.record("time/episodes", self._episode_num, exclude="tensorboard")
+        if len(self.ep_info_buffer) > 0:
+            self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
+            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
+        if len(self.ep_success_buffer) > 0:
+            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
+        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        for name, value in self.policy.statistics().items():
+            self.logger.record(name, value)
+        self.logger.record("planner/backups", self._backups)
+        self.logger.dump(step=self.num_timesteps)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        _refuse_normalized_observations(self.env)
+        self._vec_normalize_env = unwrap_vec_normalize(self.env)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_tags"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], []
+
+
+def _policy_first(policy: Any, env: Any) -> tuple[Any, Any]:
+    """Policy and environment, whichever was given first."""
+    if _is_policy(policy):
+        return policy, env
+    return (env if _is_policy(env) else "FittedRMaxPolicy"), policy
+
+
+def _is_policy(thing: Any) -> bool:
+    if isinstance(thing, str):
+        return thing in FittedRMax.policy_aliases or (thing.endswith("Policy") and thing.isidentifier())
+    return isinstance(thing, type) and issubclass(thing, BasePolicy)
+
+
+def _names(env: VecEnv | None) -> dict[str, Any]:
+    """Names of state variables and actions, where the environment has them."""
+    if env is None:
+        return {}
+    found = {}
+    for name in ("state_names", "action_names"):
+        try:
+            value = env.get_attr(name, 0)[0]
+        except AttributeError:
+            continue
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            found[name] = value
+    return found
+
+
+def _refuse_normalized_observations(env: VecEnv) -> None:
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is not None and normalizer.norm_obs:
+        raise ValueError(
+            "FittedRMax cannot work with VecNormalize(norm_obs=True): its statistics drift, and the model's grid is fixed. "
+            "Use VecNormalize(norm_obs=False); FittedRMax scales observations by their bounds itself"
+        )
+
+
+def _true_outcomes(
+    new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each step led, before an environment reset itself, and whether that was a terminal state."""
+    next_obs = np.array(new_obs)
+    terminated = np.array(dones, dtype=bool)
+    for e in np.flatnonzero(dones):
+        next_obs[e] = infos[e]["terminal_observation"]
+        terminated[e] = not infos[e].get("TimeLimit.truncated", False)
+    return next_obs, terminated

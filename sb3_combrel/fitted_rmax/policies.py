@@ -1,0 +1,377 @@
+"""The policy of Fitted R-Max: Q at a state, the greedy action, and what of it is saved."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+
+from sb3_combrel.common.instances import InstanceArrays, put_instance
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.supply import Supply
+from sb3_combrel.fitted_rmax.corrections import CorrectionArrays, find_cell, visit
+from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
+from sb3_combrel.fitted_rmax.model import KernelModel
+from sb3_combrel.fitted_rmax.planner import Planner
+from sb3_combrel.fitted_rmax.q_values import QueryScratch, look_around, q_values
+from sb3_combrel.transfer.base import TargetTask, Transfer
+
+# Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
+# enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
+LONGEST_PLAN = 10_000
+
+
+class FittedRMaxPolicy(BasePolicy):
+    """
+    Acts greedily on the action values of a kernel model (see :class:`FittedRMax` for the parameters).
+
+    Its ``state_dict`` holds float64 tensors made from the arrays of the compiled code: the instances, the values of the
+    grid points, which pairs are known, and the corrections. Everything else is rebuilt from these.
+
+    :param observation_space: a one-dimensional Box
+    :param action_space: Discrete
+    :param lr_schedule: not used; SB3 passes one to every policy
+    :param transfer: a transfer method of the policy's own, bound here
+    :param rng: source of all chance (ties, transfer)
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        *,
+        model_breadth: float = 1 / 16,
+        min_fraction: float = 0.01,
+        min_weight: float = 0.01,
+        exploration_threshold: float = 1.0,
+        resolution: int | Sequence[int] | None = None,
+        max_value: float = 0.0,
+        gamma: float = 1.0,
+        planning_tolerance: float = 0.01,
+        max_backups: int = 200,
+        max_instances: int | None = 20_000,
+        bounds: tuple[Any, Any] | None = None,
+        transfer: Transfer | None = None,
+        state_names: Sequence[str] | None = None,
+        action_names: Sequence[str] | None = None,
+        rng: np.random.Generator | None = None,
+    ):
+        super().__init__(observation_space, action_space, normalize_images=False)
+        self.kernel = (float(model_breadth), float(min_weight), float(min_fraction))
+        self.exploration_threshold = float(exploration_threshold)
+        self.gamma = float(gamma)
+        self.max_backups = max_backups
+        self.transfer = transfer
+        self.rng = np.random.default_rng() if rng is None else rng
+        self.scaling = StateScaling.from_space(observation_space, bounds)
+        self.n_actions = int(action_space.n)
+        self._first_action = int(action_space.start)
+        self._constructor_parameters = dict(
+            model_breadth=model_breadth,
+            min_fraction=min_fraction,
+            min_weight=min_weight,
+            exploration_threshold=exploration_threshold,
+            resolution=resolution,
+            max_value=max_value,
+            gamma=gamma,
+            planning_tolerance=planning_tolerance,
+            max_backups=max_backups,
+            max_instances=max_instances,
+            bounds=bounds,
+        )
+        grid = fitting_grid(self.scaling.n_variables, self.n_actions, resolution, model_breadth, min_weight)
+        if transfer is not None:
+            transfer.bind(self._target_task(grid, state_names, action_names), self.rng)
+        self.model = KernelModel(
+            grid,
+            self.n_actions,
+            model_breadth=model_breadth,
+            min_weight=min_weight,
+            min_fraction=min_fraction,
+            exploration_threshold=exploration_threshold,
+            gamma=gamma,
+            transfer=transfer,
+            max_instances=max_instances,
+        )
+        self.planner = Planner(
+            self.model, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=planning_tolerance
+        )
+        self.corrections = CorrectionArrays.empty(grid.n_variables)
+        self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
+        self._no_supply = Supply.none(self.n_actions, grid.n_variables)
+        self._q = np.empty(self.n_actions)
+        self._unsettled: list[np.ndarray] = []
+        self._warned_outside = False
+
+    def _target_task(
+        self, grid: StateGrid, state_names: Sequence[str] | None, action_names: Sequence[str] | None
+    ) -> TargetTask:
+        return TargetTask(
+            scaling=self.scaling,
+            n_actions=self.n_actions,
+            sample_states=grid.points(),
+            exploration_threshold=self.exploration_threshold,
+            min_weight=self.kernel[1],
+            min_fraction=self.kernel[2],
+            state_names=tuple(state_names or (f"s{k}" for k in range(grid.n_variables))),
+            action_names=tuple(action_names or (f"a{k}" for k in range(self.n_actions))),
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
+        return {**spaces_of_both, **self._constructor_parameters}
+
+    # ------------------------------------------------------------------ acting
+
+    def to_unit(self, observations: np.ndarray) -> np.ndarray:
+        """
+        Unit coordinates of observations; what lies outside the bounds is moved to the boundary, with one warning.
+
+        :param observations: raw units, shape (..., n_variables)
+        :raises ValueError: if an observation is not finite
+        """
+        if not np.isfinite(observations).all():
+            raise ValueError(f"the environment returned an observation that is not finite: {observations}")
+        unit = self.scaling.to_unit(observations)
+        inside = np.clip(unit, 0.0, 1.0)
+        if not self._warned_outside and np.abs(unit - inside).max(initial=0.0) > 1e-6:
+            self._warned_outside = True
+            warnings.warn(
+                f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
+                "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)",
+                stacklevel=2,
+            )
+        return inside
+
+    def q_values(self, state: np.ndarray) -> np.ndarray:
+        """
+        Action values at an exact state; optimistic actions have ``max_value``.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :return: shape (n_actions,)
+        """
+        breadth, min_weight, min_fraction = self.kernel
+        look_around(self.model.instances, state, breadth, min_weight, min_fraction, self._query)
+        supply = self._no_supply if self.transfer is None else self.transfer.supply_at(state, self._query.total)
+        q_values(
+            self.model.instances,
+            state,
+            self.exploration_threshold,
+            self.gamma,
+            self.planner.values,
+            self.corrections,
+            self.model.grid.arrays,
+            self.planner.bounds,
+            supply,
+            self._query,
+            self._q,
+        )
+        return self._q.copy()
+
+    def explore(self, state: np.ndarray, episode: int) -> int:
+        """
+        The action to learn from: greedy, ties broken at random, so optimistic actions come first.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :param episode: a number that tells the episodes of all environments apart
+        :return: action, from 0 on
+        """
+        q = self.q_values(state)
+        best = q.max()
+        self.corrections = self.corrections.with_room()
+        visit(
+            self.planner.values,
+            self.corrections,
+            state,
+            best,
+            episode,
+            self.model.grid.arrays,
+            5 * self.planner.tolerance,
+            self._query,
+        )
+        ties = np.flatnonzero(q == best)
+        return int(ties[0] if len(ties) == 1 else ties[self.rng.integers(len(ties))])
+
+    def exploit(self, state: np.ndarray) -> int:
+        """
+        The best action of those that have a model: an evaluation must not depend on trying things out.
+
+        :param state: unit coordinates, shape (n_variables,)
+        """
+        q = self.q_values(state)
+        modelled = q < self.planner.bounds[1]
+        return int(np.where(modelled, q, -np.inf).argmax()) if modelled.any() else 0
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        states = self.to_unit(np.asarray(observation.cpu().numpy(), dtype=np.float64))  # type: ignore[union-attr]
+        actions = [self.exploit(state) if deterministic else self._sample(state) for state in states]
+        return th.as_tensor(np.array(actions) + self._first_action, device=observation.device)  # type: ignore[union-attr]
+
+    def _sample(self, state: np.ndarray) -> int:
+        """Greedy with optimistic actions first, as in learning, but without a trace."""
+        q = self.q_values(state)
+        return int(self.rng.choice(np.flatnonzero(q == q.max())))
+
+    # ---------------------------------------------------------------- learning
+
+    def learn_from(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> int:
+        """
+        Take up one transition and plan.
+
+        :param state: unit coordinates; ``next_state``: the same
+        :param action: from 0 on
+        :param terminated: in a terminal state; a time limit is none
+        :return: backups done
+        """
+        self._widen(reward)
+        self._unsettled.append(self.model.add(state, action, reward, next_state, terminated))
+        if self.transfer is not None:
+            self.transfer.observe(state, action, reward, next_state, terminated)
+            self._unsettled.append(self.transfer.renewed())
+        # Left on the list until all is done: an interrupt in between loses no change.
+        pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
+        backups = self.planner.update(pairs, self.max_backups)
+        self._unsettled = []
+        return backups
+
+    def end_episode(self) -> int:
+        """Time to think: plan on while no action is due; backups done."""
+        if self.transfer is not None:
+            self.transfer.end_episode()
+            self._unsettled.append(self.transfer.renewed())
+        pairs = np.unique(np.concatenate(self._unsettled)) if self._unsettled else np.empty(0, dtype=np.int64)
+        backups = self.planner.update(pairs, 50 * self.max_backups)
+        self._unsettled = []
+        return backups
+
+    def _widen(self, reward: float) -> None:
+        """Keep the lower bound of the values below what the worst reward seen could add up to."""
+        low, high = self.planner.bounds
+        lowest = min(0.0, high) + LONGEST_PLAN * min(0.0, reward)
+        if lowest < low:
+            self.planner.bounds = (lowest, high)
+
+    def statistics(self) -> dict[str, float]:
+        """Figures for the logger, by name."""
+        arrays = self.model.arrays
+        settled = float(arrays.settled.mean())
+        known = float(arrays.known.mean())
+        figures = {
+            "model/instances": self.model.n_instances,
+            "model/known": known,
+            "model/transferred": settled - known,
+            "model/optimistic": 1.0 - settled,
+            "planner/waiting": self.planner.n_waiting,
+            "planner/corrections": int(self.corrections.count[0]),
+        }
+        return figures if self.transfer is None else {**figures, **self.transfer.statistics()}
+
+    # ------------------------------------------------------- what is saved of it
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        for name, array in self._saved_arrays().items():
+            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64), device=self.device)
+
+    def _saved_arrays(self) -> dict[str, np.ndarray]:
+        instances = self.model.instances
+        by_action = []
+        for action, count in enumerate(instances.count):
+            columns = [
+                np.full((count, 1), action),
+                instances.state[action, :count],
+                instances.effect[action, :count],
+                instances.reward[action, :count, None],
+                instances.terminated[action, :count, None],
+            ]
+            by_action.append(np.hstack(columns))
+        n = int(self.corrections.count[0])
+        return {
+            "instances": np.vstack(by_action),
+            "values": self.planner.values,
+            "known": self.model.arrays.known,
+            "lowest_value": np.array([self.planner.bounds[0]]),
+            "corrections": np.column_stack(
+                [self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]
+            ),
+        }
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        saved = {}
+        for name in self._saved_arrays():
+            if prefix + name in state_dict:
+                saved[name] = state_dict[prefix + name].detach().cpu().numpy().astype(np.float64)
+            else:
+                missing_keys.append(prefix + name)
+        ours = set(self._saved_arrays())
+        unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in ours)
+        if len(saved) == len(ours):
+            problem = self._misfit(saved)
+            if problem:
+                error_msgs.append(problem)
+            else:
+                self._restore(saved)
+
+    def _misfit(self, saved: dict[str, np.ndarray]) -> str:
+        """What is wrong with the shapes of saved arrays; empty if nothing."""
+        n_columns = 2 * self.scaling.n_variables + 3
+        if saved["instances"].ndim != 2 or saved["instances"].shape[1] != n_columns:
+            return f"instances must have {n_columns} columns, got shape {saved['instances'].shape}"
+        for name, n in (("values", self.model.grid.n_points), ("known", self.model.grid.n_points * self.n_actions)):
+            if saved[name].shape != (n,):
+                return f"{name} must have shape ({n},) for this grid, got {saved[name].shape}"
+        return ""
+
+    def _restore(self, saved: dict[str, np.ndarray]) -> None:
+        model, d = self.model, self.scaling.n_variables
+        rows = saved["instances"]
+        actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
+        fresh = KernelModel(
+            model.grid,
+            self.n_actions,
+            model_breadth=model.model_breadth,
+            min_weight=model.min_weight,
+            min_fraction=model.min_fraction,
+            exploration_threshold=model.exploration_threshold,
+            gamma=model.gamma,
+            transfer=model.transfer,
+            max_instances=model.max_instances,
+        )
+        instances = InstanceArrays.empty(self.n_actions, d)
+        for action, row in zip(actions, rows, strict=True):
+            instances = instances.with_room(action)
+            state, effect = row[1 : 1 + d], row[1 + d : 1 + 2 * d]
+            slot = instances.count[action]
+            put_instance(instances, action, slot, state, state + effect, row[-2], bool(row[-1] > 0.5))
+            instances.effect[action, slot] = effect
+        fresh.instances = instances
+        fresh.restore(saved["known"] > 0.5)
+        self.model = self.planner.model = fresh
+        self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])
+        self.planner.restore(saved["values"])
+        self.corrections = CorrectionArrays.empty(d)
+        for key, value, *state in saved["corrections"]:
+            self.corrections = self.corrections.with_room()
+            n = int(self.corrections.count[0])
+            self.corrections.table[find_cell(self.corrections, int(key))] = n
+            self.corrections.key[n], self.corrections.value[n], self.corrections.state[n] = int(key), value, state
+            self.corrections.count[0] = n + 1

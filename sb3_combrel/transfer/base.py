@@ -1,0 +1,97 @@
+"""What Fitted R-Max asks of a transfer method."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_combrel.common.scaling import StateScaling
+
+if TYPE_CHECKING:
+    from sb3_combrel.common.supply import Supply
+
+
+@dataclass(frozen=True)
+class TargetTask:
+    """The target task, as a transfer method sees it.
+
+    :param scaling: raw <-> unit coordinates
+    :param n_actions: number of actions
+    :param sample_states: the finite sample of states, unit coordinates, shape (n_points, n_variables); pair
+        ``action * n_points + point`` is a state-action pair of it
+    :param exploration_threshold: weight that settles a pair
+    :param min_weight: instances with less weight do not count
+    :param min_fraction: nearest first, an instance counts while it has this part of the weight before it
+    :param state_names: names of the state variables, for display
+    :param action_names: names of the actions, for display
+    """
+
+    scaling: StateScaling
+    n_actions: int
+    sample_states: np.ndarray
+    exploration_threshold: float
+    min_weight: float
+    min_fraction: float
+    state_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+
+    @property
+    def n_variables(self) -> int:
+        """Number of state variables."""
+        return self.scaling.n_variables
+
+
+class Transfer(ABC):
+    """A transfer method: it observes the target task, and supplies translated source instances.
+
+    It is asked for instances of a pair only while the target's own instances do not settle that pair. A transfer
+    object given to an algorithm is a description; the algorithm binds a copy of it to its task.
+    """
+
+    @abstractmethod
+    def bind(self, target: TargetTask, rng: np.random.Generator) -> None:
+        """Get ready to transfer to ``target``.
+
+        :param rng: source of all chance
+        :raises ValueError: if source or mappings do not fit the target
+        """
+
+    @abstractmethod
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        """Take notice of a transition of the target task (unit coordinates)."""
+
+    def end_episode(self) -> None:
+        """Take notice that an episode has ended."""
+
+    @abstractmethod
+    def renewed(self) -> np.ndarray:
+        """The pairs for which :meth:`supply` has something else to say than before, since the last call; int64."""
+
+    @abstractmethod
+    def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
+        """Translated instances for pairs of the sample.
+
+        :param pairs: shape (n,)
+        :param own_weight: sum of the weights of each pair's own instances, shape (n,)
+        :param known: pairs that need none, bool, shape (n,)
+        :return: for each pair instances that together with its own reach the threshold, or none
+        """
+
+    @abstractmethod
+    def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
+        """The same at an exact state, one row an action.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :param own_weight: shape (n_actions,); actions that reach the threshold need nothing
+        """
+
+    @abstractmethod
+    def spec(self) -> dict[str, Any]:
+        """The description as plain data (JSON), source instances excepted: see :meth:`source_arrays`."""
+
+    def statistics(self) -> dict[str, float]:
+        """Figures for the logger, by name."""
+        return {}

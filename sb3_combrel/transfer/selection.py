@@ -1,0 +1,72 @@
+"""Which of many instances to keep: at random, or so that they cover the task's states."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def random_rows(terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Generator) -> Ints:
+    """
+    A uniform sample without replacement, with at least one terminal instance if there is any.
+
+    :param terminated: which instances are terminal, shape (n,)
+    :param n_rows: size of the sample; all instances if there are no more
+    :param rng: source of randomness
+    :return: row numbers, ascending
+    """
+    if n_rows >= len(terminated):
+        return np.arange(len(terminated))
+    return _keep_terminal(rng.choice(len(terminated), n_rows, replace=False), terminated, rng)
+
+
+def covering_rows(units: Floats, actions: Ints, terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Generator) -> Ints:
+    """
+    About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
+
+    :param units: where the instances start, unit coordinates, shape (n, n_variables)
+    :param actions: their actions, shape (n,)
+    :param terminated: which of them are terminal, shape (n,)
+    :param n_rows: number of instances to select; all if there are no more
+    :param rng: picks the first instance of each action
+    :return: row numbers, ascending
+    """
+    if n_rows >= len(actions):
+        return np.arange(len(actions))
+    rows_of = [np.flatnonzero(actions == action) for action in np.unique(actions)]
+    quotas = _equal_quotas(np.array([len(rows) for rows in rows_of]), n_rows)
+    # Selected rows of an action come in the order of selection, so the last one says least.
+    chosen = [rows[_farthest_points(units[rows], quota, rng)] for rows, quota in zip(rows_of, quotas, strict=True)]
+    return _keep_terminal(np.concatenate(chosen), terminated, rng)
+
+
+def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator) -> Ints:
+    """Begin anywhere, then always add the point that is farthest from all points so far."""
+    chosen = np.empty(n_points, dtype=np.int64)
+    distance = np.full(len(units), np.inf)
+    candidate = int(rng.integers(len(units)))
+    for i in range(n_points):
+        chosen[i] = candidate
+        np.minimum(distance, ((units - units[candidate]) ** 2).sum(axis=1), out=distance)
+        # Of identical states one is as good as another, but none must be chosen twice.
+        distance[candidate] = -1.0
+        candidate = int(distance.argmax())
+    return chosen
+
+
+def _equal_quotas(available: Ints, total: int) -> Ints:
+    """Share ``total`` as equally as what is available allows; what one action lacks goes to the others."""
+    quotas = np.zeros_like(available)
+    for rank, i in enumerate(np.argsort(available, kind="stable")):
+        quotas[i] = min(available[i], (total - quotas.sum()) // (len(available) - rank))
+    return quotas
+
+
+def _keep_terminal(rows: Ints, terminated: NDArray[np.bool_], rng: np.random.Generator) -> Ints:
+    # Without a terminal instance the goal is unknown to the target task. It takes the place of the last row chosen.
+    if terminated.any() and not terminated[rows].any():
+        rows[-1] = rng.choice(np.flatnonzero(terminated))
+    return np.sort(rows)

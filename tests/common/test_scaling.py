@@ -1,0 +1,114 @@
+"""Box <-> unit coordinates."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sb3_combrel.common.scaling import StateScaling
+
+BOX = spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float64)
+
+finite = st.floats(-1e6, 1e6)
+
+
+@given(hnp.arrays(np.float64, (7, 3), elements=finite), hnp.arrays(np.float64, 3, elements=finite), st.floats(1e-2, 1e6))
+def test_raw_to_unit_and_back_changes_nothing(states, low, extent):
+    scaling = StateScaling(low, low + extent)
+    tolerance = 1e-9 * (np.abs(low).max() + extent + np.abs(states).max())
+    np.testing.assert_allclose(scaling.to_raw(scaling.to_unit(states)), states, atol=tolerance)
+
+
+def test_each_variable_is_divided_by_its_range():
+    scaling = StateScaling.from_space(BOX)
+    units = scaling.to_unit([[-1.2, -0.07], [0.6, 0.07], [-0.3, 0.0]])
+    np.testing.assert_allclose(units, [[0, 0], [1, 1], [0.5, 0.5]], atol=1e-15)
+    assert units.dtype == np.float64
+    assert scaling.n_variables == 2
+    # One state alone, and one outside the box: neither reshaped nor clipped.
+    np.testing.assert_allclose(scaling.to_unit([2.4, 0.21]), [2.0, 2.0])
+
+
+def test_scalings_of_equal_bounds_are_equal_and_cannot_be_changed():
+    low = np.array([-1.2, -0.07])
+    scaling = StateScaling(low, [0.6, 0.07])
+    assert scaling == StateScaling.from_space(BOX)
+    assert hash(scaling) == hash(StateScaling.from_space(BOX))
+    assert scaling != StateScaling(low, [0.6, 0.08])
+    low[0] = 5.0
+    assert scaling.low[0] == -1.2
+    with pytest.raises(ValueError, match="read-only"):
+        scaling.low[0] = 0.0
+
+
+def test_bounds_replace_those_of_the_space_and_scalars_hold_for_all_variables():
+    scaling = StateScaling.from_space(gym.make("CartPole-v1").observation_space, bounds=(-3, [1, 2, 3, 4]))
+    np.testing.assert_array_equal(scaling.low, [-3, -3, -3, -3])
+    np.testing.assert_array_equal(scaling.high, [1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1"])
+def test_an_unbounded_space_needs_bounds(env):
+    with pytest.raises(ValueError, match=r"no finite bounds .*\[1, 3\].*bounds=\(low, high\)"):
+        StateScaling.from_space(gym.make(env).observation_space)
+
+
+def test_the_largest_float_counts_as_unbounded():
+    huge = np.finfo(np.float32).max
+    with pytest.raises(ValueError, match="bounds"):
+        StateScaling.from_space(spaces.Box(-huge, huge, (2,), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        (7, "got bounds=7"),
+        ((0,), r"got bounds=\(0,\)"),
+        (([0, 1, 2], 3), r"low of shape \(3,\)"),
+        ((0, 0), "low=0.0 and high=0.0 for variable 0"),
+        (([0, 2], [1, 1]), "low=2.0 and high=1.0 for variable 1"),
+        ((np.nan, 1), "low of nan"),
+        ((0, np.inf), "high of inf"),
+        (([0, "a"], 3), "got bounds="),
+    ],
+)
+def test_wrong_bounds_are_named_with_their_value(bounds, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        StateScaling.from_space(BOX, bounds)
+    assert str(caught.value).startswith("bounds")
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.Discrete(3), "one-dimensional Box, got Discrete"),
+        (spaces.Dict({"x": BOX}), "FlattenObservation"),
+        (spaces.Box(0, 255, (8, 8, 3), np.uint8), "images"),
+        (spaces.Box(0, 1, (2, 2)), r"shape \(2, 2\)"),
+        (spaces.Box(0, 9, (2,), np.int64), "dtype int64"),
+    ],
+)
+def test_other_spaces_are_refused(space, message):
+    with pytest.raises(ValueError, match=message):
+        StateScaling.from_space(space)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ([0, 0], [1], "same length"),
+        ([], [], "at least one"),
+        ([[0]], [[1]], "one-dimensional"),
+        ([np.nan], [1], "low must hold finite"),
+        ([1], [0], "below its upper bound"),
+        ([-1.5e308], [1.5e308], "overflows"),
+        ("ab", [1], "low must be"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_wrong_vectors_are_refused(low, high, message):
+    with pytest.raises(ValueError, match=message):
+        StateScaling(low, high)
