@@ -18,6 +18,9 @@ from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.kernels import interpolate
 
 CELLS_PER_GRID_CELL = 3
+# Box edges, joint limits and round step lengths lie on round numbers. A state on a cell's edge would be remembered on one
+# side of it and looked for, one rounding error later, on the other: for ever without effect.
+CELL_OFFSET = 0.4142
 PATIENCE = 10
 VISIT_TABLE_SIZE = 1 << 14
 
@@ -77,7 +80,7 @@ def cell_key(position, shape):
     for k in range(len(position)):
         last = shape[k] - 1
         at = min(max(position[k], 0.0), float(last))
-        key = key * (last * CELLS_PER_GRID_CELL + 1) + int(at * CELLS_PER_GRID_CELL)
+        key = key * (last * CELLS_PER_GRID_CELL + 1) + int(at * CELLS_PER_GRID_CELL + CELL_OFFSET)
     return key
 
 

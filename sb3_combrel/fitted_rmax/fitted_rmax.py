@@ -62,14 +62,14 @@ class FittedRMax(BaseAlgorithm):
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
     :param transfer: a transfer method, such as ``COMBREL(source)``; or a dict, as in RL-Zoo's YAML files, from the
         method's name to its arguments. A copy of it is used.
-    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: 1/16 for one or two state
+    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: 0.09 for one or two state
         variables, 0.15 for three, 0.2 for more. Smaller is more exact and explores more.
     :param min_fraction: an instance counts while it has this part of the weight of the nearer ones; 0.1 keeps at most
         11 instances a pair, 0.01 (the original's) 101
     :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach
     :param exploration_threshold: weight of instances that makes a state-action pair known
-    :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: the
-        coarsest that suits the breadth, at least 3, as far as memory goes.
+    :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: at
+        least 6 for one or two variables, 4 for three, 3 for more, and finer if the breadth needs it and memory allows.
     :param max_value: an upper bound on the return from any state, the value of what is unknown
     :param gamma: discount factor, in (0, 1]
     :param planning_tolerance: changes of value up to this are not passed on
@@ -190,7 +190,7 @@ class FittedRMax(BaseAlgorithm):
         if self.model_breadth is not None:
             return self.model_breadth
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
-        return {1: 1 / 16, 2: 1 / 16, 3: 0.15}.get(n_variables, 0.2)
+        return {1: 0.09, 2: 0.09, 3: 0.15}.get(n_variables, 0.2)
 
     def _check_arguments(self) -> None:
         if not isinstance(self.action_space, spaces.Discrete):
@@ -237,6 +237,7 @@ class FittedRMax(BaseAlgorithm):
         callback.on_training_start(locals(), globals())
         self._episode_rewards = [[] for _ in range(self.n_envs)]
         self._episode_tags = np.arange(self.n_envs)
+        self._backups += self.policy.prepare()
         try:
             while self.num_timesteps < total_timesteps:
                 if not self._step(callback, log_interval):

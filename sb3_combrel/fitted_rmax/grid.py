@@ -72,14 +72,16 @@ class StateGrid:
 
 
 def default_resolution(n_variables: int, reach: float) -> int:
-    """The coarsest resolution of use: at least 3, and a cell's diagonal must not exceed the kernel's reach.
+    """A resolution of use: as fine as is cheap, and a cell's diagonal must not exceed the kernel's reach.
 
     A grid point farther than the reach from every state that can be visited in its cell would stay optimistic for
-    ever; and below eight cells a unit the interpolated values are too rough to act on.
+    ever. Interpolation spreads values over a cell at every step, so plans look shorter than they are on a coarse grid:
+    up to two variables a fine one costs next to nothing.
 
     :param reach: distance at which the kernel falls to ``min_weight``, unit coordinates
     """
-    return max(3, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
+    finest_that_is_cheap = {1: 6, 2: 6, 3: 4}.get(n_variables, 3)
+    return max(finest_that_is_cheap, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
 
 
 # Arrays of a pair and of a point when all of them are settled, from the sizes of ModelArrays and SweepQueue.

@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 from sb3_combrel.common.compiled import compiled
+from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
 from sb3_combrel.fitted_rmax.model import KernelModel
 
 N_LEVELS = 24
+EXPLOITATION_SWEEPS = 300
 
 
 class SweepQueue(NamedTuple):
@@ -169,6 +171,7 @@ class Planner:
         self.values = np.full(model.grid.n_points, float(max_value))
         self.queue = SweepQueue.empty(self.values)
         self._at = np.empty((3, model.grid.n_variables), dtype=np.int64)
+        self._exploitation: np.ndarray | None = None
 
     def update(self, pairs: np.ndarray, max_backups: int) -> int:
         """Bring the rows of ``pairs`` up to date, then back up these points and what waits, largest change first.
@@ -183,6 +186,7 @@ class Planner:
     def sweep(self, points: np.ndarray, max_backups: int) -> int:
         """Back up ``points``, then up to ``max_backups`` of those that wait; how many it did."""
         model = self.model
+        self._exploitation = None
         return sweep(
             self.values,
             model.arrays,
@@ -197,8 +201,27 @@ class Planner:
             self._at,
         )
 
+    def exploitation_values(self) -> np.ndarray:
+        """Values at the grid points without optimism, for evaluation; worked out once for each state of the model.
+
+        From the optimistic values downwards: where no known way leads anywhere the values keep falling, so the number
+        of sweeps is bounded.
+        """
+        if self._exploitation is None:
+            model = self.model
+            values = self.values.copy()
+            for n in range(EXPLOITATION_SWEEPS):
+                change = exploitation_sweep(
+                    values, model.arrays, model.n_actions, model.grid.arrays, self.bounds, n % 2 == 1
+                )
+                if change <= self.tolerance:
+                    break
+            self._exploitation = values
+        return self._exploitation
+
     def restore(self, values: np.ndarray) -> None:
         """Take over saved values; every point with a row is backed up once more when there is time."""
+        self._exploitation = None
         self.values[:] = np.clip(values, *self.bounds)
         self.queue = SweepQueue.empty(self.values)
         for point in np.flatnonzero(self.model.arrays.n_optimistic == 0):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -25,6 +26,10 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
 LONGEST_PLAN = 10_000
+
+AT_EPISODE_END = 50
+BACKUPS_PER_RENEWED_PAIR = int(os.environ.get("BPR", "10"))
+NO_PAIRS = np.empty(0, dtype=np.int64)
 
 
 class FittedRMaxPolicy(BasePolicy):
@@ -150,11 +155,12 @@ class FittedRMaxPolicy(BasePolicy):
             )
         return inside
 
-    def q_values(self, state: np.ndarray) -> np.ndarray:
+    def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
         """
         Action values at an exact state; optimistic actions have ``max_value``.
 
         :param state: unit coordinates, shape (n_variables,)
+        :param values: at the grid points; by default the planner's, optimistic ones
         :return: shape (n_actions,)
         """
         breadth, min_weight, min_fraction = self.kernel
@@ -165,7 +171,7 @@ class FittedRMaxPolicy(BasePolicy):
             state,
             self.exploration_threshold,
             self.gamma,
-            self.planner.values,
+            self.planner.values if values is None else values,
             self.corrections,
             self.model.grid.arrays,
             self.planner.bounds,
@@ -205,7 +211,7 @@ class FittedRMaxPolicy(BasePolicy):
 
         :param state: unit coordinates, shape (n_variables,)
         """
-        q = self.q_values(state)
+        q = self.q_values(state, self.planner.exploitation_values())
         modelled = q < self.planner.bounds[1]
         return int(np.where(modelled, q, -np.inf).argmax()) if modelled.any() else 0
 
@@ -237,20 +243,31 @@ class FittedRMaxPolicy(BasePolicy):
         self._unsettled.append(self.model.add(state, action, reward, next_state, terminated))
         if self.transfer is not None:
             self.transfer.observe(state, action, reward, next_state, terminated)
-            self._unsettled.append(self.transfer.renewed())
-        # Left on the list until all is done: an interrupt in between loses no change.
-        pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
-        backups = self.planner.update(pairs, self.max_backups)
-        self._unsettled = []
-        return backups
+        return self._plan(self.max_backups)
 
     def end_episode(self) -> int:
         """Time to think: plan on while no action is due; backups done."""
         if self.transfer is not None:
             self.transfer.end_episode()
-            self._unsettled.append(self.transfer.renewed())
-        pairs = np.unique(np.concatenate(self._unsettled)) if self._unsettled else np.empty(0, dtype=np.int64)
-        backups = self.planner.update(pairs, 50 * self.max_backups)
+        return self._plan(AT_EPISODE_END * self.max_backups)
+
+    def prepare(self) -> int:
+        """Take up what transfer has to say before the first step; backups done."""
+        return self._plan(AT_EPISODE_END * self.max_backups)
+
+    def _plan(self, max_backups: int) -> int:
+        """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
+        if self.transfer is not None:
+            renewed = self.transfer.renewed()
+            renewed = renewed[~self.model.arrays.known[renewed]]
+            if len(renewed):
+                self._unsettled.append(renewed)
+                max_backups += BACKUPS_PER_RENEWED_PAIR * len(renewed)
+        if not self._unsettled:
+            return self.planner.sweep(NO_PAIRS, max_backups)
+        # Left on the list until all is done: an interrupt in between loses no change.
+        pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
+        backups = self.planner.update(pairs, max_backups)
         self._unsettled = []
         return backups
 

@@ -23,7 +23,7 @@ from sb3_combrel.transfer.source import SourceInstances
 class Corridor(gym.Env):
     """A cart that is pushed along [0, 1]: ends at 1, and is cut off after ``limit`` steps. The second variable counts."""
 
-    observation_space = spaces.Box(np.array([0.0, 0.0]), np.array([1.0, 100.0]), dtype=np.float32)
+    observation_space = spaces.Box(np.float32([0, 0]), np.float32([1, 100]), dtype=np.float32)
     action_space = spaces.Discrete(2, start=-1)
     state_names = ("place", "time")
     action_names = ("back", "forth")

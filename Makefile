@@ -1,0 +1,90 @@
+# make demo    learn with and without transfer; figure, table, video in demo_output/
+# make test    all tests, the slow ones too
+# make bench   speed and memory                make lint, type, format, commit-checks    as in Stable-Baselines3
+# make figures the figures of README.md and docs/
+#
+# Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
+# the interpreter, make VENV=path another environment. As in any pip install, PIP_EXTRA_INDEX_URL and the like are heeded.
+SHELL := /bin/bash
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+PYTEST_WORKERS ?= 2
+DEMO_ARGS ?=
+LINTED := sb3_combrel envs tests
+
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
+PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python; do \
+	$$python -c '$(SUPPORTED)' 2>/dev/null && { echo $$python; break; }; done)
+
+# Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
+export OMP_NUM_THREADS := 1
+
+.PHONY: demo figures test pytest bench lint type format check-codestyle commit-checks build gl clean
+
+demo: $(VENV)/.installed-demo
+	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
+
+figures: demo
+	mkdir -p docs/figures
+	cp demo_output/learning_curves.png docs/figures/
+
+test pytest: $(VENV)/.installed-all gl
+	$(BIN)/python -m sb3_combrel.experiments.warm_up
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal
+
+bench: $(VENV)/.installed-all
+	$(BIN)/python -m pytest tests/benchmarks -o addopts="--strict-markers" --benchmark-only
+
+lint: $(VENV)/.installed-all
+	$(BIN)/ruff check $(LINTED)
+
+type: $(VENV)/.installed-all
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-all
+	$(BIN)/ruff check --select I $(LINTED) --fix
+	$(BIN)/black $(LINTED)
+
+check-codestyle: $(VENV)/.installed-all
+	$(BIN)/ruff check --select I $(LINTED)
+	$(BIN)/black --check $(LINTED)
+
+commit-checks: format type lint
+
+build: $(VENV)/.installed-all
+	$(BIN)/python -m build
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info
+
+# An installation that was interrupted leaves no stamp and is done again; a changed pin or dependency renews it.
+$(VENV)/.installed-demo: pyproject.toml constraints.txt
+	$(call make_venv)
+	$(call install,experiments)
+	@touch $@
+
+$(VENV)/.installed-all: pyproject.toml constraints.txt
+	$(call make_venv)
+	$(call install,all$(comma)dev)
+	@touch $(VENV)/.installed-demo $@
+
+comma := ,
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+define make_venv
+@$(if $(PYTHON),,echo "Python 3.11, 3.12 or 3.13 is needed, and none was found. Install one, or name it: make PYTHON=/path/to/python" >&2; exit 1)
+@$(PYTHON) -c '$(SUPPORTED)' || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1); Python 3.11, 3.12 or 3.13 is needed: make PYTHON=/path/to/python" >&2; exit 1; }
+@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+endef
+
+# labmaze, which dm_control's locomotion tasks alone use, has no wheel for Python 3.13: there dm_control goes in without it.
+define install
+$(PIP) install -c constraints.txt -e ".[$(1)]"
+@$(BIN)/python -c 'import importlib.util as u; exit(u.find_spec("dm_control") is None)' || $(PIP) install -c constraints.txt --no-deps dm_control
+endef
+
+# Tests that draw need OpenGL; where it cannot be installed here they say what is missing.
+gl:
+	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! ldconfig -p | grep -q libEGL_mesa; then \
+		apt-get update -qq && apt-get install -y -qq libegl1 libgl1-mesa-dri; fi

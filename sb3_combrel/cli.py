@@ -1,0 +1,115 @@
+"""The command ``sb3-combrel``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[experiments]'"
+OF_EXTRA = ("combrel_envs", "joblib", "matplotlib", "mujoco", "dm_control", "moviepy", "tyro")
+
+
+def demo(
+    output: Path = Path("demo_output"),
+    seeds: int = 10,
+    episodes: int = 12,
+    max_episode_steps: int = 2000,
+    workers: int | None = None,
+    fresh: bool = False,
+) -> None:
+    """
+    Learn 4D Mountain Car without transfer, with TIMBREL and with COMBREL from the 2D one, and compare.
+
+    Stop it at any time: the same command goes on where it was.
+
+    :param output: folder for the figure, the tables, the video, the models and the logs
+    :param seeds: runs of each method
+    :param episodes: episodes of each run
+    :param max_episode_steps: steps after which an episode is cut off
+    :param workers: processes at a time; one a core by default
+    :param fresh: delete earlier results in the folder and begin anew
+    """
+    from sb3_combrel.experiments.demo import run_demo
+
+    run_demo(output, seeds, episodes, max_episode_steps, workers, fresh)
+
+
+def record(
+    env_id: str,
+    output: Path = Path("source.npz"),
+    n_instances: int = 1000,
+    total_timesteps: int = 30_000,
+    seed: int = 0,
+    method: str = "random",
+    overwrite: bool = False,
+) -> None:
+    """
+    Learn a source task by Q-learning and keep a sample of its experience as source instances.
+
+    :param env_id: id of a task with few state variables and discrete actions, such as combrel/MountainCar2D-v0 or
+        package:Task-v0
+    :param output: file to write
+    :param n_instances: instances to keep
+    :param total_timesteps: steps of learning
+    :param seed: seed of learner, task and sample
+    :param method: how to choose the instances, "random" or "covering"
+    :param overwrite: replace the file if it exists
+    """
+    from rich.console import Console
+
+    from sb3_combrel import SourceInstances
+    from sb3_combrel.experiments.runs import make_task
+
+    console = Console()
+    file = output if output.suffix == ".npz" else output.with_name(output.name + ".npz")
+    if file.exists() and not overwrite:
+        raise ValueError(f"{file} exists; use --overwrite or another --output")
+    env = make_task(env_id)
+    with console.status(f"Learning {env_id} for {total_timesteps:,} steps ..."):
+        source = SourceInstances.from_q_learning(
+            env, n_instances=n_instances, seed=seed, total_timesteps=total_timesteps, method=method
+        )
+    env.close()
+    console.print(source, markup=False, soft_wrap=True)
+    console.print(f"written to {source.save(file)}; use it as COMBREL({str(file)!r})", soft_wrap=True)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Run the command line.
+
+    :param args: arguments, those of the process by default
+    :return: exit status: 0, or 1 if something was wrong with the arguments, or 130 if the user stopped it
+    """
+    try:
+        import tyro
+    except ModuleNotFoundError:
+        print(f"sb3-combrel: {NEEDS_EXTRA.format(missing='tyro')}", file=sys.stderr)
+        return 1
+    from gymnasium.error import Error as GymnasiumError
+
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="sb3-combrel",
+            description="Transfer learning with Fitted R-Max for Stable-Baselines3.",
+            args=args,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except (ValueError, OSError, GymnasiumError, ModuleNotFoundError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name in OF_EXTRA:
+            error = ModuleNotFoundError(NEEDS_EXTRA.format(missing=error.name))
+        print(f"sb3-combrel: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\nStopped. The same command goes on from here.", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

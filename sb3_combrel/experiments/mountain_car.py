@@ -1,0 +1,52 @@
+"""The experiment of Section 5.1: Mountain Car in two dimensions is the source of Mountain Car in four."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel.transfer.base import Transfer
+
+SOURCE_ID = "combrel/MountainCar2D-v0"
+TARGET_ID = "combrel/MountainCar4D-v0"
+N_INSTANCES = 1000
+
+LEARNER: dict[str, Any] = {"model_breadth": 0.1, "resolution": 3, "min_fraction": 0.1}
+
+NO_TRANSFER = "no transfer"
+
+
+def intuitive_mapping() -> list[InterTaskMapping]:
+    """
+    The mapping that a person would choose, one for each action of the target.
+
+    Neutral, West and East are seen along x, South and North along y; each time the other axis is left alone.
+    """
+    to_source_action = (0, 1, 2, 1, 2)
+    along_x = InterTaskMapping(state=(0, None, 1, None), action=to_source_action)
+    along_y = InterTaskMapping(state=(None, 0, None, 1), action=to_source_action)
+    return [along_x, along_x, along_x, along_y, along_y]
+
+
+def methods(source: SourceInstances) -> dict[str, Transfer | None]:
+    """
+    What is compared, by name.
+
+    :param source: instances of the source task
+    """
+    return {
+        NO_TRANSFER: None,
+        "TIMBREL": TIMBREL(source, mapping=intuitive_mapping()),
+        "COMBREL": COMBREL(source),
+    }
+
+
+def learn_source(seed: int = 0) -> SourceInstances:
+    """
+    Learn the source task by Q-learning and keep 1000 instances of its experience.
+
+    :param seed: seed of the learner and the sample
+    """
+    import combrel_envs  # noqa: F401 - registers the tasks
+
+    return SourceInstances.from_q_learning(SOURCE_ID, n_instances=N_INSTANCES, seed=seed)

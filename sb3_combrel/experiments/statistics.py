@@ -1,0 +1,68 @@
+"""Means of several runs with confidence intervals, and what a method saves, by SciPy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+class Estimate(NamedTuple):
+    """A mean and its 95% confidence interval; the interval is NaN where there are too few runs for one."""
+
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class Saving(NamedTuple):
+    """
+    Steps that a method saves over another.
+
+    :param steps: difference of the means
+    :param low: lower bound of its 95% confidence interval, NaN with fewer than two runs of each
+    :param high: upper bound
+    :param share: the difference as part of the other's mean
+    :param p_value: of Welch's t-test that both need equally many steps
+    """
+
+    steps: float
+    low: float
+    high: float
+    share: float
+    p_value: float
+
+
+def mean_of_runs(samples: np.ndarray) -> Estimate:
+    """
+    Mean over runs, with the interval of Student's t.
+
+    :param samples: one run a row, shape (n_runs, ...)
+    """
+    samples = np.asarray(samples, dtype=np.float64)
+    mean = samples.mean(axis=0)
+    if len(samples) < 2:
+        return Estimate(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
+    half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(samples) - 1) * stats.sem(samples, axis=0)
+    return Estimate(mean, mean - half, mean + half)
+
+
+def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
+    """
+    What transfer saves, by Welch's t-test: the runs are independent and their variances differ.
+
+    :param without: steps of each run without transfer, shape (n_runs,)
+    :param with_transfer: steps of each run with transfer, shape (n_runs,)
+    """
+    without, with_transfer = (np.asarray(steps, dtype=np.float64) for steps in (without, with_transfer))
+    steps = float(without.mean() - with_transfer.mean())
+    share = steps / float(without.mean())
+    no_spread = min(len(without), len(with_transfer)) < 2 or (np.ptp(without) == 0.0 and np.ptp(with_transfer) == 0.0)
+    if no_spread:
+        return Saving(steps, np.nan, np.nan, share, np.nan)
+    test = stats.ttest_ind(without, with_transfer, equal_var=False)
+    interval = test.confidence_interval(CONFIDENCE)
+    return Saving(steps, float(interval.low), float(interval.high), share, float(test.pvalue))

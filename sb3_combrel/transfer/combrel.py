@@ -1,0 +1,302 @@
+"""COMBREL: transfer through many mappings, chosen state by state by compliance (Fachantidis et al.)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.supply import Supply
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.compliance import ComplianceScratch, transition_compliance
+from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, MappingsLike, SourceLike, VirtualSourceTransfer
+
+RELEVANCE_RENEWAL = 1.2
+
+
+class COMBREL(VirtualSourceTransfer):
+    """
+    COmpliance-aware transfer for Model-Based REinforcement Learning: finds by itself how two tasks correspond.
+
+    Paper: Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection" (Algorithm
+    1). Each mapping makes a virtual source task. For a state and an action, the nearest recorded target transitions with
+    that action vote: the mapping with the highest mean compliance translates the source instances that are missing.
+    Because compliance depends only on the state mapping and on the one source action that the target action maps to,
+    any number of action mappings costs nothing.
+
+    :param source: source instances, a path to them, or a list of several, which then compete
+    :param mappings: "injective" (each source variable stands for one target variable, the other target variables are
+        left alone), "surjective", "all", "balanced", "paper_mountain_car", "paper_icub", a list of mappings or a
+        ``MappingSet``. The paper uses sets without unmapped variables, which help much less.
+    :param n_neighbors: how many of the nearest target transitions vote; k of Algorithm 1 (the paper: 3)
+    :param measured: when compliance is measured: "online", with every transition (the default, which works best); or
+        "first_episode", once, after the first episode, as in the paper
+    :param max_transitions: target transitions measured at most
+    :param breadth: kernel breadth of transferred instances, in unit coordinates; the paper names none
+    :param believe_terminal: whether a source instance that ended its episode ends the target's too; the paper does not
+        say
+    :param relevance: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful.
+    :param relevance_fraction: mu of Eq. 4: the part of the weight over which distances are averaged
+    :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
+        from the data. The paper names none.
+    :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
+    """
+
+    def __init__(
+        self,
+        source: SourceLike,
+        mappings: MappingsLike = "injective",
+        *,
+        n_neighbors: int = 3,
+        measured: str = "online",
+        max_transitions: int = 3000,
+        breadth: float = DEFAULT_BREADTH,
+        believe_terminal: bool = False,
+        relevance: bool = False,
+        relevance_fraction: float = 0.5,
+        bandwidths: tuple[float, float, float] | None = None,
+    ):
+        check_count("n_neighbors", n_neighbors)
+        check_count("max_transitions", max_transitions)
+        if measured not in ("online", "first_episode"):
+            raise ValueError(f'measured must be "online" or "first_episode", got {measured!r}')
+        super().__init__(
+            source,
+            mappings,
+            breadth=breadth,
+            believe_terminal=believe_terminal,
+            relevance=relevance,
+            relevance_fraction=relevance_fraction,
+            bandwidths=bandwidths,
+        )
+        self.n_neighbors = n_neighbors
+        self.measured = measured
+        self.max_transitions = max_transitions
+
+    def bind(self, target: TargetTask, rng: np.random.Generator) -> None:
+        super().bind(target, rng)
+        n_rows, n_actions = len(self._table.index), len(self._instances.count)
+        n_points = len(target.sample_states)
+        self._mirrored = bool((self._table.sign < 0.0).any())
+        self._compliance_scratch = ComplianceScratch.empty(target.n_variables, self._instances.state.shape[2], n_rows)
+        self._tables = np.empty((64, n_rows, n_actions))
+        self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
+        self._distance = np.full((target.n_actions, n_points, self.n_neighbors), np.inf)
+        self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
+        self._changed_points = np.empty(n_points, dtype=np.int64)
+        self._renewed: list[np.ndarray] = []
+        self._first_episode = True
+        self._switches = 0
+        self._choice_at = np.empty(target.n_actions, dtype=np.int64)
+        self._near_at = np.empty(self.n_neighbors, dtype=np.int64)
+        self._distance_at = np.empty(self.n_neighbors)
+
+    # ---------------------------------------------------------------- observing
+
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        if self._seen.n >= self.max_transitions or not (self._first_episode or self.measured == "online"):
+            return
+        i = self._seen.add(state, action, reward, next_state)
+        if self.measured == "online":
+            self._measure(i)
+            if self.relevance and self._seen.n >= max(50, RELEVANCE_RENEWAL * self._merit_of):
+                self._renew_relevance()
+
+    def end_episode(self) -> None:
+        if self._first_episode and self.measured == "first_episode":
+            for i in range(self._seen.n):
+                self._measure(i)
+            if self.relevance:
+                self._renew_relevance()
+        self._first_episode = False
+
+    def _measure(self, i: int) -> None:
+        """Compliance of transition ``i`` with every mapping, and the votes that it changes (lines 9-13 and 17-20)."""
+        assert self.target is not None
+        if i == len(self._tables):
+            self._tables = np.concatenate([self._tables, np.empty_like(self._tables)])
+        action = int(self._seen.actions[i])
+        transition_compliance(
+            self._seen.states[i],
+            self._seen.effects[i],
+            float(self._seen.rewards[i]),
+            self._instances,
+            self._table,
+            self._mirrored,
+            self._bandwidths,
+            self._compliance_scratch,
+            self._tables[i],
+        )
+        n = note_neighbor(
+            i,
+            self._seen.states[i],
+            self.target.sample_states,
+            self._near[action],
+            self._distance[action],
+            self._changed_points,
+        )
+        n_points = len(self.target.sample_states)
+        changed = vote(
+            self._changed_points[:n],
+            self._near[action],
+            self._tables,
+            self._ways,
+            action,
+            self._choice[action * n_points : (action + 1) * n_points],
+        )
+        self._switches += changed
+        self._renewed.append(self._changed_points[:changed] + action * n_points)
+
+    def renewed(self) -> np.ndarray:
+        if not self._renewed:
+            return np.empty(0, dtype=np.int64)
+        renewed = self._renewed[0] if len(self._renewed) == 1 else np.unique(np.concatenate(self._renewed))
+        self._renewed = []
+        return renewed
+
+    # ---------------------------------------------------------------- supplying
+
+    def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
+        assert self.target is not None
+        chosen = np.where(known, -1, self._choice[pairs])
+        if (chosen < 0).all():
+            return self._nothing_for(len(pairs))
+        first = np.maximum(chosen, 0)
+        states = self.target.sample_states[pairs % len(self.target.sample_states)]
+        return self._draw(states, own_weight, first, np.where(chosen < 0, first, first + 1))
+
+    def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
+        missing = own_weight < self._rules.threshold
+        if self._seen.n == 0 or not missing.any():
+            return self._nothing_for(len(own_weight))
+        n_measured = self._seen.n if self.measured == "online" or not self._first_episode else 0
+        choose_at(
+            state,
+            missing,
+            self._seen.states,
+            self._seen.actions,
+            n_measured,
+            self._tables,
+            self._ways,
+            self._near_at,
+            self._distance_at,
+            self._choice_at,
+        )
+        first = np.maximum(self._choice_at, 0)
+        last = np.where(self._choice_at < 0, first, first + 1)
+        supply = self._draw(np.tile(state, (len(own_weight), 1)), own_weight, first, last)
+        for action in np.flatnonzero(supply.count):
+            self._use(int(first[action]))
+        return supply
+
+    def statistics(self) -> dict[str, float]:
+        chosen = self._choice[self._choice >= 0]
+        shares = np.bincount(chosen) / max(len(chosen), 1)
+        shares = shares[shares > 0.0]
+        return {
+            **super().statistics(),
+            "transfer/switches": self._switches,
+            "transfer/choice_entropy": float(-(shares * np.log(shares)).sum()),
+            "transfer/distinct_mappings": len(shares),
+            "transfer/transitions_measured": self._seen.n,
+        }
+
+
+@compiled
+def note_neighbor(i, state, sample_states, near, distance, changed):
+    """Enter transition ``i`` at every sample state that has it among its nearest.
+
+    :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
+    :param distance: squared distances to them, inf for none, updated
+    :param changed: receives the points at which it entered
+    :return: how many
+    """
+    n_points, d = sample_states.shape
+    last = near.shape[1] - 1
+    n_changed = 0
+    for p in range(n_points):
+        apart = 0.0
+        for v in range(d):
+            along = sample_states[p, v] - state[v]
+            apart += along * along
+        if apart >= distance[p, last]:
+            continue
+        k = last
+        while k > 0 and distance[p, k - 1] > apart:
+            distance[p, k] = distance[p, k - 1]
+            near[p, k] = near[p, k - 1]
+            k -= 1
+        distance[p, k] = apart
+        near[p, k] = i
+        changed[n_changed] = p
+        n_changed += 1
+    return n_changed
+
+
+@compiled
+def best_candidate(near, tables, ways, action):
+    """The candidate of ``action`` with the highest mean compliance with the transitions ``near``; -1 if none has any."""
+    best = -1
+    highest = 0.0
+    for c in range(ways.first[action], ways.first[action + 1]):
+        total = 0.0
+        for k in range(len(near)):
+            if near[k] >= 0:
+                total += tables[near[k], ways.row[c], ways.action[c]]
+        if total > highest:
+            highest = total
+            best = c
+    return best
+
+
+@compiled
+def vote(points, near, tables, ways, action, choice):
+    """Renew the choice at some sample states; those where it changed are moved to the front of ``points``.
+
+    :param choice: int64, shape (n_points,), updated
+    :return: how many changed
+    """
+    n_changed = 0
+    for f in range(len(points)):
+        p = points[f]
+        chosen = best_candidate(near[p], tables, ways, action)
+        if chosen != choice[p]:
+            choice[p] = chosen
+            points[n_changed] = p
+            n_changed += 1
+    return n_changed
+
+
+@compiled
+def choose_at(state, missing, states, actions, n, tables, ways, near, distance, choice):
+    """The candidate for every action with ``missing`` at an exact state, by the same vote; -1 for none.
+
+    :param states: target transitions' states, of which the first ``n`` are measured; ``actions``: their actions
+    :param near: int64 scratch, shape (n_neighbors,); ``distance``: float64, same shape
+    :param choice: receives the candidates, shape (n_actions,)
+    """
+    last = len(near) - 1
+    for action in range(len(missing)):
+        choice[action] = -1
+        if not missing[action]:
+            continue
+        for k in range(len(near)):
+            near[k] = -1
+            distance[k] = np.inf
+        for i in range(n):
+            if actions[i] != action:
+                continue
+            apart = 0.0
+            for v in range(len(state)):
+                along = states[i, v] - state[v]
+                apart += along * along
+            if apart >= distance[last]:
+                continue
+            k = last
+            while k > 0 and distance[k - 1] > apart:
+                distance[k] = distance[k - 1]
+                near[k] = near[k - 1]
+                k -= 1
+            distance[k] = apart
+            near[k] = i
+        choice[action] = best_candidate(near, tables, ways, action)

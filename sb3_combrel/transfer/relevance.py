@@ -1,0 +1,73 @@
+"""Relevance: which source instances are fit to be transferred (Eqs. 4 and 7)."""
+
+import numpy as np
+
+from sb3_combrel.common.compiled import compiled
+
+
+@compiled
+def relevance(states, effects, rewards, source, action, index, sign, bandwidths, mu, weight, merit):
+    """Relevance of the source instances of one action, seen through one state mapping, to the target's transitions.
+
+    rho_j = exp(-((lambda_j - 1) / d_j)^2). lambda_j is the compliance of instance j with the target's transitions:
+    weights normalized over these, so a perfectly compliant instance has 1. d_j is the mean distance to the nearest
+    transitions, as many as make up the part ``mu`` of the weight (Eq. 4). Without transitions everything is relevant.
+
+    :param states: target states of one target action, unit coordinates, shape (n, n_target_variables)
+    :param effects: next states minus states; ``rewards``: shape (n,)
+    :param index: source variable of each target variable, -1 for none; ``sign``: -1 where mirrored
+    :param weight: float64 scratch, shape (n,)
+    :param merit: receives the relevances, at least as many as ``source.count[action]``
+    """
+    n, d = states.shape
+    for j in range(source.count[action]):
+        total = 0.0
+        transition = 0.0
+        rewarded = 0.0
+        for i in range(n):
+            apart = 0.0
+            missed = 0.0
+            for v in range(d):
+                moved = 0.0
+                if index[v] >= 0:
+                    here = source.state[action, j, index[v]]
+                    moved = sign[v] * source.effect[action, j, index[v]]
+                    along = states[i, v] - (1.0 - here if sign[v] < 0.0 else here)
+                    apart += along * along
+                missed += (effects[i, v] - moved) ** 2
+            w = np.exp(-apart / bandwidths.start)
+            weight[i] = w
+            total += w
+            transition += w * np.exp(-missed / bandwidths.outcome)
+            off = rewards[i] - source.reward[action, j]
+            rewarded += w * np.exp(-off * off / bandwidths.reward)
+        if total < 1e-300:
+            merit[j] = 1.0
+            continue
+        compliance = (transition / total) * (rewarded / total)
+        distance = _mean_distance(weight, total, mu, bandwidths.start)
+        off = compliance - 1.0
+        merit[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
+
+
+@compiled
+def _mean_distance(weight, total, mu, bandwidth):
+    """d_j of Eq. 4: mean distance of the heaviest transitions that together make up ``mu`` of the weight.
+
+    The weights are used up; distances are read back from them.
+    """
+    gathered = 0.0
+    distance = 0.0
+    n_taken = 0
+    while gathered < mu * total:
+        best = 0
+        for i in range(1, len(weight)):
+            if weight[i] > weight[best]:
+                best = i
+        if weight[best] <= 0.0:
+            break
+        gathered += weight[best]
+        distance += np.sqrt(-bandwidth * np.log(weight[best]))
+        weight[best] = -1.0
+        n_taken += 1
+    return distance / max(n_taken, 1)

@@ -1,0 +1,135 @@
+"""TIMBREL: transfer of instances through a mapping that is given (Taylor, Jong & Stone 2008)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.common.supply import Supply
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, MappingsLike, SourceLike, VirtualSourceTransfer
+
+RELEVANCE_RENEWAL = 1.2
+
+
+class TIMBREL(VirtualSourceTransfer):
+    """
+    Where the target has too few instances, source instances are translated by a given mapping and join the model.
+
+    Paper: Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning" (ECML 2008). The
+    nearest translated instances come first, until they and the target's own reach the threshold that makes a
+    state-action pair known; if they cannot, nothing is transferred. A pair whose own instances suffice uses none.
+
+    :param source: source instances, a path to them, or a list of several
+    :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of
+        ``mappings`` drawn anew at each transfer (the baseline of the iCub experiment); or "pool" for the translations
+        by all of ``mappings`` in one pool (Figure 3)
+    :param mappings: the set that "random" and "pool" draw from: "injective", "surjective", "all", "balanced", the
+        paper's sets, a list of mappings or a ``MappingSet``
+    :param breadth: kernel breadth of transferred instances, in unit coordinates. The paper names none; it needs to be
+        wide enough for 1000 instances to cover the source.
+    :param believe_terminal: whether a source instance that ended its episode ends the target's too. The paper does not
+        say; reaching one of two goals at once is not the end, so the default is not.
+    :param relevance: order the instances by relevance (Eq. 7) to the target's transitions, not by distance. The paper
+        finds it harmful.
+    :param relevance_fraction: mu of Eq. 4: the part of the weight over which distances are averaged
+    :param bandwidths: (start, outcome, reward) bandwidths of relevance; None: from the data
+    :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
+    """
+
+    def __init__(
+        self,
+        source: SourceLike,
+        mapping: str | InterTaskMapping | Sequence[InterTaskMapping] | dict[str, Any] = "random",
+        *,
+        mappings: MappingsLike = "injective",
+        breadth: float = DEFAULT_BREADTH,
+        believe_terminal: bool = False,
+        relevance: bool = False,
+        relevance_fraction: float = 0.5,
+        bandwidths: tuple[float, float, float] | None = None,
+    ):
+        if isinstance(mapping, str) and mapping not in ("random", "pool"):
+            raise ValueError(f'mapping must be an InterTaskMapping, one for each action, "random" or "pool", got {mapping!r}')
+        super().__init__(
+            source,
+            mappings if isinstance(mapping, str) else mapping,
+            breadth=breadth,
+            believe_terminal=believe_terminal,
+            relevance=relevance,
+            relevance_fraction=relevance_fraction,
+            bandwidths=bandwidths,
+        )
+        self.mapping = mapping
+
+    def bind(self, target: TargetTask, rng: np.random.Generator) -> None:
+        super().bind(target, rng)
+        given = [self.mapping] if isinstance(self.mapping, InterTaskMapping | dict) else self.mapping
+        if not isinstance(given, str) and len(given) not in (1, target.n_actions):
+            raise ValueError(
+                f"mapping must be one mapping or one for each of the {target.n_actions} target actions, got {len(given)}"
+            )
+        self._fixed = None if isinstance(given, str) else self._candidate_of_each_action(len(given))
+
+    def _candidate_of_each_action(self, n_given: int) -> np.ndarray:
+        """The candidate that the mapping given for each action amounts to there (of the first source)."""
+        assert self.target is not None
+        chosen = np.empty(self.target.n_actions, dtype=np.int64)
+        mappings: MappingSet = self._sets[0]
+        for a in range(self.target.n_actions):
+            mapping = mappings[a if n_given > 1 else 0]
+            chosen[a] = next(
+                c
+                for c in range(self._ways.first[a], self._ways.first[a + 1])
+                if np.array_equal(self._table.index[self._ways.row[c]], mapping.state_index)
+                and np.array_equal(self._table.sign[self._ways.row[c]], mapping.state_sign)
+                and self._ways.action[c] == mapping.action[a]
+            )
+        return chosen
+
+    def _most_ways_at_once(self) -> int:
+        return int(np.diff(self._ways.first).max()) if self.mapping == "pool" else 1
+
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        if not self.relevance:
+            return
+        self._seen.add(state, action, reward, next_state)
+        if self._seen.n >= max(50, RELEVANCE_RENEWAL * self._merit_of):
+            self._renew_relevance()
+
+    def renewed(self) -> np.ndarray:
+        """All pairs at first; afterwards none: what the target's own instances change is asked for anyway."""
+        assert self.target is not None
+        n = 0 if getattr(self, "_announced", False) else self.target.n_actions * len(self.target.sample_states)
+        self._announced = True
+        return np.arange(n)
+
+    def _span(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The candidates from which each pair may draw."""
+        first, last = self._ways.first[actions], self._ways.first[actions + 1]
+        if self.mapping == "pool":
+            return first, last
+        chosen = self._rng.integers(first, last) if self._fixed is None else self._fixed[actions]
+        return chosen, chosen + 1
+
+    def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
+        assert self.target is not None
+        if known.all():
+            return self._nothing_for(len(pairs))
+        n_points = len(self.target.sample_states)
+        first, last = self._span(pairs // n_points)
+        return self._draw(self.target.sample_states[pairs % n_points], own_weight, first, np.where(known, first, last))
+
+    def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
+        assert self.target is not None
+        if (own_weight >= self._rules.threshold).all():
+            return self._nothing_for(len(own_weight))
+        first, last = self._span(np.arange(self.target.n_actions))
+        supply = self._draw(np.tile(state, (len(own_weight), 1)), own_weight, first, last)
+        if self.mapping != "pool":
+            for action in np.flatnonzero(supply.count):
+                self._use(int(first[action]))
+        return supply

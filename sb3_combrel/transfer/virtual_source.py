@@ -1,0 +1,301 @@
+"""What TIMBREL and COMBREL share: source tasks seen through mappings, and instances translated from them."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.common.checks import check_positive
+from sb3_combrel.common.instances import BLOCK, InstanceArrays, put_instance
+from sb3_combrel.common.kernels import list_room
+from sb3_combrel.common.supply import Supply
+from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.transfer.compliance import Bandwidths, MappingTable, default_bandwidths
+from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet, resolve
+from sb3_combrel.transfer.relevance import relevance
+from sb3_combrel.transfer.source import SourceInstances
+from sb3_combrel.transfer.translation import CandidateArrays, GatherScratch, TransferRules, translate
+
+SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances | str | os.PathLike[str]]
+MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
+
+DEFAULT_BREADTH = 0.2
+MOST_TRANSFERRED = 32
+
+
+class VirtualSourceTransfer(Transfer):
+    """Translates source instances through mappings; which mapping, and when, is for the subclasses to say.
+
+    Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. A candidate
+    of a target action is a pair of a state mapping and a source action; nothing else of a mapping matters there.
+
+    :param source: instances, a path to them, or a list of several
+    :param mappings: mappings from the target to the source (see ``resolve``)
+    :param breadth: kernel breadth of transferred instances, in unit coordinates
+    :param believe_terminal: whether a source instance that ended its episode ends the target's
+    :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance
+    :param relevance_fraction: mu of Eq. 4
+    :param bandwidths: (start, outcome, reward) of compliance and relevance; None: from the data
+    """
+
+    def __init__(
+        self,
+        source: SourceLike,
+        mappings: MappingsLike,
+        *,
+        breadth: float,
+        believe_terminal: bool,
+        relevance: bool,
+        relevance_fraction: float,
+        bandwidths: tuple[float, float, float] | None,
+    ):
+        check_positive("breadth", breadth)
+        check_positive("relevance_fraction", relevance_fraction, largest=1.0)
+        if bandwidths is not None:
+            if len(tuple(bandwidths)) != 3:
+                raise ValueError(f"bandwidths must be three numbers (start, outcome, reward) or None, got {bandwidths!r}")
+            for value in bandwidths:
+                check_positive("bandwidths", value)
+        self.source = source
+        self.mappings = mappings
+        self.breadth = breadth
+        self.believe_terminal = bool(believe_terminal)
+        self.relevance = bool(relevance)
+        self.relevance_fraction = relevance_fraction
+        self.bandwidths = bandwidths
+        self.target: TargetTask | None = None
+
+    # ----------------------------------------------------------------- binding
+
+    def bind(self, target: TargetTask, rng: np.random.Generator) -> None:
+        self.target = target
+        self._rng = rng
+        self._sources = load_sources(self.source)
+        self._sets = [self._named(resolve(self.mappings, **_sizes(source, target)), source) for source in self._sources]
+        self._instances = stacked_instances(self._sources)
+        self._table = stacked_table(self._sets)
+        self._ways = self._candidates()
+        self._bandwidths = default_bandwidths(self._instances) if self.bandwidths is None else Bandwidths(*self.bandwidths)
+        self._rules = TransferRules(
+            threshold=target.exploration_threshold,
+            breadth=float(self.breadth),
+            min_weight=target.min_weight,
+            min_fraction=target.min_fraction,
+            believe_terminal=self.believe_terminal,
+            by_merit=self.relevance,
+        )
+        n_candidates = len(self._ways.row)
+        most = int(self._instances.count.max())
+        self._merit = np.ones((n_candidates, most)) if self.relevance else np.empty((1, 0))
+        self._scratch = GatherScratch.empty(most * self._most_ways_at_once())
+        self._seen = TargetTransitions(target.n_actions, target.n_variables)
+        self._no_choice = np.zeros(target.n_actions, dtype=np.int64)
+        self._uses: Counter[int] = Counter()
+        self._merit_of = 0
+        self._most_transferred = min(list_room(target.min_fraction), MOST_TRANSFERRED)
+
+    def _most_ways_at_once(self) -> int:
+        """Candidates from which one pair may draw at the same time."""
+        return 1
+
+    def _named(self, mappings: MappingSet, source: SourceInstances) -> MappingSet:
+        assert self.target is not None
+        return mappings.with_names(
+            source.state_names, self.target.state_names, source.action_names, self.target.action_names
+        )
+
+    def _candidates(self) -> CandidateArrays:
+        """The candidates of every target action, over all sources."""
+        assert self.target is not None
+        rows: list[np.ndarray] = []
+        actions: list[np.ndarray] = []
+        first = [0]
+        self._origin: list[tuple[int, int, int, int]] = []
+        for a in range(self.target.n_actions):
+            row_offset = action_offset = 0
+            for number, (source, mappings) in enumerate(zip(self._sources, self._sets, strict=True)):
+                state_index, source_action = mappings.candidates(a)
+                rows.append(state_index + row_offset)
+                actions.append(source_action + action_offset)
+                self._origin += [(number, a, int(s), int(u)) for s, u in zip(state_index, source_action, strict=True)]
+                row_offset += mappings.n_state_mappings
+                action_offset += source.n_actions
+            first.append(len(self._origin))
+        return CandidateArrays(
+            first=np.array(first, dtype=np.int64),
+            row=np.concatenate(rows).astype(np.int64),
+            action=np.concatenate(actions).astype(np.int64),
+        )
+
+    # ---------------------------------------------------------------- supplying
+
+    def _draw(
+        self, states: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray
+    ) -> Supply:
+        """Translate, for each state, instances of the candidates from ``first`` up to ``last``."""
+        n, d = states.shape
+        most = self._most_transferred
+        supply = Supply(
+            count=np.empty(n, dtype=np.int64),
+            weight=np.empty((n, most)),
+            effect=np.empty((n, most, d)),
+            reward=np.empty((n, most)),
+            terminated=np.empty((n, most), dtype=np.bool_),
+        )
+        translate(
+            states,
+            own,
+            first,
+            last,
+            self._instances,
+            self._ways,
+            self._table,
+            self._rules,
+            self._merit,
+            self._scratch,
+            supply,
+        )
+        return supply
+
+    def _nothing_for(self, n: int) -> Supply:
+        assert self.target is not None
+        return Supply.none(n, self.target.n_variables)
+
+    def _use(self, candidate: int) -> None:
+        self._uses[candidate] += 1
+
+    def _renew_relevance(self) -> None:
+        """Relevance of all instances to the target transitions seen so far."""
+        for c in range(len(self._ways.row)):
+            action = int(self._origin[c][1])
+            states, effects, rewards = self._seen.of_action(action)
+            row = self._ways.row[c]
+            relevance(
+                states,
+                effects,
+                rewards,
+                self._instances,
+                self._ways.action[c],
+                self._table.index[row],
+                self._table.sign[row],
+                self._bandwidths,
+                float(self.relevance_fraction),
+                np.empty(len(rewards)),
+                self._merit[c],
+            )
+        self._merit_of = self._seen.n
+
+    # --------------------------------------------------------------- describing
+
+    def describe(self, candidate: int) -> str:
+        """A candidate in words: target action, source action and the variables that stand for each other."""
+        number, action, state_index, source_action = self._origin[candidate]
+        mappings = self._sets[number]
+        whole = repr(mappings[mappings.find(state_index, action, source_action)])
+        assert self.target is not None
+        variables = whole[whole.index("(") + 1 : whole.index(";")]
+        words = f"{self.target.action_names[action]}<-{self._sources[number].action_names[source_action]} with {variables}"
+        return words if len(self._sources) == 1 else f"source {number}: {words}"
+
+    def mapping_counts(self) -> list[tuple[str, int]]:
+        """How often each mapping supplied instances to a decision, the most used first, by name."""
+        return [(self.describe(candidate), n) for candidate, n in self._uses.most_common()]
+
+    def statistics(self) -> dict[str, float]:
+        return {"transfer/uses": sum(self._uses.values()), "transfer/mappings_used": len(self._uses)}
+
+    def spec(self) -> dict[str, Any]:
+        options = {name: value for name, value in vars(self).items() if name in OPTIONS}
+        return {f"{type(self).__module__}.{type(self).__qualname__}": options}
+
+
+OPTIONS = ("breadth", "believe_terminal", "relevance", "relevance_fraction", "bandwidths")
+
+
+class TargetTransitions:
+    """The target transitions that a transfer method has noted, in growing arrays (unit coordinates)."""
+
+    def __init__(self, n_actions: int, n_variables: int):
+        self.n = 0
+        self.states = np.empty((64, n_variables))
+        self.effects = np.empty((64, n_variables))
+        self.rewards = np.empty(64)
+        self.actions = np.empty(64, dtype=np.int64)
+
+    def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray) -> int:
+        """Note one; its number."""
+        if self.n == len(self.rewards):
+            for name in ("states", "effects", "rewards", "actions"):
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.empty_like(old)]))
+        i = self.n
+        self.states[i], self.effects[i] = state, next_state - state
+        self.rewards[i], self.actions[i] = reward, action
+        self.n += 1
+        return i
+
+    def of_action(self, action: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """States, effects and rewards of the transitions with one action."""
+        rows = np.flatnonzero(self.actions[: self.n] == action)
+        return self.states[rows], self.effects[rows], self.rewards[rows]
+
+
+def load_sources(source: SourceLike) -> list[SourceInstances]:
+    """The source instances that a user means.
+
+    :raises FileNotFoundError: if a path leads nowhere
+    :raises ValueError: if it is not instances, a path, or a list of these
+    """
+    if isinstance(source, SourceInstances):
+        return [source]
+    if isinstance(source, str | os.PathLike):
+        return [SourceInstances.load(source)]
+    if isinstance(source, Sequence) and len(source) > 0:
+        return [instances for one in source for instances in load_sources(one)]
+    raise ValueError(f"source must be SourceInstances, a path to them, or a list of these, got {source!r}")
+
+
+def stacked_instances(sources: Sequence[SourceInstances]) -> InstanceArrays:
+    """The instances of all sources in unit coordinates of each, by action, the sources' actions numbered on."""
+    n_actions = sum(source.n_actions for source in sources)
+    n_variables = max(source.n_variables for source in sources)
+    most = max(int(np.bincount(source.actions, minlength=1).max()) for source in sources)
+    instances = InstanceArrays.empty(n_actions, n_variables, capacity=-(-most // BLOCK) * BLOCK)
+    offset = 0
+    for source in sources:
+        states, next_states = source.scaling.to_unit(source.states), source.scaling.to_unit(source.next_states)
+        padding = ((0, 0), (0, n_variables - source.n_variables))
+        states, next_states = np.pad(states, padding), np.pad(next_states, padding)
+        for i, action in enumerate(source.actions + offset):
+            put_instance(
+                instances,
+                action,
+                instances.count[action],
+                states[i],
+                next_states[i],
+                source.rewards[i],
+                bool(source.terminated[i]),
+            )
+        offset += source.n_actions
+    return instances
+
+
+def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:
+    """The state mappings of all sets, one below the other."""
+    return MappingTable(
+        index=np.vstack([mappings.state_mappings for mappings in sets]).astype(np.int64),
+        sign=np.vstack([mappings.state_signs for mappings in sets]).astype(np.float64),
+    )
+
+
+def _sizes(source: SourceInstances, target: TargetTask) -> dict[str, int]:
+    return {
+        "n_source_variables": source.n_variables,
+        "n_target_variables": target.n_variables,
+        "n_source_actions": source.n_actions,
+        "n_target_actions": target.n_actions,
+    }

@@ -1,0 +1,168 @@
+"""Fitted R-Max again, written from its definition in plain loops: slow, obvious, and independent of the package.
+
+Nothing is incremental: every list, row and value is computed from all instances seen. The one piece of memory is which
+pairs were known before, because "a pair once known stays known" speaks of the past.
+"""
+
+import itertools
+import math
+
+import numpy as np
+
+
+class Instance:
+    """One transition in unit coordinates."""
+
+    def __init__(self, state, action, reward, next_state, terminated):
+        self.state = np.array(state, dtype=float)
+        self.action = action
+        self.reward = reward
+        self.effect = np.array(next_state, dtype=float) - self.state
+        self.terminated = terminated
+
+
+def kernel(distance_squared, breadth):
+    return math.exp(-distance_squared / breadth**2)
+
+
+def kept_instances(state, instances, breadth, min_weight, min_fraction):
+    """(number, weight) of the instances that count at ``state``, nearest first."""
+    weighted = []
+    for number, instance in enumerate(instances):
+        if instance is None:
+            continue
+        w = kernel(sum((a - b) ** 2 for a, b in zip(state, instance.state, strict=True)), breadth)
+        if w >= min_weight:
+            weighted.append((number, w))
+    weighted.sort(key=lambda pair: -pair[1])
+    kept = []
+    for number, w in weighted:
+        if kept and w / sum(v for _, v in kept) < min_fraction:
+            break
+        kept.append((number, w))
+    return kept
+
+
+class NaiveGrid:
+    """Grid points by their whole-numbered coordinates."""
+
+    def __init__(self, resolution, margin):
+        self.cells = [2**r for r in resolution]
+        self.margin = margin
+        self.shape = [c + 1 + 2 * margin for c in self.cells]
+        self.coordinates = list(itertools.product(*[range(n) for n in self.shape]))
+        self.number = {coordinates: i for i, coordinates in enumerate(self.coordinates)}
+
+    def unit(self, point):
+        return np.array([(c - self.margin) / n for c, n in zip(self.coordinates[point], self.cells, strict=True)])
+
+    def corners(self, unit):
+        """{point: weight} of multilinear interpolation; what lies outside the grid is clipped to its edge."""
+        ways = []
+        for u, cells, n in zip(unit, self.cells, self.shape, strict=True):
+            at = min(max(u * cells + self.margin, 0.0), n - 1.0)
+            low = min(int(math.floor(at)), n - 2)
+            ways.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
+        corners = {}
+        for corner in itertools.product(*ways):
+            weight = math.prod(w for _, w in corner)
+            if weight > 0.0:
+                corners[self.number[tuple(c for c, _ in corner)]] = weight
+        return corners
+
+    def clipped(self, unit):
+        low = [-self.margin / c for c in self.cells]
+        high = [1.0 + self.margin / c for c in self.cells]
+        return np.clip(unit, low, high)
+
+
+class NaiveFittedRMax:
+    """The model, its values and Q, all from scratch."""
+
+    def __init__(
+        self, resolution, margin, n_actions, *, breadth, min_weight, min_fraction, threshold=1.0, gamma=1.0, max_value=0.0
+    ):
+        self.grid = NaiveGrid(resolution, margin)
+        self.n_points = len(self.grid.coordinates)
+        self.n_actions = n_actions
+        self.kernel = (breadth, min_weight, min_fraction)
+        self.threshold = threshold
+        self.gamma = gamma
+        self.max_value = max_value
+        self.instances = [[] for _ in range(n_actions)]
+        self.known = np.zeros((n_actions, self.n_points), dtype=bool)
+
+    def add(self, state, action, reward, next_state, terminated):
+        self.instances[action].append(Instance(state, action, reward, next_state, terminated))
+        for point in range(self.n_points):
+            if sum(w for _, w in self.list_of(action, point)) >= self.threshold:
+                self.known[action, point] = True
+
+    def list_of(self, action, point):
+        return kept_instances(self.grid.unit(point), self.instances[action], *self.kernel)
+
+    def row(self, action, point):
+        """(R, {successor: probability}) of a pair, self-loop included and undiscounted."""
+        kept = self.list_of(action, point)
+        total = sum(w for _, w in kept)
+        reward = 0.0
+        successors = {}
+        for number, w in kept:
+            instance = self.instances[action][number]
+            reward += w / total * instance.reward
+            if instance.terminated:
+                continue
+            for to, part in self.grid.corners(self.grid.unit(point) + instance.effect).items():
+                successors[to] = successors.get(to, 0.0) + w / total * part
+        return reward, successors
+
+    def matrices(self):
+        """R (n_actions, n_points) and P (n_actions, n_points, n_points) of the known pairs, zero elsewhere."""
+        rewards = np.zeros((self.n_actions, self.n_points))
+        chances = np.zeros((self.n_actions, self.n_points, self.n_points))
+        for action, point in zip(*np.nonzero(self.known), strict=True):
+            rewards[action, point], successors = self.row(action, point)
+            for to, p in successors.items():
+                chances[action, point, to] = p
+        return rewards, chances
+
+    def optimal_values(self, min_value, tolerance=1e-12, most_sweeps=200_000):
+        """Value iteration on the known pairs with their self-loops; a point with an unknown action has max_value."""
+        rewards, chances = self.matrices()
+        hopeful = ~self.known.all(axis=0)
+        values = np.full(self.n_points, float(self.max_value))
+        for _ in range(most_sweeps):
+            backed_up = np.clip((rewards + self.gamma * chances @ values).max(axis=0), min_value, self.max_value)
+            backed_up[hopeful] = self.max_value
+            change = np.abs(backed_up - values).max()
+            values = backed_up
+            if change <= tolerance:
+                return values
+        raise AssertionError("value iteration did not converge")
+
+    def q_values(self, state, values, min_value):
+        """Q at an exact state from values at the grid points; staying put is worth the state's own Q."""
+        q = []
+        for action in range(self.n_actions):
+            kept = kept_instances(state, self.instances[action], *self.kernel)
+            total = sum(w for _, w in kept)
+            if total < self.threshold:
+                q.append(self.max_value)
+                continue
+            reward = after = stay = 0.0
+            for number, w in kept:
+                instance = self.instances[action][number]
+                reward += w / total * instance.reward
+                if instance.terminated:
+                    continue
+                here, there = self.grid.clipped(state), self.grid.clipped(state + instance.effect)
+                if np.abs(there - here).max() < 1e-12:
+                    stay += w / total
+                else:
+                    after += w / total * sum(p * values[to] for to, p in self.grid.corners(there).items())
+            if 1.0 - self.gamma * stay < 1e-9:
+                value = 0.0 if reward == 0.0 else math.copysign(math.inf, reward)
+            else:
+                value = (reward + self.gamma * after) / (1.0 - self.gamma * stay)
+            q.append(min(max(value, min_value), self.max_value))
+        return np.array(q)
