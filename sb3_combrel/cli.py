@@ -37,6 +37,7 @@ def demo(
 
 def record(
     env_id: str,
+    /,
     output: Path = Path("source.npz"),
     n_instances: int = 1000,
     total_timesteps: int = 30_000,

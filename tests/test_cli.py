@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -49,6 +50,12 @@ def without_times(path):
 def first_call(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "output"
     return folder, *run_tiny_demo(folder)
+
+
+@pytest.fixture()
+def folder(first_call, tmp_path):
+    """What the first call has left, to do something with."""
+    return shutil.copytree(first_call[0], tmp_path / "output")
 
 
 @pytest.fixture()
@@ -105,16 +112,14 @@ class TestDemo:
         assert all(name in ending for name in OUTPUTS if name != "settings.json")
         assert "What to try next" in ending
 
-    def test_a_second_call_learns_nothing_again(self, first_call, no_film):
-        folder, _, _ = first_call
+    def test_a_second_call_learns_nothing_again(self, folder, no_film):
         before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")}
         status, written = run_tiny_demo(folder)
         assert status == 0
         assert "6 of 6 runs were complete already" in written
         assert {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")} == before
 
-    def test_an_unfinished_run_is_done_again_with_the_same_result(self, first_call, no_film):
-        folder, _, _ = first_call
+    def test_an_unfinished_run_is_done_again_with_the_same_result(self, folder, no_film):
         episodes, model = folder / "runs" / "combrel_seed1.csv", folder / "runs" / "combrel_seed1.zip"
         mappings = folder / "runs" / "combrel_seed1_mappings.csv"
         before = without_times(episodes), mappings.read_text()
@@ -126,21 +131,19 @@ class TestDemo:
         assert (without_times(episodes), mappings.read_text()) == before
         assert len(list(folder.glob("tensorboard/combrel_seed1_*"))) == 1
 
-    def test_more_runs_are_added_to_those_that_are_there(self, first_call, no_film):
-        folder, _, _ = first_call
+    def test_more_runs_are_added_to_those_that_are_there(self, folder, no_film):
         status, written = run_tiny_demo(folder, "--seeds", "3")
         assert status == 0
         assert "6 of 9 runs were complete already" in written
         assert len(rows_of(folder / "results.csv")) == 18
 
-    def test_results_of_other_settings_are_not_mixed_with_new_ones(self, first_call):
-        status, written = run_tiny_demo(first_call[0], "--max-episode-steps", "50")
+    def test_results_of_other_settings_are_not_mixed_with_new_ones(self, folder):
+        status, written = run_tiny_demo(folder, "--max-episode-steps", "50")
         assert status == 1
         assert "max_episode_steps was 60 and is 50" in written
         assert "--fresh" in written
 
-    def test_fresh_begins_anew_and_deletes_nothing_of_the_users(self, first_call, no_film):
-        folder, _, _ = first_call
+    def test_fresh_begins_anew_and_deletes_nothing_of_the_users(self, folder, no_film):
         (folder / "notes.txt").write_text("mine")
         status, written = run_tiny_demo(folder, "--fresh", "--max-episode-steps", "50")
         assert status == 0

@@ -58,7 +58,8 @@ def run_demo(
     :param console: where to write; None for the standard output
     :raises ValueError: if a number is below 1, or the folder has results of other settings
     """
-    numbers = {"seeds": n_seeds, "episodes": n_episodes, "max_episode_steps": max_episode_steps, "workers": workers or 1}
+    workers = cpu_count() if workers is None else workers
+    numbers = {"seeds": n_seeds, "episodes": n_episodes, "max_episode_steps": max_episode_steps, "workers": workers}
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
@@ -76,7 +77,7 @@ def run_demo(
         with console.status("Compiling; the first time this takes a while ..."):
             warm_up()
         console.print(f"Learning {mountain_car.TARGET_ID}: {n_seeds} runs of {n_episodes} episodes with each method ...")
-    carry_out_all(runs, workers or cpu_count(), console)
+    carry_out_all(runs, workers, console)
     _report(runs, output, console)
     shutil.copyfile(_best([run for run in runs if run.method == FILMED], console).model_file, output / MODEL)
     _film(output, max_episode_steps, console)

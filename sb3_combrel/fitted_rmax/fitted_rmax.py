@@ -285,7 +285,7 @@ class FittedRMax(BaseAlgorithm):
     def _end_episode(self, env_index: int, terminated: bool) -> None:
         self._episode_num += 1
         self._episode_tags[env_index] += self.n_envs
-        self._backups += self.policy.end_episode()
+        self._backups += self.policy.end_episode(not terminated)
         rewards = self._episode_rewards[env_index]
         self._episode_rewards[env_index] = []
         if terminated or min(rewards) >= 0.0:
@@ -325,9 +325,10 @@ class FittedRMax(BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        if isinstance(env, VecEnv):
+            _refuse_normalized_observations(env)
         super().set_env(env, force_reset)
         assert self.env is not None
-        _refuse_normalized_observations(self.env)
         self._vec_normalize_env = unwrap_vec_normalize(self.env)
 
     def _excluded_save_params(self) -> list[str]:
@@ -356,10 +357,10 @@ def _names(env: VecEnv | None) -> dict[str, Any]:
         return {}
     found = {}
     for name in ("state_names", "action_names"):
-        try:
-            value = env.get_attr(name, 0)[0]
-        except AttributeError:
+        # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
+        if not env.has_attr(name):
             continue
+        value = env.get_attr(name, 0)[0]
         if isinstance(value, Sequence) and not isinstance(value, str):
             found[name] = value
     return found

@@ -81,7 +81,12 @@ def default_resolution(n_variables: int, reach: float) -> int:
     :param reach: distance at which the kernel falls to ``min_weight``, unit coordinates
     """
     finest_that_is_cheap = {1: 6, 2: 6, 3: 4}.get(n_variables, 3)
-    return max(finest_that_is_cheap, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
+    return max(finest_that_is_cheap, coarsest_in_reach(n_variables, reach))
+
+
+def coarsest_in_reach(n_variables: int, reach: float) -> int:
+    """The coarsest resolution at which a cell's diagonal does not exceed ``reach``."""
+    return max(1, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
 
 
 # Arrays of a pair and of a point when all of them are settled, from the sizes of ModelArrays and SweepQueue.
@@ -141,7 +146,7 @@ def _warn_if_too_coarse(n_variables: int, resolution: int | Sequence[int], reach
         warnings.warn(
             f"resolution={resolution} is coarse for model_breadth={model_breadth:g}: a grid cell's diagonal is "
             f"{diagonal:.3g}, but an instance reaches only {reach:.3g}, so some grid points may stay optimistic for "
-            f"ever; resolution={default_resolution(n_variables, reach)} or model_breadth="
+            f"ever; resolution={coarsest_in_reach(n_variables, reach)} or model_breadth="
             f"{model_breadth * diagonal / reach:.3g} would be enough",
             stacklevel=5,
         )

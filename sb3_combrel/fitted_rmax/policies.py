@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +27,7 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 LONGEST_PLAN = 10_000
 
 AT_EPISODE_END = 50
-BACKUPS_PER_RENEWED_PAIR = int(os.environ.get("BPR", "10"))
+BACKUPS_PER_RENEWED_PAIR = 10
 NO_PAIRS = np.empty(0, dtype=np.int64)
 
 
@@ -93,7 +92,8 @@ class FittedRMaxPolicy(BasePolicy):
         )
         grid = fitting_grid(self.scaling.n_variables, self.n_actions, resolution, model_breadth, min_weight)
         if transfer is not None:
-            transfer.bind(self._target_task(grid, state_names, action_names), self.rng)
+            self._task = self._target_task(grid, state_names, action_names)
+            transfer.bind(self._task, self.rng)
         self.model = KernelModel(
             grid,
             self.n_actions,
@@ -245,10 +245,10 @@ class FittedRMaxPolicy(BasePolicy):
             self.transfer.observe(state, action, reward, next_state, terminated)
         return self._plan(self.max_backups)
 
-    def end_episode(self) -> int:
+    def end_episode(self, truncated: bool) -> int:
         """Time to think: plan on while no action is due; backups done."""
         if self.transfer is not None:
-            self.transfer.end_episode()
+            self.transfer.end_episode(truncated)
         return self._plan(AT_EPISODE_END * self.max_backups)
 
     def prepare(self) -> int:
@@ -313,7 +313,9 @@ class FittedRMaxPolicy(BasePolicy):
             ]
             by_action.append(np.hstack(columns))
         n = int(self.corrections.count[0])
+        of_transfer = {} if self.transfer is None else self.transfer.saved_arrays()
         return {
+            **{f"transfer_{name}": array for name, array in of_transfer.items()},
             "instances": np.vstack(by_action),
             "values": self.planner.values,
             "known": self.model.arrays.known,
@@ -348,14 +350,25 @@ class FittedRMaxPolicy(BasePolicy):
             else:
                 self._restore(saved)
 
+    def _restore_transfer(self, saved: dict[str, np.ndarray]) -> None:
+        """Bind the transfer method anew and give it back what it had learned."""
+        if self.transfer is not None:
+            self.transfer.bind(self._task, self.rng)
+            prefix = "transfer_"
+            self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
+
     def _misfit(self, saved: dict[str, np.ndarray]) -> str:
-        """What is wrong with the shapes of saved arrays; empty if nothing."""
-        n_columns = 2 * self.scaling.n_variables + 3
-        if saved["instances"].ndim != 2 or saved["instances"].shape[1] != n_columns:
-            return f"instances must have {n_columns} columns, got shape {saved['instances'].shape}"
-        for name, n in (("values", self.model.grid.n_points), ("known", self.model.grid.n_points * self.n_actions)):
+        """What is wrong with saved arrays; empty if nothing."""
+        d, n_points = self.scaling.n_variables, self.model.grid.n_points
+        for name, n_columns in (("instances", 2 * d + 3), ("corrections", d + 2)):
+            if saved[name].ndim != 2 or saved[name].shape[1] != n_columns:
+                return f"{name} must have {n_columns} columns, got shape {saved[name].shape}"
+        for name, n in (("values", n_points), ("known", n_points * self.n_actions), ("lowest_value", 1)):
             if saved[name].shape != (n,):
                 return f"{name} must have shape ({n},) for this grid, got {saved[name].shape}"
+        for name, array in saved.items():
+            if not np.isfinite(array).all():
+                return f"{name} must hold finite numbers only"
         return ""
 
     def _restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -373,6 +386,7 @@ class FittedRMaxPolicy(BasePolicy):
             transfer=model.transfer,
             max_instances=model.max_instances,
         )
+        self._restore_transfer(saved)
         instances = InstanceArrays.empty(self.n_actions, d)
         for action, row in zip(actions, rows, strict=True):
             instances = instances.with_room(action)

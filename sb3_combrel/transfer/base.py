@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -63,8 +63,8 @@ class Transfer(ABC):
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         """Take notice of a transition of the target task (unit coordinates)."""
 
-    def end_episode(self) -> None:
-        """Take notice that an episode has ended."""
+    def end_episode(self, truncated: bool) -> None:
+        """Take notice that an episode has ended, by its time limit or (not ``truncated``) in a terminal state."""
 
     @abstractmethod
     def renewed(self) -> np.ndarray:
@@ -88,9 +88,12 @@ class Transfer(ABC):
         :param own_weight: shape (n_actions,); actions that reach the threshold need nothing
         """
 
-    @abstractmethod
-    def spec(self) -> dict[str, Any]:
-        """The description as plain data (JSON), source instances excepted: see :meth:`source_arrays`."""
+    def saved_arrays(self) -> dict[str, np.ndarray]:
+        """What was learned since it was bound, float64, to be saved with a model."""
+        return {}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Take up what :meth:`saved_arrays` gave; called on a freshly bound object."""
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

@@ -9,7 +9,7 @@ from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.compliance import ComplianceScratch, transition_compliance
-from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, MappingsLike, SourceLike, VirtualSourceTransfer
+from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, DEFAULT_FADING, MappingsLike, SourceLike, VirtualSourceTransfer
 
 RELEVANCE_RENEWAL = 1.2
 
@@ -33,6 +33,8 @@ class COMBREL(VirtualSourceTransfer):
         "first_episode", once, after the first episode, as in the paper
     :param max_transitions: target transitions measured at most
     :param breadth: kernel breadth of transferred instances, in unit coordinates; the paper names none
+    :param fading: factor on ``breadth`` for each episode that runs into its time limit (the paper: none, 1). Whatever
+        the source, pairs that it settled wrongly are explored in the end.
     :param believe_terminal: whether a source instance that ended its episode ends the target's too; the paper does not
         say
     :param relevance: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful.
@@ -51,6 +53,7 @@ class COMBREL(VirtualSourceTransfer):
         measured: str = "online",
         max_transitions: int = 3000,
         breadth: float = DEFAULT_BREADTH,
+        fading: float = DEFAULT_FADING,
         believe_terminal: bool = False,
         relevance: bool = False,
         relevance_fraction: float = 0.5,
@@ -64,6 +67,7 @@ class COMBREL(VirtualSourceTransfer):
             source,
             mappings,
             breadth=breadth,
+            fading=fading,
             believe_terminal=believe_terminal,
             relevance=relevance,
             relevance_fraction=relevance_fraction,
@@ -77,14 +81,12 @@ class COMBREL(VirtualSourceTransfer):
         super().bind(target, rng)
         n_rows, n_actions = len(self._table.index), len(self._instances.count)
         n_points = len(target.sample_states)
-        self._mirrored = bool((self._table.sign < 0.0).any())
-        self._compliance_scratch = ComplianceScratch.empty(target.n_variables, self._instances.state.shape[2], n_rows)
+        self._compliance_scratch = ComplianceScratch.for_mappings(self._table)
         self._tables = np.empty((64, n_rows, n_actions))
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
         self._distance = np.full((target.n_actions, n_points, self.n_neighbors), np.inf)
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._changed_points = np.empty(n_points, dtype=np.int64)
-        self._renewed: list[np.ndarray] = []
         self._first_episode = True
         self._switches = 0
         self._choice_at = np.empty(target.n_actions, dtype=np.int64)
@@ -96,13 +98,14 @@ class COMBREL(VirtualSourceTransfer):
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         if self._seen.n >= self.max_transitions or not (self._first_episode or self.measured == "online"):
             return
-        i = self._seen.add(state, action, reward, next_state)
+        i = self._seen.add(state, action, reward, next_state - state)
         if self.measured == "online":
             self._measure(i)
             if self.relevance and self._seen.n >= max(50, RELEVANCE_RENEWAL * self._merit_of):
                 self._renew_relevance()
 
-    def end_episode(self) -> None:
+    def end_episode(self, truncated: bool) -> None:
+        super().end_episode(truncated)
         if self._first_episode and self.measured == "first_episode":
             for i in range(self._seen.n):
                 self._measure(i)
@@ -122,7 +125,6 @@ class COMBREL(VirtualSourceTransfer):
             float(self._seen.rewards[i]),
             self._instances,
             self._table,
-            self._mirrored,
             self._bandwidths,
             self._compliance_scratch,
             self._tables[i],
@@ -147,12 +149,19 @@ class COMBREL(VirtualSourceTransfer):
         self._switches += changed
         self._renewed.append(self._changed_points[:changed] + action * n_points)
 
-    def renewed(self) -> np.ndarray:
-        if not self._renewed:
-            return np.empty(0, dtype=np.int64)
-        renewed = self._renewed[0] if len(self._renewed) == 1 else np.unique(np.concatenate(self._renewed))
-        self._renewed = []
-        return renewed
+    def saved_arrays(self) -> dict[str, np.ndarray]:
+        return {**super().saved_arrays(), "first_episode": np.array([float(self._first_episode)])}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        self._first_episode = bool(saved["first_episode"][0] > 0.5)
+        super().restore(saved)
+        if self.relevance and self._seen.n:
+            self._renew_relevance()
+
+    def _note(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> None:
+        super()._note(state, action, reward, effect)
+        if self.measured == "online" or not self._first_episode:
+            self._measure(self._seen.n - 1)
 
     # ---------------------------------------------------------------- supplying
 
@@ -183,11 +192,7 @@ class COMBREL(VirtualSourceTransfer):
             self._choice_at,
         )
         first = np.maximum(self._choice_at, 0)
-        last = np.where(self._choice_at < 0, first, first + 1)
-        supply = self._draw(np.tile(state, (len(own_weight), 1)), own_weight, first, last)
-        for action in np.flatnonzero(supply.count):
-            self._use(int(first[action]))
-        return supply
+        return self._draw_at(state, own_weight, first, first + (self._choice_at >= 0))
 
     def statistics(self) -> dict[str, float]:
         chosen = self._choice[self._choice >= 0]

@@ -39,24 +39,53 @@ class MappingTable(NamedTuple):
 
 
 class ComplianceScratch(NamedTuple):
-    """Work space: kernel factors of one source instance, by target variable, source variable and (not) mirrored.
+    """Work space, and the state mappings in the form that the inner loop reads.
 
-    :param start: float64, shape (n_target_variables, n_source_variables, 2)
+    A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses.
+
+    :param variable: int64, shape (n_factors,): target variable of each factor
+    :param source: int64, same shape: source variable
+    :param mirrored: bool, same shape
+    :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are
+        ``factors[first[m] : first[m + 1]]``
+    :param factors: int64
+    :param start: float64, shape (n_factors,): kernel of where a transition and a source instance start
     :param outcome: the same for outcomes
-    :param still: float64, shape (n_target_variables,): outcome factor of a variable that is predicted not to change
+    :param still: float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
     :param sums: float64, shape (n_state_mappings, 3): sums over instances of weight, weight x outcome, weight x reward
     """
 
+    variable: np.ndarray
+    source: np.ndarray
+    mirrored: np.ndarray
+    first: np.ndarray
+    factors: np.ndarray
     start: np.ndarray
     outcome: np.ndarray
     still: np.ndarray
     sums: np.ndarray
 
     @classmethod
-    def empty(cls, n_target_variables: int, n_source_variables: int, n_state_mappings: int) -> "ComplianceScratch":
-        """Work space for tables of this size."""
-        pairs = (n_target_variables, n_source_variables, 2)
-        return cls(np.empty(pairs), np.empty(pairs), np.empty(n_target_variables), np.empty((n_state_mappings, 3)))
+    def for_mappings(cls, mappings: MappingTable) -> "ComplianceScratch":
+        """Work space for a table of state mappings."""
+        number: dict[tuple[int, int, bool], int] = {}
+        first, factors = [0], []
+        for index, sign in zip(mappings.index, mappings.sign, strict=True):
+            for v in np.flatnonzero(index >= 0):
+                factors.append(number.setdefault((int(v), int(index[v]), bool(sign[v] < 0.0)), len(number)))
+            first.append(len(factors))
+        n_mappings, keys = len(mappings.index), list(number)
+        return cls(
+            variable=np.array([v for v, _, _ in keys], dtype=np.int64),
+            source=np.array([k for _, k, _ in keys], dtype=np.int64),
+            mirrored=np.array([m for _, _, m in keys], dtype=np.bool_),
+            first=np.array(first, dtype=np.int64),
+            factors=np.array(factors, dtype=np.int64),
+            start=np.empty(len(keys)),
+            outcome=np.empty(len(keys)),
+            still=np.empty(n_mappings),
+            sums=np.empty((n_mappings, 3)),
+        )
 
 
 # Below this sum of kernel weights (a tenth of one instance at a distance of sqrt(2.3 delta)) nothing is near enough to
@@ -64,26 +93,39 @@ class ComplianceScratch(NamedTuple):
 LEAST_EVIDENCE = 0.1
 
 
+# Kernel arguments beyond this make less than 1e-17 and are taken as 0, without an exponential.
+NOTHING = 40.0
+
+
 @compiled
-def _kernel_factors(state, effect, source, action, j, mirrored, bandwidths, scratch):
+def _kernel_factors(state, effect, source, action, j, bandwidths, scratch):
     """Fill ``scratch.start`` and ``scratch.outcome`` for source instance ``j`` of ``action``."""
-    for v in range(len(state)):
-        for k in range(source.state.shape[2]):
-            here = source.state[action, j, k]
-            moved = source.effect[action, j, k]
-            apart = state[v] - here
-            missed = effect[v] - moved
-            scratch.start[v, k, 0] = np.exp(-apart * apart / bandwidths.start)
-            scratch.outcome[v, k, 0] = np.exp(-missed * missed / bandwidths.outcome)
-            if mirrored:
-                apart = state[v] - (1.0 - here)
-                missed = effect[v] + moved
-                scratch.start[v, k, 1] = np.exp(-apart * apart / bandwidths.start)
-                scratch.outcome[v, k, 1] = np.exp(-missed * missed / bandwidths.outcome)
+    for f in range(len(scratch.variable)):
+        v = scratch.variable[f]
+        here = source.state[action, j, scratch.source[f]]
+        moved = source.effect[action, j, scratch.source[f]]
+        if scratch.mirrored[f]:
+            here = 1.0 - here
+            moved = -moved
+        apart = (state[v] - here) * (state[v] - here) / bandwidths.start
+        missed = (effect[v] - moved) * (effect[v] - moved) / bandwidths.outcome
+        scratch.start[f] = np.exp(-apart) if apart < NOTHING else 0.0
+        scratch.outcome[f] = np.exp(-missed) if missed < NOTHING else 0.0
 
 
 @compiled
-def transition_compliance(state, effect, reward, source, mappings, mirrored, bandwidths, scratch, table):
+def _still_factors(effect, mappings, bandwidth, still):
+    """Outcome kernel of each mapping's unmapped variables, which are predicted not to change."""
+    for m in range(mappings.index.shape[0]):
+        missed = 0.0
+        for v in range(len(effect)):
+            if mappings.index[m, v] < 0:
+                missed += effect[v] * effect[v]
+        still[m] = np.exp(-missed / bandwidth)
+
+
+@compiled
+def transition_compliance(state, effect, reward, source, mappings, bandwidths, scratch, table):
     """Compliance of one target transition with the source through every state mapping, for every source action (Eq. 5).
 
     The transition function's part is the mean of phi(d(s', s + (s_j' - s_j))) weighted by w_ij (Eq. 2), the reward
@@ -94,29 +136,23 @@ def transition_compliance(state, effect, reward, source, mappings, mirrored, ban
     :param state: unit coordinates of the target, shape (n_target_variables,)
     :param effect: next state minus state, same shape
     :param source: InstanceArrays of the source, in its own unit coordinates
-    :param mirrored: whether any sign is -1
+    :param scratch: ComplianceScratch for ``mappings``
     :param table: receives the compliances, shape (n_state_mappings, n_source_actions); 0 where no instance is near
     """
-    n_mappings, n_variables = mappings.index.shape
-    for v in range(n_variables):
-        scratch.still[v] = np.exp(-effect[v] * effect[v] / bandwidths.outcome)
+    n_mappings = mappings.index.shape[0]
+    _still_factors(effect, mappings, bandwidths.outcome, scratch.still)
     for action in range(len(source.count)):
         scratch.sums[:, :] = 0.0
         for j in range(source.count[action]):
-            _kernel_factors(state, effect, source, action, j, mirrored, bandwidths, scratch)
+            _kernel_factors(state, effect, source, action, j, bandwidths, scratch)
             off = reward - source.reward[action, j]
-            same_reward = np.exp(-off * off / bandwidths.reward)
+            same_reward = np.exp(-off * off / bandwidths.reward) if off != 0.0 else 1.0
             for m in range(n_mappings):
                 weight = 1.0
                 outcome = 1.0
-                for v in range(n_variables):
-                    k = mappings.index[m, v]
-                    if k < 0:
-                        outcome *= scratch.still[v]
-                    else:
-                        mirror = 1 if mappings.sign[m, v] < 0.0 else 0
-                        weight *= scratch.start[v, k, mirror]
-                        outcome *= scratch.outcome[v, k, mirror]
+                for t in range(scratch.first[m], scratch.first[m + 1]):
+                    weight *= scratch.start[scratch.factors[t]]
+                    outcome *= scratch.outcome[scratch.factors[t]]
                 scratch.sums[m, 0] += weight
                 scratch.sums[m, 1] += weight * outcome
                 scratch.sums[m, 2] += weight * same_reward
@@ -125,16 +161,14 @@ def transition_compliance(state, effect, reward, source, mappings, mirrored, ban
             if total < LEAST_EVIDENCE:
                 table[m, action] = 0.0
             else:
-                table[m, action] = (scratch.sums[m, 1] / total) * (scratch.sums[m, 2] / total)
+                table[m, action] = scratch.still[m] * (scratch.sums[m, 1] / total) * (scratch.sums[m, 2] / total)
 
 
 @compiled
-def compliance_table(states, effects, rewards, source, mappings, mirrored, bandwidths, scratch, tables):
+def compliance_table(states, effects, rewards, source, mappings, bandwidths, scratch, tables):
     """:func:`transition_compliance` of many transitions; ``tables`` has one table a transition."""
     for i in range(len(rewards)):
-        transition_compliance(
-            states[i], effects[i], rewards[i], source, mappings, mirrored, bandwidths, scratch, tables[i]
-        )
+        transition_compliance(states[i], effects[i], rewards[i], source, mappings, bandwidths, scratch, tables[i])
 
 
 def task_compliance(tables: np.ndarray, actions: np.ndarray, state_index: int, action_mapping: np.ndarray) -> float:

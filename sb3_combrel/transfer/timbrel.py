@@ -10,7 +10,7 @@ import numpy as np
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, MappingsLike, SourceLike, VirtualSourceTransfer
+from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, DEFAULT_FADING, MappingsLike, SourceLike, VirtualSourceTransfer
 
 RELEVANCE_RENEWAL = 1.2
 
@@ -31,6 +31,8 @@ class TIMBREL(VirtualSourceTransfer):
         paper's sets, a list of mappings or a ``MappingSet``
     :param breadth: kernel breadth of transferred instances, in unit coordinates. The paper names none; it needs to be
         wide enough for 1000 instances to cover the source.
+    :param fading: factor on ``breadth`` for each episode that runs into its time limit (the paper: none, 1). Whatever
+        the source, pairs that it settled wrongly are explored in the end.
     :param believe_terminal: whether a source instance that ended its episode ends the target's too. The paper does not
         say; reaching one of two goals at once is not the end, so the default is not.
     :param relevance: order the instances by relevance (Eq. 7) to the target's transitions, not by distance. The paper
@@ -47,6 +49,7 @@ class TIMBREL(VirtualSourceTransfer):
         *,
         mappings: MappingsLike = "injective",
         breadth: float = DEFAULT_BREADTH,
+        fading: float = DEFAULT_FADING,
         believe_terminal: bool = False,
         relevance: bool = False,
         relevance_fraction: float = 0.5,
@@ -58,6 +61,7 @@ class TIMBREL(VirtualSourceTransfer):
             source,
             mappings if isinstance(mapping, str) else mapping,
             breadth=breadth,
+            fading=fading,
             believe_terminal=believe_terminal,
             relevance=relevance,
             relevance_fraction=relevance_fraction,
@@ -73,6 +77,7 @@ class TIMBREL(VirtualSourceTransfer):
                 f"mapping must be one mapping or one for each of the {target.n_actions} target actions, got {len(given)}"
             )
         self._fixed = None if isinstance(given, str) else self._candidate_of_each_action(len(given))
+        self._renew_all()
 
     def _candidate_of_each_action(self, n_given: int) -> np.ndarray:
         """The candidate that the mapping given for each action amounts to there (of the first source)."""
@@ -96,16 +101,9 @@ class TIMBREL(VirtualSourceTransfer):
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         if not self.relevance:
             return
-        self._seen.add(state, action, reward, next_state)
+        self._seen.add(state, action, reward, next_state - state)
         if self._seen.n >= max(50, RELEVANCE_RENEWAL * self._merit_of):
             self._renew_relevance()
-
-    def renewed(self) -> np.ndarray:
-        """All pairs at first; afterwards none: what the target's own instances change is asked for anyway."""
-        assert self.target is not None
-        n = 0 if getattr(self, "_announced", False) else self.target.n_actions * len(self.target.sample_states)
-        self._announced = True
-        return np.arange(n)
 
     def _span(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The candidates from which each pair may draw."""
@@ -128,8 +126,4 @@ class TIMBREL(VirtualSourceTransfer):
         if (own_weight >= self._rules.threshold).all():
             return self._nothing_for(len(own_weight))
         first, last = self._span(np.arange(self.target.n_actions))
-        supply = self._draw(np.tile(state, (len(own_weight), 1)), own_weight, first, last)
-        if self.mapping != "pool":
-            for action in np.flatnonzero(supply.count):
-                self._use(int(first[action]))
-        return supply
+        return self._draw_at(state, own_weight, first, last)

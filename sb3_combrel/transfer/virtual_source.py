@@ -23,7 +23,8 @@ from sb3_combrel.transfer.translation import CandidateArrays, GatherScratch, Tra
 SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances | str | os.PathLike[str]]
 MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
-DEFAULT_BREADTH = 0.2
+DEFAULT_BREADTH = 0.3
+DEFAULT_FADING = 0.8
 MOST_TRANSFERRED = 32
 
 
@@ -36,6 +37,7 @@ class VirtualSourceTransfer(Transfer):
     :param source: instances, a path to them, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
     :param breadth: kernel breadth of transferred instances, in unit coordinates
+    :param fading: factor on ``breadth`` for each episode that runs into its time limit
     :param believe_terminal: whether a source instance that ended its episode ends the target's
     :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance
     :param relevance_fraction: mu of Eq. 4
@@ -48,12 +50,14 @@ class VirtualSourceTransfer(Transfer):
         mappings: MappingsLike,
         *,
         breadth: float,
+        fading: float,
         believe_terminal: bool,
         relevance: bool,
         relevance_fraction: float,
         bandwidths: tuple[float, float, float] | None,
     ):
         check_positive("breadth", breadth)
+        check_positive("fading", fading, largest=1.0)
         check_positive("relevance_fraction", relevance_fraction, largest=1.0)
         if bandwidths is not None:
             if len(tuple(bandwidths)) != 3:
@@ -63,6 +67,7 @@ class VirtualSourceTransfer(Transfer):
         self.source = source
         self.mappings = mappings
         self.breadth = breadth
+        self.fading = fading
         self.believe_terminal = bool(believe_terminal)
         self.relevance = bool(relevance)
         self.relevance_fraction = relevance_fraction
@@ -93,9 +98,10 @@ class VirtualSourceTransfer(Transfer):
         self._merit = np.ones((n_candidates, most)) if self.relevance else np.empty((1, 0))
         self._scratch = GatherScratch.empty(most * self._most_ways_at_once())
         self._seen = TargetTransitions(target.n_actions, target.n_variables)
-        self._no_choice = np.zeros(target.n_actions, dtype=np.int64)
         self._uses: Counter[int] = Counter()
         self._merit_of = 0
+        self._renewed: list[np.ndarray] = []
+        self._states_at = np.empty((target.n_actions, target.n_variables))
         self._most_transferred = min(list_room(target.min_fraction), MOST_TRANSFERRED)
 
     def _most_ways_at_once(self) -> int:
@@ -133,9 +139,7 @@ class VirtualSourceTransfer(Transfer):
 
     # ---------------------------------------------------------------- supplying
 
-    def _draw(
-        self, states: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray
-    ) -> Supply:
+    def _draw(self, states: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray) -> Supply:
         """Translate, for each state, instances of the candidates from ``first`` up to ``last``."""
         n, d = states.shape
         most = self._most_transferred
@@ -161,12 +165,37 @@ class VirtualSourceTransfer(Transfer):
         )
         return supply
 
+    def _draw_at(self, state: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray) -> Supply:
+        """The same for every action at one state; what is used there is counted."""
+        self._states_at[:] = state
+        supply = self._draw(self._states_at, own, first, last)
+        if self._most_ways_at_once() == 1:
+            self._uses.update(first[supply.count > 0].tolist())
+        return supply
+
+    def renewed(self) -> np.ndarray:
+        if not self._renewed:
+            return NO_PAIRS
+        renewed = self._renewed[0] if len(self._renewed) == 1 else np.unique(np.concatenate(self._renewed))
+        self._renewed = []
+        return renewed
+
+    def _renew_all(self) -> None:
+        assert self.target is not None
+        self._renewed = [np.arange(self.target.n_actions * len(self.target.sample_states))]
+
+    def end_episode(self, truncated: bool) -> None:
+        """An episode that ran into its time limit speaks against the transferred model: it reaches less far from now on.
+
+        Where transferred instances settle every pair, wrongly, nothing is optimistic and nothing would ever be tried.
+        """
+        if truncated and self.fading < 1.0:
+            self._rules = self._rules._replace(breadth=self._rules.breadth * self.fading)
+            self._renew_all()
+
     def _nothing_for(self, n: int) -> Supply:
         assert self.target is not None
         return Supply.none(n, self.target.n_variables)
-
-    def _use(self, candidate: int) -> None:
-        self._uses[candidate] += 1
 
     def _renew_relevance(self) -> None:
         """Relevance of all instances to the target transitions seen so far."""
@@ -208,12 +237,29 @@ class VirtualSourceTransfer(Transfer):
     def statistics(self) -> dict[str, float]:
         return {"transfer/uses": sum(self._uses.values()), "transfer/mappings_used": len(self._uses)}
 
-    def spec(self) -> dict[str, Any]:
-        options = {name: value for name, value in vars(self).items() if name in OPTIONS}
-        return {f"{type(self).__module__}.{type(self).__qualname__}": options}
+    # --------------------------------------------------------------- saving
+
+    def saved_arrays(self) -> dict[str, np.ndarray]:
+        seen = self._seen
+        n = seen.n
+        columns = [seen.states[:n], seen.effects[:n], seen.rewards[:n, None], seen.actions[:n, None]]
+        return {"transitions": np.hstack(columns), "breadth": np.array([self._rules.breadth])}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        assert self.target is not None
+        d = self.target.n_variables
+        self._rules = self._rules._replace(breadth=float(saved["breadth"][0]))
+        for row in saved["transitions"]:
+            action = int(np.clip(row[-1], 0, self.target.n_actions - 1))
+            self._note(row[:d], action, float(row[-2]), row[d : 2 * d])
+        self.renewed()
+
+    def _note(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> None:
+        """Take up a saved transition."""
+        self._seen.add(state, action, reward, effect)
 
 
-OPTIONS = ("breadth", "believe_terminal", "relevance", "relevance_fraction", "bandwidths")
+NO_PAIRS = np.empty(0, dtype=np.int64)
 
 
 class TargetTransitions:
@@ -226,14 +272,14 @@ class TargetTransitions:
         self.rewards = np.empty(64)
         self.actions = np.empty(64, dtype=np.int64)
 
-    def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray) -> int:
+    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> int:
         """Note one; its number."""
         if self.n == len(self.rewards):
             for name in ("states", "effects", "rewards", "actions"):
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.empty_like(old)]))
         i = self.n
-        self.states[i], self.effects[i] = state, next_state - state
+        self.states[i], self.effects[i] = state, effect
         self.rewards[i], self.actions[i] = reward, action
         self.n += 1
         return i

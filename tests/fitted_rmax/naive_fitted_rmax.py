@@ -61,7 +61,7 @@ class NaiveGrid:
         ways = []
         for u, cells, n in zip(unit, self.cells, self.shape, strict=True):
             at = min(max(u * cells + self.margin, 0.0), n - 1.0)
-            low = min(int(math.floor(at)), n - 2)
+            low = min(math.floor(at), n - 2)
             ways.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
         corners = {}
         for corner in itertools.product(*ways):

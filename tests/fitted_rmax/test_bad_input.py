@@ -202,7 +202,7 @@ def test_a_grid_that_does_not_fit_in_memory_is_refused_with_its_size_and_one_tha
         FittedRMax(Scripted(n_variables=4), resolution=12)
     assert "4097" in str(error.value) or f"{4097**4:,}" in str(error.value)
     with pytest.raises(ValueError, match=r"GiB"):
-        FittedRMax(Scripted(n_variables=12))
+        FittedRMax(Scripted(n_variables=4), resolution=[12, 12, 12, 12])
 
 
 def test_a_resolution_too_coarse_for_the_breadth_gives_a_warning_that_names_better_ones():

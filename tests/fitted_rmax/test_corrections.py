@@ -189,7 +189,9 @@ def test_a_correction_counts_in_its_cell_only_and_never_raises_a_value():
     for state in rng.random((500, 2)):
         plain = GRID.interpolate(values, state)
         if c.cell_key(state * 8, GRID.arrays.shape) == own_cell:
-            assert value_at(values, memory, state) == pytest.approx(plain - 30.0 - GRID.interpolate(values, np.array([0.3, 0.4])))
+            assert value_at(values, memory, state) == pytest.approx(
+                plain - 30.0 - GRID.interpolate(values, np.array([0.3, 0.4]))
+            )
             lowered += 1
         else:
             assert value_at(values, memory, state) == pytest.approx(plain)

@@ -238,9 +238,7 @@ class ListsByHand:
         for point in range(self.naive.n_points):
             candidates = [*self.lists[point], slot]
             ordered = sorted(candidates, key=lambda s, point=point: -self.weight(point, s))
-            kept = kept_instances(
-                self.naive.grid.unit(point), [self.instances[s] for s in ordered], *self.naive.kernel
-            )
+            kept = kept_instances(self.naive.grid.unit(point), [self.instances[s] for s in ordered], *self.naive.kernel)
             self.lists[point] = [ordered[number] for number, _ in kept]
             self.known[point] |= sum(w for _, w in kept) >= self.naive.threshold
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.logger import HumanOutputFormat, Logger, configure
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
@@ -241,6 +241,7 @@ def test_normalized_observations_are_refused_by_constructor_and_set_env():
     model = small()
     with pytest.raises(ValueError, match="norm_obs"):
         model.set_env(normalized)
+    assert model.get_env() is not normalized, "refused before anything was changed"
     model.learn(5)
 
 
@@ -310,7 +311,9 @@ def test_save_and_load_keep_everything(tmp_path):
     assert same_parameters(model, loaded)
     for name in ("min_fraction", "model_breadth", "resolution", "max_backups", "gamma", "max_value", "num_timesteps"):
         assert getattr(loaded, name) == getattr(model, name)
-    np.testing.assert_array_equal(loaded.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0])
+    np.testing.assert_array_equal(
+        loaded.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0]
+    )
     for observation in OBSERVATIONS:
         unit = model.policy.to_unit(observation)
         np.testing.assert_array_equal(loaded.policy.q_values(unit), model.policy.q_values(unit))
@@ -322,7 +325,9 @@ def test_save_and_load_keep_everything(tmp_path):
 
 
 def test_pairs_that_are_known_by_history_alone_are_saved(tmp_path):
-    model = small(min_fraction=0.9, model_breadth=0.3).learn(300)
+    model = small(min_fraction=0.6, model_breadth=0.5, resolution=1)
+    for state, next_state in [(0.1, 0.2), (0.1, 0.2), (0.45, 0.95)]:
+        model.policy.learn_from(np.array([state, 0.5]), 0, -1.0, np.array([next_state, 0.5]), False)
     arrays = model.policy.model.arrays
     assert (arrays.known & (arrays.total < 1.0)).any(), "the case that this test is about"
     model.save(tmp_path / "model")
@@ -348,7 +353,9 @@ def test_a_policy_can_be_saved_and_loaded_by_itself(tmp_path):
     model = small().learn(100)
     model.policy.save(tmp_path / "policy.pth")
     policy = FittedRMaxPolicy.load(tmp_path / "policy.pth")
-    np.testing.assert_array_equal(policy.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0])
+    np.testing.assert_array_equal(
+        policy.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0]
+    )
 
 
 def test_parameters_go_back_and_forth():
@@ -387,15 +394,13 @@ def test_the_same_seed_gives_the_same_run_to_the_last_bit():
 
 def test_without_a_seed_numpys_decides():
     runs = []
-    for seed in (1, 1, 2):
+    for seed in (1, 1, 2, 3, 4, 5):
         np.random.seed(seed)
-        env = Walk()
-        env.reset(seed=0)
-        runs.append(small(env, seed=None))
+        runs.append(small(seed=None))
         runs[-1].env.seed(0)
         runs[-1].learn(80)
     assert same_parameters(runs[0], runs[1])
-    assert not same_parameters(runs[0], runs[2])
+    assert not all(same_parameters(runs[0], other) for other in runs[2:])
 
 
 # --------------------------------------------------------------------------- logs
@@ -431,10 +436,6 @@ def test_tensorboard_logs_are_named_after_the_algorithm(tmp_path):
 def test_logging_to_the_screen(capsys):
     small(verbose=1).learn(60, log_interval=1)
     assert "ep_rew_mean" in capsys.readouterr().out
-    model = small()
-    model.set_logger(Logger(None, [HumanOutputFormat(sys.stdout)]))
-    model.dump_logs()
-    assert "total_timesteps" in capsys.readouterr().out
 
 
 # ------------------------------------------------------------------------- import
@@ -446,8 +447,9 @@ def test_importing_is_light_and_compiles_nothing():
         "heavy = {'mujoco', 'dm_control', 'rl_zoo3', 'matplotlib', 'pandas', 'minari', 'optuna'} & set(sys.modules)\n"
         "from numba.core.dispatcher import Dispatcher\n"
         "import gc\n"
-        "compiled = [d for d in gc.get_objects() if isinstance(d, Dispatcher) and d.py_func.__module__.startswith('sb3_combrel')"
-        " and d.signatures]\n"
+        "ours = [d for d in gc.get_objects() if isinstance(d, Dispatcher) and 'sb3_combrel' in d.py_func.__module__]\n"
+        "assert ours\n"
+        "compiled = [d for d in ours if d.signatures]\n"
         "sys.exit(f'{heavy} {compiled}' if heavy or compiled else 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

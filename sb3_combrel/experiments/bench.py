@@ -1,0 +1,132 @@
+"""What Fitted R-Max costs: time of an environment step, memory, and the compilation on first use.
+
+Run as ``python -m sb3_combrel.experiments.bench``.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any, NamedTuple
+
+
+class Case(NamedTuple):
+    """One line of the table.
+
+    :param name: what stands in it
+    :param env_id: the environment
+    :param env_kwargs: its arguments
+    :param kwargs: arguments of FittedRMax
+    :param n_episodes: how many to learn
+    """
+
+    name: str
+    env_id: str
+    env_kwargs: dict[str, Any]
+    kwargs: dict[str, Any]
+    n_episodes: int
+
+
+CASES = (
+    Case(
+        "Mountain Car 2D, breadth 1/16, resolution 4",
+        "combrel/MountainCar2D-v0",
+        dict(start="fixed"),
+        dict(model_breadth=1 / 16, resolution=4, min_fraction=0.01),
+        50,
+    ),
+    Case(
+        "Mountain Car 4D, breadth 0.4, resolution 3",
+        "combrel/MountainCar4D-v0",
+        {},
+        dict(model_breadth=0.4, resolution=3, min_fraction=0.1),
+        200,
+    ),
+    Case(
+        "Mountain Car 4D, breadth 0.2, resolution 3",
+        "combrel/MountainCar4D-v0",
+        {},
+        dict(model_breadth=0.2, resolution=3, min_fraction=0.1),
+        60,
+    ),
+)
+
+_FIRST_USE = """
+import time
+import gymnasium
+from sb3_combrel import FittedRMax
+model = FittedRMax("MountainCar-v0", seed=0)
+start = time.perf_counter()
+model.learn(5)
+model.predict(model.observation_space.sample(), deterministic=True)
+print(time.perf_counter() - start)
+"""
+
+
+def resident_memory() -> float:
+    """Resident memory of this process in MiB (Linux; elsewhere the peak so far)."""
+    try:
+        with open("/proc/self/statm") as statm:
+            return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def first_use_seconds() -> float:
+    """Seconds until the first steps and the first prediction are done, in a fresh process with nothing compiled."""
+    with tempfile.TemporaryDirectory() as empty:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": empty}
+        done = subprocess.run([sys.executable, "-c", _FIRST_USE], env=environment, capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
+    """Learn ``n_episodes`` of a case; environment steps, and seconds of processor time."""
+    from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+    from stable_baselines3.common.env_util import make_vec_env
+
+    import combrel_envs  # noqa: F401 - registers the environments
+    from sb3_combrel import FittedRMax
+
+    env = make_vec_env(case.env_id, seed=seed, env_kwargs=case.env_kwargs)
+    model = FittedRMax(env, seed=seed, **case.kwargs)
+    start = time.process_time()
+    model.learn(10**7, callback=StopTrainingOnMaxEpisodes(n_episodes), log_interval=None)
+    return model.num_timesteps, time.process_time() - start
+
+
+def measure(number: int, part: float = 1.0) -> tuple[int, float, float]:
+    """Steps, milliseconds a step and MiB beyond the imports of case ``number``, warm, in a process of its own."""
+    code = (
+        "import torch; torch.set_num_threads(1)\n"
+        "from sb3_combrel.experiments import bench\n"
+        f"case = bench.CASES[{number}]\n"
+        "bench.learn(bench.CASES[0], 1, seed=1)\n"
+        "before = bench.resident_memory()\n"
+        f"steps, seconds = bench.learn(case, max(1, round({part} * case.n_episodes)))\n"
+        "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    steps, milliseconds, memory = done.stdout.split()[-3:]
+    return int(steps), float(milliseconds), float(memory)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--part", type=float, default=1.0, help="part of each case's episodes, for a quick look")
+    part = parser.parse_args().part
+    print(f"{'case':45} {'episodes':>8} {'steps':>7} {'ms/step':>8} {'MiB':>6}")
+    for number, case in enumerate(CASES):
+        steps, milliseconds, memory = measure(number, part)
+        n_episodes = max(1, round(part * case.n_episodes))
+        print(f"{case.name:45} {n_episodes:8} {steps:7} {milliseconds:8.2f} {memory:6.0f}", flush=True)
+    print(f"first use, nothing compiled: {first_use_seconds():.1f} s")
+
+
+if __name__ == "__main__":
+    main()

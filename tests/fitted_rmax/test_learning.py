@@ -1,0 +1,110 @@
+"""Fitted R-Max learns, fast: on the paper's Mountain Cars and on two of Gymnasium's classic tasks."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+import combrel_envs  # noqa: F401 - registers the Mountain Cars
+from sb3_combrel import FittedRMax
+
+SEEDS = range(5)
+CART_POLE_BOUNDS = ([-2.6, -3.0, -0.23, -3.2], [2.6, 3.0, 0.23, 3.2])
+
+
+class Episodes(BaseCallback):
+    """The lengths of episodes; ends the learning after ``n`` of them."""
+
+    def __init__(self, n):
+        super().__init__()
+        self.n = n
+        self.lengths = []
+
+    def _on_step(self):
+        self.lengths += [info["episode"]["l"] for info in self.locals["infos"] if "episode" in info]
+        return len(self.lengths) < self.n
+
+
+def lengths_of_episodes(env_id, n_episodes, seed, env_kwargs=None, **kwargs):
+    env = make_vec_env(env_id, seed=seed, env_kwargs=env_kwargs)
+    episodes = Episodes(n_episodes)
+    FittedRMax(env, seed=seed, **kwargs).learn(10**6, callback=episodes)
+    return np.array(episodes.lengths)
+
+
+def mountain_car_2d(seed, n_episodes):
+    return lengths_of_episodes(
+        "combrel/MountainCar2D-v0",
+        n_episodes,
+        seed,
+        dict(start="fixed"),
+        model_breadth=1 / 16,
+        resolution=4,
+        min_fraction=0.01,
+    )
+
+
+def mountain_car_4d(seed, n_episodes):
+    return lengths_of_episodes("combrel/MountainCar4D-v0", n_episodes, seed, model_breadth=0.4, resolution=3, min_fraction=0.1)
+
+
+def test_mountain_car_2d_is_learned_within_ten_episodes():
+    lengths = mountain_car_2d(0, 20)
+    assert lengths[:10].mean() <= 190
+    assert lengths[10:].mean() <= 135
+
+
+def test_mountain_car_4d_gets_shorter_within_a_few_episodes():
+    lengths = mountain_car_4d(0, 8)
+    assert lengths[0] < 1100
+    assert lengths[4:].mean() < 500
+
+
+@pytest.mark.slow
+def test_mountain_car_2d_as_fast_as_the_original():
+    """Its authors' program: 163 to 166 steps over the first ten episodes, 115 to 120 from then on."""
+    runs = np.array([mountain_car_2d(seed, 50) for seed in SEEDS])
+    assert runs[:, :10].mean() <= 170
+    assert runs[:, -10:].mean() <= 120
+
+
+@pytest.mark.slow
+def test_mountain_car_4d_as_fast_as_the_prototype():
+    runs = np.array([mountain_car_4d(seed, 60) for seed in SEEDS])
+    assert (runs[:, 0] < 1100).all()
+    assert runs[:, 40:60].mean() <= 230
+
+
+def returns_in_evaluation(env_id, steps, seed, n_episodes=100, **kwargs):
+    model = FittedRMax(make_vec_env(env_id, seed=seed), seed=seed, **kwargs).learn(steps)
+    returns, _ = evaluate_policy(
+        model, make_vec_env(env_id, seed=1000 + seed), n_episodes, deterministic=True, return_episode_rewards=True
+    )
+    return np.array(returns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_mountain_car_v0_with_default_parameters(seed):
+    """Solved is -110."""
+    assert returns_in_evaluation("MountainCar-v0", 3000, seed).mean() >= -110
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cart_pole(seed):
+    """Solved is 475."""
+    returns = returns_in_evaluation(
+        "CartPole-v1",
+        4000,
+        seed,
+        bounds=CART_POLE_BOUNDS,
+        gamma=0.99,
+        max_value=100,
+        model_breadth=0.2,
+        resolution=4,
+        min_fraction=0.1,
+        max_backups=1000,
+    )
+    assert returns.mean() >= 475
