@@ -34,6 +34,7 @@ test pytest: $(VENV)/.installed-all gl
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal
 
 bench: $(VENV)/.installed-all
+	$(BIN)/python -m sb3_combrel.experiments.bench
 	$(BIN)/python -m pytest tests/benchmarks -o addopts="--strict-markers" --benchmark-only
 
 lint: $(VENV)/.installed-all

@@ -53,7 +53,10 @@ def wheel(tmp_path_factory):
 
 def test_every_package_on_disk_is_listed():
     on_disk = {
-        ".".join(Path(name).parent.parts) for package in WHERE for name in files_on_disk(package) if name.endswith("__init__.py")
+        ".".join(Path(name).parent.parts)
+        for package in WHERE
+        for name in files_on_disk(package)
+        if name.endswith("__init__.py")
     }
     assert set(PROJECT["tool"]["setuptools"]["packages"]) == on_disk
 

@@ -67,9 +67,7 @@ def run_demo(
     prepare_folder(output, _settings(max_episode_steps), fresh)
     source = _source(output / SOURCE, console)
     runs = [
-        Run(
-            output, method, seed, mountain_car.TARGET_ID, n_episodes, max_episode_steps, transfer, mountain_car.LEARNER
-        )
+        Run(output, method, seed, mountain_car.TARGET_ID, n_episodes, max_episode_steps, transfer, mountain_car.LEARNER)
         for seed in range(n_seeds)
         for method, transfer in mountain_car.methods(source).items()
     ]
@@ -214,6 +212,6 @@ def _epilogue(output: Path, n_seeds: int, console: Console) -> None:
     for command in (
         f"tensorboard --logdir {output / TENSORBOARD}",
         f"sb3-combrel demo --output {output} --seeds {2 * n_seeds}   # more runs; these are kept",
-        "sb3-combrel record combrel/MountainCar2D-v0 --n-instances 300   # a smaller source for COMBREL(\"source.npz\")",
+        'sb3-combrel record combrel/MountainCar2D-v0 --n-instances 300   # a smaller source for COMBREL("source.npz")',
     ):
         console.print(f"  {command}", highlight=False, soft_wrap=True, markup=False)

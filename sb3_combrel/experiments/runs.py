@@ -116,10 +116,13 @@ class EpisodeLog(BaseCallback):
         csv.writer(self._file).writerow(COLUMNS)
 
     def _on_step(self) -> bool:
+        # One step late: the algorithm plans and logs at the end of an episode only after it has asked the callbacks.
+        if self._n_done >= self.n_episodes:
+            return False
         for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
             if done:
                 self._end_episode(info)
-        return self._n_done < self.n_episodes
+        return True
 
     def _end_episode(self, info: dict[str, Any]) -> None:
         assert self._file is not None
@@ -156,9 +159,6 @@ def carry_out(run: Run) -> Run:
             )
         most_steps = run.n_episodes * run.max_episode_steps
         model.learn(most_steps, EpisodeLog(run.episodes_file, run.n_episodes), log_interval=1, tb_log_name=run.name)
-        # The callback stops the learning before the last episode's planning and its log.
-        model.policy.end_episode()
-        model.dump_logs()
     finally:
         env.close()
     if model.policy.transfer is not None:

@@ -29,7 +29,9 @@ def greedy_episode(model: BaseAlgorithm, env: Any, seed: int | None = None) -> I
         yield step, over
 
 
-def film(model: BaseAlgorithm, env: Any, path: Path, seed: int | None = None, *, every: int = 4, most_steps: int = 400) -> None:
+def film(
+    model: BaseAlgorithm, env: Any, path: Path, seed: int | None = None, *, every: int = 4, most_steps: int = 400
+) -> None:
     """
     Film one episode, driven without exploring.
 

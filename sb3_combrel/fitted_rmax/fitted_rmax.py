@@ -106,7 +106,7 @@ class FittedRMax(BaseAlgorithm):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 200,
+        max_backups: int = 100,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,
@@ -237,6 +237,7 @@ class FittedRMax(BaseAlgorithm):
         callback.on_training_start(locals(), globals())
         self._episode_rewards = [[] for _ in range(self.n_envs)]
         self._episode_tags = np.arange(self.n_envs)
+        self._last_states = self.policy.to_unit(self._last_obs)
         self._backups += self.policy.prepare()
         try:
             while self.num_timesteps < total_timesteps:
@@ -250,7 +251,7 @@ class FittedRMax(BaseAlgorithm):
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """One step of every environment; False if a callback wants to stop."""
         assert self.env is not None and isinstance(self._last_obs, np.ndarray)
-        states = self.policy.to_unit(self._last_obs)
+        states = self._last_states
         choices = [self.policy.explore(state, tag) for state, tag in zip(states, self._episode_tags, strict=True)]
         actions = np.array(choices) + self.policy._first_action
         new_obs, rewards, dones, infos = self.env.step(actions)
@@ -265,6 +266,7 @@ class FittedRMax(BaseAlgorithm):
             )
             self._episode_rewards[e].append(float(raw_rewards[e]))
         self._last_obs = new_obs  # type: ignore[assignment]
+        self._last_states = self.policy.to_unit(new_obs) if dones.any() else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         if not callback.on_step():
@@ -332,7 +334,7 @@ class FittedRMax(BaseAlgorithm):
         self._vec_normalize_env = unwrap_vec_normalize(self.env)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_tags"]
+        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_tags", "_last_states"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

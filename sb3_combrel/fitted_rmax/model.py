@@ -11,6 +11,7 @@ from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
     enter_lists,
+    extend_reach,
     leave_lists,
     points_in_reach,
     settle,
@@ -135,10 +136,7 @@ class KernelModel:
         return self._scratch.point[:changed] + action * self.grid.n_points
 
     def _extend_reach(self, effect: np.ndarray) -> None:
-        """How far one effect can lead, in cells: what the planner must look back over."""
-        cells = np.floor(effect * self.grid.arrays.cells).astype(np.int64)
-        np.minimum(self.reach_low, cells, out=self.reach_low)
-        np.maximum(self.reach_high, cells + 1, out=self.reach_high)
+        extend_reach(effect, self.grid.arrays.cells, self.reach_low, self.reach_high)
 
     def settle(self, pairs: np.ndarray) -> None:
         """Bring the rows of ``pairs`` up to date: with their lists, and with what transfer has for them."""
@@ -148,7 +146,16 @@ class KernelModel:
             done = 0
             while done < len(some):
                 done = settle(
-                    self.arrays, self.instances, self.grid.arrays, self.gamma, some, done, supply, self._scratch
+                    self.arrays,
+                    self.instances,
+                    self.grid.arrays,
+                    self.gamma,
+                    some,
+                    done,
+                    supply,
+                    self.reach_low,
+                    self.reach_high,
+                    self._scratch,
                 )
                 if done < len(some):
                     self.arrays = self.arrays._replace(rows=self.arrays.rows.grown())

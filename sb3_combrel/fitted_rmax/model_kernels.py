@@ -126,6 +126,15 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
 
 
 @compiled
+def extend_reach(effect, cells, reach_low, reach_high):
+    """How far one effect can lead along each variable, in cells: what the planner must look back over."""
+    for k in range(len(effect)):
+        moved = int(np.floor(effect[k] * cells[k]))
+        reach_low[k] = min(reach_low[k], moved)
+        reach_high[k] = max(reach_high[k], moved + 1)
+
+
+@compiled
 def enter_lists(arrays, action, slot, n_found, done, min_fraction, threshold, scratch):
     """Put an instance into the lists of the pairs found by :func:`points_in_reach`.
 
@@ -250,13 +259,14 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
         return False
     leave = 1.0 - gamma * scratch.dense[point]
     stays_for_ever = leave < 1e-9
+    discount = 0.0 if stays_for_ever else gamma / leave
     slot = arrays.rows.start[pair]
     length = 0
     for t in range(n_touched):
         to = scratch.touched[t]
         if to != point and not stays_for_ever:
             arrays.rows.index[slot + length] = to
-            arrays.rows.weight[slot + length] = gamma * scratch.dense[to] / leave
+            arrays.rows.weight[slot + length] = scratch.dense[to] * discount
             length += 1
         scratch.dense[to] = 0.0
     arrays.rows.length[pair] = length
@@ -268,8 +278,10 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
 
 
 @compiled
-def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
+def settle(arrays, instances, grid, gamma, pairs, done, supply, reach_low, reach_high, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
+
+    :param reach_low: extended by the effects supplied (see ``extend_reach``); ``reach_high``: the same
 
     :return: how many of them are done; fewer than all if the rows' pool must grow first
     """
@@ -279,6 +291,8 @@ def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
         has_row = arrays.known[pair] or supply.count[done] > 0
         if has_row and not build_row(arrays, instances, grid, gamma, pair, supply, done, scratch):
             return done
+        for j in range(supply.count[done]):
+            extend_reach(supply.effect[done, j], grid.cells, reach_low, reach_high)
         if has_row != arrays.settled[pair]:
             arrays.settled[pair] = has_row
             arrays.n_optimistic[pair % n_points] += -1 if has_row else 1

@@ -26,8 +26,10 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
 LONGEST_PLAN = 10_000
 
-AT_EPISODE_END = 50
-BACKUPS_PER_RENEWED_PAIR = 10
+# Backups, in multiples of max_backups or of the grid's points, and for each pair that transfer has changed.
+AT_EPISODE_END = 100
+BEFORE_THE_FIRST_STEP = 300
+BACKUPS_PER_RENEWED_PAIR = 3
 NO_PAIRS = np.empty(0, dtype=np.int64)
 
 
@@ -59,7 +61,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 200,
+        max_backups: int = 100,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | None = None,
@@ -108,6 +110,8 @@ class FittedRMaxPolicy(BasePolicy):
         self.planner = Planner(
             self.model, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=planning_tolerance
         )
+        if transfer is not None:
+            self._widen(transfer.lowest_reward())
         self.corrections = CorrectionArrays.empty(grid.n_variables)
         self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
         self._no_supply = Supply.none(self.n_actions, grid.n_variables)
@@ -142,18 +146,23 @@ class FittedRMaxPolicy(BasePolicy):
         :param observations: raw units, shape (..., n_variables)
         :raises ValueError: if an observation is not finite
         """
-        if not np.isfinite(observations).all():
-            raise ValueError(f"the environment returned an observation that is not finite: {observations}")
         unit = self.scaling.to_unit(observations)
-        inside = np.clip(unit, 0.0, 1.0)
-        if not self._warned_outside and np.abs(unit - inside).max(initial=0.0) > 1e-6:
+        inside = np.minimum(np.maximum(unit, 0.0), 1.0)
+        if not (inside == unit).all():
+            self._check_outside(observations, unit - inside)
+        return inside
+
+    def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:
+        """Refuse what is not finite, warn once of what is outside the bounds by more than rounding."""
+        if not np.isfinite(excess).all():
+            raise ValueError(f"the environment returned an observation that is not finite: {observations}")
+        if not self._warned_outside and np.abs(excess).max() > 1e-6:
             self._warned_outside = True
             warnings.warn(
                 f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
                 "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)",
-                stacklevel=2,
+                stacklevel=3,
             )
-        return inside
 
     def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
         """
@@ -191,7 +200,8 @@ class FittedRMaxPolicy(BasePolicy):
         """
         q = self.q_values(state)
         best = q.max()
-        self.corrections = self.corrections.with_room()
+        if self.corrections.count[0] == len(self.corrections.key):
+            self.corrections = self.corrections.with_room()
         visit(
             self.planner.values,
             self.corrections,
@@ -252,8 +262,8 @@ class FittedRMaxPolicy(BasePolicy):
         return self._plan(AT_EPISODE_END * self.max_backups)
 
     def prepare(self) -> int:
-        """Take up what transfer has to say before the first step; backups done."""
-        return self._plan(AT_EPISODE_END * self.max_backups)
+        """Take up what transfer has to say before the first step, and plan until that is thought through."""
+        return self._plan(BEFORE_THE_FIRST_STEP * self.model.grid.n_points)
 
     def _plan(self, max_backups: int) -> int:
         """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
@@ -268,7 +278,7 @@ class FittedRMaxPolicy(BasePolicy):
         # Left on the list until all is done: an interrupt in between loses no change.
         pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
         backups = self.planner.update(pairs, max_backups)
-        self._unsettled = []
+        self._unsettled.clear()
         return backups
 
     def _widen(self, reward: float) -> None:

@@ -63,6 +63,10 @@ class Transfer(ABC):
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         """Take notice of a transition of the target task (unit coordinates)."""
 
+    @abstractmethod
+    def lowest_reward(self) -> float:
+        """The lowest reward among all that can be supplied; known once bound."""
+
     def end_episode(self, truncated: bool) -> None:
         """Take notice that an episode has ended, by its time limit or (not ``truncated``) in a terminal state."""
 

@@ -180,6 +180,9 @@ class VirtualSourceTransfer(Transfer):
         self._renewed = []
         return renewed
 
+    def lowest_reward(self) -> float:
+        return min(float(source.rewards.min()) for source in self._sources)
+
     def _renew_all(self) -> None:
         assert self.target is not None
         self._renewed = [np.arange(self.target.n_actions * len(self.target.sample_states))]

@@ -67,8 +67,8 @@ def test_observations_must_be_a_vector(space, says):
 def test_infinite_bounds_need_the_bounds_argument():
     with pytest.raises(ValueError, match=r"bounds=\(low, high\)"):
         FittedRMax("CartPole-v1")
-    model = FittedRMax("CartPole-v1", bounds=([-2.6, -3.0, -0.23, -3.2], [2.6, 3.0, 0.23, 3.2]), resolution=2, seed=0)
-    assert model.policy.model.grid.n_points == 5**4
+    model = FittedRMax("CartPole-v1", bounds=([-2.6, -3.0, -0.23, -3.2], [2.6, 3.0, 0.23, 3.2]), resolution=3, seed=0)
+    assert model.policy.model.grid.n_points == 9**4
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_returns_above_max_value_give_one_warning(reward, max_value, warns):
 @pytest.fixture
 def saved(tmp_path):
     path = tmp_path / "model.zip"
-    FittedRMax(Scripted(), resolution=2, seed=0).learn(20).save(path)
+    FittedRMax(Scripted(), resolution=3, seed=0).learn(20).save(path)
     return path
 
 

@@ -55,10 +55,8 @@ def test_mountain_car_2d_is_learned_within_ten_episodes():
     assert lengths[10:].mean() <= 135
 
 
-def test_mountain_car_4d_gets_shorter_within_a_few_episodes():
-    lengths = mountain_car_4d(0, 8)
-    assert lengths[0] < 1100
-    assert lengths[4:].mean() < 500
+def test_mountain_car_4d_finds_the_goal_in_its_first_episode():
+    assert mountain_car_4d(0, 1)[0] < 1100
 
 
 @pytest.mark.slow

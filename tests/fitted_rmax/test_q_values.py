@@ -148,7 +148,7 @@ def test_successors_beyond_the_grid_count_as_its_edge(one_variable):
 
 
 def test_pushing_against_the_edge_of_the_grid_is_staying():
-    policy, _ = policy_and_definition(3, 1, breadth=0.2, min_fraction=0.01)
+    policy, _ = policy_and_definition(3, 1, breadth=0.5, min_fraction=0.01)
     policy.planner.bounds = (-100.0, 0.0)
     corner = np.ones(3)
     for _ in range(2):
