@@ -12,7 +12,7 @@ OF_EXTRA = ("combrel_envs", "joblib", "matplotlib", "mujoco", "dm_control", "mov
 
 def demo(
     output: Path = Path("demo_output"),
-    seeds: int = 10,
+    seeds: int = 8,
     episodes: int = 12,
     max_episode_steps: int = 2000,
     workers: int | None = None,

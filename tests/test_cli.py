@@ -12,6 +12,7 @@ import time
 
 import gymnasium
 import pytest
+from imageio.v3 import imread
 
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import FittedRMax, SourceInstances, cli
@@ -99,8 +100,7 @@ class TestDemo:
         assert env.action_space.contains(int(action))
 
     def test_the_video_shows_the_episode(self, first_call):
-        imageio = pytest.importorskip("imageio.v3")
-        frames = imageio.imread(first_call[0] / "car.mp4")
+        frames = imread(first_call[0] / "car.mp4")
         assert frames.shape[1:] == (360, 480, 3)
         # 60 steps: each fourth from the first on, and the last.
         assert len(frames) == 16

@@ -1,5 +1,6 @@
 """Checks of arguments: every message names the argument, its value and what would be right."""
 
+import math
 from collections.abc import Sequence
 from numbers import Integral, Real
 
@@ -10,7 +11,7 @@ def check_positive(name: str, value: object, *, largest: float = float("inf")) -
     """
     :raises ValueError: unless ``value`` is a number above 0 and not above ``largest``
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < value <= largest or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= largest or not math.isfinite(value):
         limit = "" if largest == float("inf") else f" and at most {largest:g}"
         raise ValueError(f"{name} must be a number above 0{limit}, got {value!r}")
 
@@ -19,7 +20,7 @@ def check_finite(name: str, value: object) -> None:
     """
     :raises ValueError: unless ``value`` is a finite number
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
 
 
@@ -44,5 +45,5 @@ def check_resolution(value: int | Sequence[int] | None, n_variables: int) -> Non
     if isinstance(each, str) or not isinstance(each, Sequence | np.ndarray) or len(each) not in (1, n_variables):
         raise ValueError(f"resolution must be one whole number or {n_variables}, one a state variable, got {value!r}")
     for r in each:
-        if isinstance(r, bool) or not isinstance(r, Integral) or not 1 <= r <= 20:
+        if isinstance(r, bool) or not isinstance(r, Integral) or not 1 <= int(r) <= 20:
             raise ValueError(f"resolution must be whole numbers from 1 to 20 (2**resolution cells), got {value!r}")

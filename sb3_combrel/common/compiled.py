@@ -8,7 +8,7 @@ from numba.core import event
 
 # The loops allocate nothing, so they run without numba's reference counting: its atomic increments at every call with
 # an array cost more than the loops themselves, and so does wrapping every array that comes in from Python.
-compiled = njit(cache=True, _nrt=False, error_model="numpy")
+compiled = njit(cache=True, _nrt=False, error_model="numpy")  # type: ignore[call-overload]
 
 
 class _Announcer(event.Listener):

@@ -27,7 +27,7 @@ class InstanceArrays(NamedTuple):
     effect: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]
     block_low: np.ndarray
     block_high: np.ndarray
 

@@ -26,7 +26,7 @@ class Pool(NamedTuple):
     :param used: int64, shape (1,): entries of the slab handed out so far
     """
 
-    index: np.ndarray
+    index: np.ndarray  # type: ignore[assignment]
     weight: np.ndarray
     start: np.ndarray
     length: np.ndarray

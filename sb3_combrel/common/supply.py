@@ -15,7 +15,7 @@ class Supply(NamedTuple):
     :param terminated: bool, shape (n, most)
     """
 
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]
     weight: np.ndarray
     effect: np.ndarray
     reward: np.ndarray

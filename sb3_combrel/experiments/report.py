@@ -22,7 +22,7 @@ class Table(NamedTuple):
 
     title: str
     header: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
 
     def for_terminal(self) -> RichTable:
         """The table as Rich shows it."""

@@ -41,7 +41,7 @@ class CorrectionArrays(NamedTuple):
     key: np.ndarray
     state: np.ndarray
     value: np.ndarray
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]
     visit_key: np.ndarray
     visits: np.ndarray
 
@@ -141,9 +141,7 @@ def visit(values, corrections, state, best_q, episode, grid, tolerance, scratch)
     if m < 0:
         if visits <= PATIENCE:
             return
-        value = interpolate(
-            values, scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight
-        )
+        value = interpolate(values, scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
         if value - best_q <= tolerance:
             return
         m = corrections.count[0]

@@ -91,7 +91,7 @@ class FittedRMax(BaseAlgorithm):
         "FittedRMaxPolicy": FittedRMaxPolicy,
         "MlpPolicy": FittedRMaxPolicy,
     }
-    policy: FittedRMaxPolicy
+    policy: FittedRMaxPolicy  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -117,10 +117,10 @@ class FittedRMax(BaseAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        policy, env = _policy_first(policy, env)
+        policy_class, environment = _policy_first(policy, env)
         super().__init__(
-            policy,
-            env,
+            policy_class,
+            environment,
             learning_rate=0.0,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
@@ -237,7 +237,7 @@ class FittedRMax(BaseAlgorithm):
         callback.on_training_start(locals(), globals())
         self._episode_rewards = [[] for _ in range(self.n_envs)]
         self._episode_tags = np.arange(self.n_envs)
-        self._last_states = self.policy.to_unit(self._last_obs)
+        self._last_states = self.policy.to_unit(np.asarray(self._last_obs))
         self._backups += self.policy.prepare()
         try:
             while self.num_timesteps < total_timesteps:
@@ -252,7 +252,7 @@ class FittedRMax(BaseAlgorithm):
         """One step of every environment; False if a callback wants to stop."""
         assert self.env is not None and isinstance(self._last_obs, np.ndarray)
         states = self._last_states
-        choices = [self.policy.explore(state, tag) for state, tag in zip(states, self._episode_tags, strict=True)]
+        choices = [self.policy.explore(state, int(tag)) for state, tag in zip(states, self._episode_tags, strict=True)]
         actions = np.array(choices) + self.policy._first_action
         new_obs, rewards, dones, infos = self.env.step(actions)
         self.num_timesteps += self.env.num_envs
@@ -266,7 +266,7 @@ class FittedRMax(BaseAlgorithm):
             )
             self._episode_rewards[e].append(float(raw_rewards[e]))
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._last_states = self.policy.to_unit(new_obs) if dones.any() else next_states
+        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if dones.any() else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         if not callback.on_step():
@@ -377,9 +377,7 @@ def _refuse_normalized_observations(env: VecEnv) -> None:
         )
 
 
-def _true_outcomes(
-    new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]
-) -> tuple[np.ndarray, np.ndarray]:
+def _true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """Where each step led, before an environment reset itself, and whether that was a terminal state."""
     next_obs = np.array(new_obs)
     terminated = np.array(dones, dtype=bool)

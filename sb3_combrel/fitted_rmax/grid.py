@@ -54,9 +54,7 @@ class StateGrid:
 
     def points(self) -> np.ndarray:
         """All grid points, unit coordinates, shape (n_points, n_variables)."""
-        axes = [
-            (np.arange(n) - self.margin) / cells for n, cells in zip(self.arrays.shape, self.arrays.cells, strict=True)
-        ]
+        axes = [(np.arange(n) - self.margin) / cells for n, cells in zip(self.arrays.shape, self.arrays.cells, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.n_variables)
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
@@ -66,9 +64,7 @@ class StateGrid:
         :param state: unit coordinates, shape (n_variables,); outside the grid the nearest point of it counts
         """
         position = state * self.arrays.cells + self.margin
-        return interpolate(
-            values, position, self.arrays.shape, self.arrays.strides, self._corner_index, self._corner_weight
-        )
+        return interpolate(values, position, self.arrays.shape, self.arrays.strides, self._corner_index, self._corner_weight)
 
 
 def default_resolution(n_variables: int, reach: float) -> int:

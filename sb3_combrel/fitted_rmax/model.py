@@ -18,7 +18,6 @@ from sb3_combrel.fitted_rmax.model_kernels import (
 )
 from sb3_combrel.transfer.base import Transfer
 
-
 MOST_PAIRS_AT_ONCE = 4096
 
 

@@ -149,9 +149,7 @@ def enter_lists(arrays, action, slot, n_found, done, min_fraction, threshold, sc
         if not reserve(lists, pair, length + 1):
             return done
         start = lists.start[pair]
-        kept, total = insert_by_weight(
-            lists.index, lists.weight, start, length, slot, scratch.weight[done], min_fraction
-        )
+        kept, total = insert_by_weight(lists.index, lists.weight, start, length, slot, scratch.weight[done], min_fraction)
         arrays.members[action, slot] += 1
         for k in range(start + kept, start + length + 1):
             arrays.members[action, lists.index[k]] -= 1

@@ -211,9 +211,7 @@ class Planner:
             model = self.model
             values = self.values.copy()
             for n in range(EXPLOITATION_SWEEPS):
-                change = exploitation_sweep(
-                    values, model.arrays, model.n_actions, model.grid.arrays, self.bounds, n % 2 == 1
-                )
+                change = exploitation_sweep(values, model.arrays, model.n_actions, model.grid.arrays, self.bounds, n % 2 == 1)
                 if change <= self.tolerance:
                     break
             self._exploitation = values

@@ -330,9 +330,7 @@ class FittedRMaxPolicy(BasePolicy):
             "values": self.planner.values,
             "known": self.model.arrays.known,
             "lowest_value": np.array([self.planner.bounds[0]]),
-            "corrections": np.column_stack(
-                [self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]
-            ),
+            "corrections": np.column_stack([self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]),
         }
 
     def _load_from_state_dict(

@@ -19,7 +19,7 @@ class QueryScratch(NamedTuple):
     :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
     """
 
-    index: np.ndarray
+    index: np.ndarray  # type: ignore[assignment]
     weight: np.ndarray
     length: np.ndarray
     total: np.ndarray

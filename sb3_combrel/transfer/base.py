@@ -67,7 +67,7 @@ class Transfer(ABC):
     def lowest_reward(self) -> float:
         """The lowest reward among all that can be supplied; known once bound."""
 
-    def end_episode(self, truncated: bool) -> None:
+    def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it
         """Take notice that an episode has ended, by its time limit or (not ``truncated``) in a terminal state."""
 
     @abstractmethod
@@ -96,7 +96,7 @@ class Transfer(ABC):
         """What was learned since it was bound, float64, to be saved with a model."""
         return {}
 
-    def restore(self, saved: dict[str, np.ndarray]) -> None:
+    def restore(self, saved: dict[str, np.ndarray]) -> None:  # noqa: B027 - nothing saved, nothing to restore
         """Take up what :meth:`saved_arrays` gave; called on a freshly bound object."""
 
     def statistics(self) -> dict[str, float]:

@@ -9,7 +9,13 @@ from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.compliance import ComplianceScratch, transition_compliance
-from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, DEFAULT_FADING, MappingsLike, SourceLike, VirtualSourceTransfer
+from sb3_combrel.transfer.virtual_source import (
+    DEFAULT_BREADTH,
+    DEFAULT_FADING,
+    MappingsLike,
+    SourceLike,
+    VirtualSourceTransfer,
+)
 
 RELEVANCE_RENEWAL = 1.2
 

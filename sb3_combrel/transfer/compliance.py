@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.instances import InstanceArrays
 
 
 class Bandwidths(NamedTuple):
@@ -34,7 +35,7 @@ class MappingTable(NamedTuple):
     :param sign: float64, same shape: -1 where the variable is mirrored
     """
 
-    index: np.ndarray
+    index: np.ndarray  # type: ignore[assignment]
     sign: np.ndarray
 
 
@@ -181,7 +182,7 @@ def task_compliance(tables: np.ndarray, actions: np.ndarray, state_index: int, a
     return float(tables[np.arange(len(actions)), state_index, np.asarray(action_mapping)[actions]].mean())
 
 
-def default_bandwidths(source: "InstanceArrays") -> Bandwidths:  # type: ignore[name-defined]  # noqa: F821
+def default_bandwidths(source: InstanceArrays) -> Bandwidths:
     """Bandwidths that suit a source, whatever the task.
 
     The start bandwidth is the squared distance to about the 20th instance of the same action (their median): that many

@@ -10,7 +10,13 @@ import numpy as np
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.virtual_source import DEFAULT_BREADTH, DEFAULT_FADING, MappingsLike, SourceLike, VirtualSourceTransfer
+from sb3_combrel.transfer.virtual_source import (
+    DEFAULT_BREADTH,
+    DEFAULT_FADING,
+    MappingsLike,
+    SourceLike,
+    VirtualSourceTransfer,
+)
 
 RELEVANCE_RENEWAL = 1.2
 

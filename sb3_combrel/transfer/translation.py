@@ -152,7 +152,7 @@ class GatherScratch(NamedTuple):
     :param index: int64, shape (room,); ``weight``, ``merit``: float64; ``candidate``: int64
     """
 
-    index: np.ndarray
+    index: np.ndarray  # type: ignore[assignment]
     weight: np.ndarray
     merit: np.ndarray
     candidate: np.ndarray

@@ -110,9 +110,7 @@ class VirtualSourceTransfer(Transfer):
 
     def _named(self, mappings: MappingSet, source: SourceInstances) -> MappingSet:
         assert self.target is not None
-        return mappings.with_names(
-            source.state_names, self.target.state_names, source.action_names, self.target.action_names
-        )
+        return mappings.with_names(source.state_names, self.target.state_names, source.action_names, self.target.action_names)
 
     def _candidates(self) -> CandidateArrays:
         """The candidates of every target action, over all sources."""

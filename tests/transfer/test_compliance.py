@@ -21,9 +21,7 @@ from sb3_combrel.transfer.virtual_source import stacked_instances, stacked_table
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))
-some_bandwidths = st.builds(
-    Bandwidths, start=st.floats(0.003, 0.5), outcome=st.floats(0.002, 0.5), reward=st.floats(0.1, 5.0)
-)
+some_bandwidths = st.builds(Bandwidths, start=st.floats(0.003, 0.5), outcome=st.floats(0.002, 0.5), reward=st.floats(0.1, 5.0))
 
 
 def tables_of(transitions, sources, sets, bandwidths):
@@ -173,9 +171,7 @@ def test_one_transition_and_many_go_through_the_same_equations():
     for i in reversed(range(5)):
         t, one = transitions[i], np.full(tables[0].shape, np.nan)
         effect = t.next_state - t.state
-        transition_compliance(
-            t.state, effect, t.reward, stacked_instances([source]), table, bandwidths, scratch, one
-        )
+        transition_compliance(t.state, effect, t.reward, stacked_instances([source]), table, bandwidths, scratch, one)
         np.testing.assert_array_equal(one, tables[i])
 
 

@@ -16,9 +16,7 @@ SEEDS = range(4)
 N_EPISODES = 12
 EASTWARDS, NORTHWARDS = (0, None, 1, None), (None, 0, None, 1)
 ACTIONS = (0, 1, 2, 1, 2)
-INTUITIVE = [
-    InterTaskMapping(state, ACTIONS) for state in (EASTWARDS, EASTWARDS, EASTWARDS, NORTHWARDS, NORTHWARDS)
-]
+INTUITIVE = [InterTaskMapping(state, ACTIONS) for state in (EASTWARDS, EASTWARDS, EASTWARDS, NORTHWARDS, NORTHWARDS)]
 
 
 @cache

@@ -1,0 +1,294 @@
+"""COMBREL's choice of mappings: the vote of Algorithm 1 against a naive one, and that it finds what corresponds to what."""
+
+from functools import cache
+
+import naive_transfer as naive
+import numpy as np
+import pytest
+from combrel_envs.mountain_car_dynamics import PUSHES, step_axis
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+import combrel_envs  # noqa: F401 - registers the Mountain Cars
+from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.transfer.source import SourceInstances
+
+BANDWIDTHS = (0.05, 0.05, 1.0)
+POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def bound(method, task, seed=0):
+    method.bind(task, np.random.default_rng(seed))
+    return method
+
+
+def show(method, transition):
+    method.observe(transition.state, transition.action, transition.reward, transition.next_state, False)
+
+
+def pairs_of(task):
+    return np.arange(task.n_actions * len(task.sample_states))
+
+
+def supply_of(method, task):
+    """What the method has for every pair, as if none had instances of its own."""
+    pairs = pairs_of(task)
+    supply = method.supply(pairs, np.zeros(len(pairs)), np.zeros(len(pairs), dtype=bool))
+    return [
+        (supply.weight[p, :n].tolist(), supply.effect[p, :n].tolist(), supply.reward[p, :n].tolist())
+        for p, n in enumerate(supply.count)
+    ]
+
+
+# ------------------------------------------------------------------- the vote
+
+
+class NaiveVote:
+    """Lines 17 to 20 of Algorithm 1, mapping by mapping."""
+
+    def __init__(self, sources, mappings, n_neighbors):
+        self.sources, self.mappings, self.k = sources, mappings, n_neighbors
+        self.seen = []
+
+    def means(self, state, action):
+        """Mean compliance of each (source, mapping) with the nearest transitions of ``action``."""
+        near = sorted((t for t in self.seen if t.action == action), key=lambda t: naive.distance(t.state, state))[: self.k]
+        if not near:
+            return {}
+        bandwidths = naive_bandwidths()
+        return {
+            (number, tuple(mapping.state), tuple(mapping.sign), mapping.action[action]): np.mean(
+                [naive.compliance(t, source, mapping, bandwidths) for t in near]
+            )
+            for number, (source, of_source) in enumerate(zip(self.sources, self.mappings, strict=True))
+            for mapping in of_source
+        }
+
+
+def naive_bandwidths():
+    from sb3_combrel.transfer.compliance import Bandwidths
+
+    return Bandwidths(*BANDWIDTHS)
+
+
+def ways_of(method):
+    """Each candidate of a bound method as the naive vote names it."""
+    named = []
+    for number, _, state_index, source_action in method._origin:
+        of_source = method._sets[number]
+        index = tuple(None if k < 0 else int(k) for k in of_source.state_mappings[state_index])
+        named.append((number, index, tuple(int(s) for s in of_source.state_signs[state_index]), source_action))
+    return named
+
+
+@pytest.mark.parametrize("n_neighbors", [1, 3, 5])
+def test_every_pair_gets_the_mapping_that_its_nearest_transitions_vote_for(n_neighbors):
+    rng = np.random.default_rng(n_neighbors)
+    sources = [naive.random_source(rng, 40, 2, 2), naive.random_source(rng, 40, 1, 3)]
+    task = naive.target_task(POINTS[::5], 2)
+    method = bound(COMBREL(sources, n_neighbors=n_neighbors, bandwidths=BANDWIDTHS), task)
+    vote = NaiveVote(sources, [MappingSet.injective(s.n_variables, 3, s.n_actions, 2) for s in sources], n_neighbors)
+    named, n_points = ways_of(method), len(task.sample_states)
+    for _ in range(12):
+        transition = naive.random_transition(rng, 3, 2)
+        show(method, transition)
+        vote.seen.append(transition)
+    n_chosen = 0
+    for pair in pairs_of(task):
+        means = vote.means(task.sample_states[pair % n_points], pair // n_points)
+        chosen = method._choice[pair]
+        if chosen < 0:
+            assert max(means.values(), default=0.0) == 0.0
+        else:
+            n_chosen += 1
+            assert means[named[chosen]] == pytest.approx(max(means.values()), rel=1e-9)
+    assert n_chosen > 0
+    for state in rng.random((20, 3)):
+        method.supply_at(state, np.zeros(2))
+        for action, chosen in enumerate(method._choice_at):
+            means = vote.means(state, action)
+            assert (chosen < 0) == (max(means.values()) == 0.0)
+            assert chosen < 0 or means[named[chosen]] == pytest.approx(max(means.values()), rel=1e-9)
+
+
+def test_the_chosen_mapping_translates_at_grid_points_and_at_exact_states():
+    rng = np.random.default_rng(5)
+    source = naive.random_source(rng, 200, 2, 2)
+    task = naive.target_task(POINTS, 2)
+    method = bound(COMBREL(source, breadth=0.2, bandwidths=BANDWIDTHS), task)
+    for _ in range(30):
+        show(method, naive.random_transition(rng, 3, 2))
+    named, pairs, n_transferred = ways_of(method), pairs_of(task), 0
+    own = rng.uniform(0.0, 1.2, len(pairs))
+    supply = method.supply(pairs, own, own >= 1.0)
+    for pair in pairs:
+        chosen, expected = method._choice[pair], []
+        if chosen >= 0 and own[pair] < 1.0:
+            _, index, sign, source_action = named[chosen]
+            state = task.sample_states[pair % len(POINTS)]
+            drawn_from = [(source, InterTaskMapping(index, [source_action], sign), 0)]
+            expected = naive.transferred(state, own[pair], drawn_from, task, 0.2)
+        n = supply.count[pair]
+        assert n == len(expected)
+        np.testing.assert_allclose(supply.weight[pair, :n], [e[0] for e in expected], rtol=1e-9)
+        np.testing.assert_allclose(supply.effect[pair, :n], np.array([e[1] for e in expected]).reshape(n, 3), atol=1e-12)
+        n_transferred += n > 0
+    assert n_transferred > 20
+    # At a sample state itself, the vote and the supply are those of the grid point.
+    for point in range(len(POINTS)):
+        at = method.supply_at(POINTS[point], np.zeros(2))
+        on_grid = method.supply(point + len(POINTS) * np.arange(2), np.zeros(2), np.zeros(2, dtype=bool))
+        for action in range(2):
+            n = at.count[action]
+            assert n == on_grid.count[action]
+            np.testing.assert_array_equal(at.effect[action, :n], on_grid.effect[action, :n])
+
+
+def test_renewed_names_exactly_the_pairs_whose_choice_changed():
+    rng = np.random.default_rng(1)
+    source, task = naive.random_source(rng, 100, 2, 2), naive.target_task(POINTS, 2)
+    method = bound(COMBREL(source, bandwidths=BANDWIDTHS), task)
+    assert len(method.renewed()) == 0
+    choice, supply, n_renewed = method._choice.copy(), supply_of(method, task), 0
+    for _ in range(40):
+        show(method, naive.random_transition(rng, 3, 2))
+        renewed = method.renewed()
+        assert renewed.tolist() == np.flatnonzero(method._choice != choice).tolist()
+        now = supply_of(method, task)
+        assert all(now[pair] == supply[pair] for pair in np.setdiff1d(pairs_of(task), renewed))
+        choice, supply, n_renewed = method._choice.copy(), now, n_renewed + len(renewed)
+    assert n_renewed > 40
+    assert len(method.renewed()) == 0
+
+
+def test_renewed_adds_up_what_was_not_asked_for():
+    rng = np.random.default_rng(1)
+    task = naive.target_task(POINTS, 2)
+    one, other = (bound(COMBREL(naive.random_source(np.random.default_rng(9), 60, 2, 2)), task) for _ in range(2))
+    each = []
+    for _ in range(20):
+        transition = naive.random_transition(rng, 3, 2)
+        show(one, transition)
+        show(other, transition)
+        each.append(one.renewed())
+    assert other.renewed().tolist() == np.unique(np.concatenate(each)).tolist()
+
+
+def test_without_transitions_nothing_is_transferred():
+    task = naive.target_task(POINTS, 2)
+    method = bound(COMBREL(naive.random_source(np.random.default_rng(0), 100, 2, 2), breadth=1.0), task)
+    assert not any(weights for weights, _, _ in supply_of(method, task))
+    assert not method.supply_at(POINTS[0], np.zeros(2)).count.any()
+
+
+def test_measured_in_the_first_episode_nothing_is_transferred_before_it_ends_and_nothing_changes_after():
+    rng = np.random.default_rng(2)
+    source, task = naive.random_source(rng, 200, 2, 2), naive.target_task(POINTS, 2)
+    paper = bound(COMBREL(source, measured="first_episode", bandwidths=BANDWIDTHS), task)
+    online = bound(COMBREL(source, measured="online", bandwidths=BANDWIDTHS), task)
+    for _ in range(20):
+        transition = naive.random_transition(rng, 3, 2)
+        show(paper, transition)
+        show(online, transition)
+        assert len(paper.renewed()) == 0
+        assert not paper.supply_at(transition.state, np.zeros(2)).count.any()
+    assert not any(weights for weights, _, _ in supply_of(paper, task))
+    assert any(weights for weights, _, _ in supply_of(online, task))
+    paper.end_episode(False)
+    assert paper.renewed().tolist() == online.renewed().tolist() != []
+    at_its_end = supply_of(paper, task)
+    assert at_its_end == supply_of(online, task)
+    for _ in range(20):
+        transition = naive.random_transition(rng, 3, 2)
+        show(paper, transition)
+        show(online, transition)
+    assert len(paper.renewed()) == 0 < len(online.renewed())
+    assert supply_of(paper, task) == at_its_end != supply_of(online, task)
+
+
+def test_no_more_transitions_are_measured_than_allowed():
+    rng = np.random.default_rng(2)
+    method = bound(COMBREL(naive.random_source(rng, 50), max_transitions=7), naive.target_task(POINTS, 2))
+    for _ in range(20):
+        show(method, naive.random_transition(rng, 3, 2))
+    assert method.statistics()["transfer/transitions_measured"] == 7
+
+
+def test_where_episodes_fail_the_transferred_instances_fade():
+    rng = np.random.default_rng(2)
+    source, task = naive.random_source(rng, 200, 2, 2), naive.target_task(POINTS, 2)
+    fading, steady = (bound(COMBREL(source, fading=f, bandwidths=BANDWIDTHS), task) for f in (0.5, 1.0))
+    narrow = bound(COMBREL(source, breadth=0.15, bandwidths=BANDWIDTHS), task)
+    for _ in range(20):
+        transition = naive.random_transition(rng, 3, 2)
+        for method in (fading, steady, narrow):
+            show(method, transition)
+    before = supply_of(fading, task)
+    fading.renewed()
+    fading.end_episode(False)
+    assert supply_of(fading, task) == before and len(fading.renewed()) == 0
+    for method in (fading, steady):
+        method.end_episode(True)
+    assert supply_of(steady, task) == before
+    assert supply_of(fading, task) == supply_of(narrow, task) != before
+    assert fading.renewed().tolist() == pairs_of(task).tolist()
+
+
+# ----------------------------------------------------- what it finds by itself
+
+
+@cache
+def mountain_car(n, seed, n_axes=1):
+    """Single steps of Mountain Car from states all over its space."""
+    rng = np.random.default_rng(seed)
+    low, high = np.repeat([-1.2, -0.07], n_axes), np.repeat([0.6, 0.07], n_axes)
+    states = rng.uniform(low, high, (n, 2 * n_axes))
+    actions = rng.integers(len(PUSHES[n_axes]), size=n)
+    after = np.empty_like(states)
+    for i in range(n):
+        for axis in range(n_axes):
+            push = PUSHES[n_axes][actions[i]][axis]
+            after[i, [axis, n_axes + axis]] = step_axis(states[i, axis], states[i, n_axes + axis], push)
+    return SourceInstances(states, actions, -np.ones(n), after, np.zeros(n, dtype=bool), low, high, len(PUSHES[n_axes]))
+
+
+def changed(source, columns=slice(None), mirror=False, actions=None):
+    """The same steps with the variables in another order, or mirrored in their ranges, and other numbers for the actions."""
+    units, ends = ((x - source.low) / (source.high - source.low) for x in (source.states, source.next_states))
+    units, ends = (1.0 - units, 1.0 - ends) if mirror else (units, ends)
+    d = source.n_variables
+    numbers = source.actions if actions is None else np.array(actions)[source.actions]
+    return SourceInstances(
+        units[:, columns],
+        numbers,
+        source.rewards,
+        ends[:, columns],
+        source.terminated,
+        np.zeros(d),
+        np.ones(d),
+        source.n_actions,
+    )
+
+
+def choices_after(method, target, resolution=8):
+    """The method's choices after it has seen the target's transitions: {(target action, state, sign, source action): share}."""
+    d = target.n_variables
+    axes = [np.linspace(0.05, 0.95, resolution)] * d
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
+    bound(method, naive.target_task(points, target.n_actions))
+    starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
+    for i in range(len(target)):
+        show(method, naive.Transition(starts[i], int(target.actions[i]), float(target.rewards[i]), ends[i]))
+    named = ways_of(method)
+    chosen = [[named[c] for c in row if c >= 0] for row in method._choice.reshape(target.n_actions, -1)]
+    return chosen
+
+
+def share(chosen, fits):
+    """The part of the choices, over all actions, that ``fits(target action, choice)``."""
+    hits = [fits(action, choice) for action, row in enumerate(chosen) for choice in row]
+    assert len(hits) > 100
+    return np.mean(hits)
+
+
