@@ -11,6 +11,10 @@ from numba.core import event
 compiled = njit(cache=True, _nrt=False, error_model="numpy")  # type: ignore[call-overload]
 
 
+# A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
+# for the constant and for the variable: such variables start as np.int64(0).
+
+
 class _Announcer(event.Listener):
     """Says once, on stderr, that compilation goes on: the first run is silent for seconds otherwise."""
 

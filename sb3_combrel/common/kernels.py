@@ -50,7 +50,8 @@ def near_instances(instances, action, state, breadth, min_weight, min_fraction, 
     scale = -1.0 / (breadth * breadth)
     n_variables = len(state)
     farthest = np.log(min_weight) / scale
-    length = 0
+    start = np.int64(0)
+    length = np.int64(0)
     total = 0.0
     count = instances.count[action]
     for block in range((count + BLOCK - 1) // BLOCK):
@@ -72,7 +73,7 @@ def near_instances(instances, action, state, breadth, min_weight, min_fraction, 
             w = np.exp(distance * scale)
             if w < min_weight:
                 continue
-            length, total = insert_by_weight(indices, weights, 0, length, i, w, min_fraction)
+            length, total = insert_by_weight(indices, weights, start, length, i, w, min_fraction)
             least = min(weights[length - 1], min_fraction * total)
             if least > min_weight:
                 farthest = np.log(least) / scale * (1 + 1e-12)

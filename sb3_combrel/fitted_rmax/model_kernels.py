@@ -239,7 +239,7 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
         scratch.at[k] = rest // grid.strides[k]
         rest -= scratch.at[k] * grid.strides[k]
     reward = 0.0
-    n_touched = 0
+    n_touched = np.int64(0)
     for k in range(start, start + n_own):
         i = arrays.lists.index[k]
         p = arrays.lists.weight[k] / total

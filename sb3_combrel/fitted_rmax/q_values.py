@@ -12,7 +12,7 @@ from sb3_combrel.fitted_rmax.corrections import corrected_value
 class QueryScratch(NamedTuple):
     """Work space and results of a query at one state.
 
-    :param index: int64, shape (n_actions, list room): kept instances of each action, nearest first
+    :param index: int32, shape (n_actions, list room): kept instances of each action, nearest first
     :param weight: float64, same shape
     :param length: int64, shape (n_actions,); ``total``: float64, same shape: sum of the weights
     :param position: float64, shape (n_variables,); ``there``: the same
@@ -32,7 +32,7 @@ class QueryScratch(NamedTuple):
     def empty(cls, n_actions: int, n_variables: int, room: int) -> "QueryScratch":
         """Work space for lists of up to ``room`` instances."""
         return cls(
-            index=np.empty((n_actions, room), dtype=np.int64),
+            index=np.empty((n_actions, room), dtype=np.int32),
             weight=np.empty((n_actions, room)),
             length=np.zeros(n_actions, dtype=np.int64),
             total=np.zeros(n_actions),

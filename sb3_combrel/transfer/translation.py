@@ -113,7 +113,7 @@ def translate(states, own, first, last, source, ways, mappings, rules, merit, sc
         supply.count[s] = 0
         if own[s] >= rules.threshold:
             continue
-        found = 0
+        found = np.int64(0)
         for c in range(first[s], last[s]):
             found = gather(
                 states[s],

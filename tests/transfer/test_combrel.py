@@ -1,5 +1,6 @@
 """COMBREL's choice of mappings: the vote of Algorithm 1 against a naive one, and that it finds what corresponds to what."""
 
+from collections import Counter
 from functools import cache
 
 import naive_transfer as naive
@@ -11,10 +12,11 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel.transfer.compliance import Bandwidths
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
 from sb3_combrel.transfer.source import SourceInstances
 
-BANDWIDTHS = (0.05, 0.05, 1.0)
+BANDWIDTHS = Bandwidths(0.05, 0.05, 1.0)
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -50,26 +52,27 @@ class NaiveVote:
     def __init__(self, sources, mappings, n_neighbors):
         self.sources, self.mappings, self.k = sources, mappings, n_neighbors
         self.seen = []
+        self.known = {}
 
     def means(self, state, action):
         """Mean compliance of each (source, mapping) with the nearest transitions of ``action``."""
         near = sorted((t for t in self.seen if t.action == action), key=lambda t: naive.distance(t.state, state))[: self.k]
         if not near:
             return {}
-        bandwidths = naive_bandwidths()
         return {
-            (number, tuple(mapping.state), tuple(mapping.sign), mapping.action[action]): np.mean(
-                [naive.compliance(t, source, mapping, bandwidths) for t in near]
+            (number, mapping.state, mapping.sign, mapping.action[action]): np.mean(
+                [self.compliance(t, number, mapping) for t in near]
             )
-            for number, (source, of_source) in enumerate(zip(self.sources, self.mappings, strict=True))
+            for number, of_source in enumerate(self.mappings)
             for mapping in of_source
         }
 
-
-def naive_bandwidths():
-    from sb3_combrel.transfer.compliance import Bandwidths
-
-    return Bandwidths(*BANDWIDTHS)
+    def compliance(self, transition, number, mapping):
+        """Naive, but computed once only."""
+        key = (id(transition), number, mapping)
+        if key not in self.known:
+            self.known[key] = naive.compliance(transition, self.sources[number], mapping, BANDWIDTHS)
+        return self.known[key]
 
 
 def ways_of(method):
@@ -292,3 +295,164 @@ def share(chosen, fits):
     return np.mean(hits)
 
 
+def test_a_source_that_is_the_target_is_recognized():
+    chosen = choices_after(COMBREL(mountain_car(1000, 0)), mountain_car(400, 1))
+    assert share(chosen, lambda action, choice: choice[1] == (0, 1)) > 0.95
+    assert share(chosen, lambda action, choice: choice[1] == (0, 1) and choice[3] == action) > 0.75
+
+
+def test_variables_and_actions_in_another_order_are_found():
+    source = changed(mountain_car(1000, 0), columns=[1, 0], actions=[2, 0, 1])
+    chosen = choices_after(COMBREL(source), mountain_car(400, 1))
+    assert share(chosen, lambda action, choice: choice[1] == (1, 0)) > 0.95
+    assert share(chosen, lambda action, choice: choice[1] == (1, 0) and choice[3] == [2, 0, 1][action]) > 0.75
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_a_mirrored_source_is_found_among_mappings_with_signs(mirror):
+    """The valley lies near the middle of the range, so a mirrored car differs little from a plain one."""
+    source = changed(mountain_car(1000, 0), mirror=mirror)
+    mappings = MappingSet.injective(2, 2, 3, 3, signs=True)
+    chosen = choices_after(COMBREL(source, mappings), mountain_car(400, 1))
+    sign = (-1, -1) if mirror else (1, 1)
+    for action, row in enumerate(chosen):
+        [(most_frequent, n), (_, n_next)] = Counter(choice[1:] for choice in row).most_common(2)
+        assert most_frequent == ((0, 1), sign, action)
+        assert n > 2 * n_next
+
+
+def test_of_several_sources_the_one_that_fits_is_chosen():
+    sources = [noise(0), mountain_car(1000, 0), noise(1)]
+    chosen = choices_after(COMBREL(sources), mountain_car(400, 1))
+    assert share(chosen, lambda action, choice: choice[0] == 1) > 0.95
+
+
+def test_each_action_of_the_larger_car_gets_the_axis_that_it_drives():
+    """East and West act like Right and Left on x; from y's point of view they do nothing. North and South: vice versa."""
+    chosen = choices_after(COMBREL(mountain_car(1000, 0)), mountain_car(1500, 2, 2), resolution=4)
+    along_x, along_y = (0, None, 1, None), (None, 0, None, 1)
+    fitting = [
+        {(along_x, 0), (along_y, 0)},
+        {(along_x, 1), (along_y, 0)},
+        {(along_x, 2), (along_y, 0)},
+        {(along_y, 1), (along_x, 0)},
+        {(along_y, 2), (along_x, 0)},
+    ]
+    for action, row in enumerate(chosen):
+        by_number = Counter((choice[1], choice[3]) for choice in row).most_common(2)
+        assert {way for way, _ in by_number} == fitting[action]
+        assert sum(n for _, n in by_number) > 0.6 * len(row)
+
+
+# --------------------------------------------------------------------- learning
+
+
+def noise(seed, n=500):
+    """A source that has nothing to do with any task: from anywhere to somewhere near."""
+    rng = np.random.default_rng(seed)
+    states = rng.random((n, 2))
+    after = np.clip(states + 0.1 * rng.normal(size=(n, 2)), 0.0, 1.0)
+    return SourceInstances(
+        states, rng.integers(3, size=n), -np.ones(n), after, np.zeros(n, dtype=bool), np.zeros(2), np.ones(2), 3
+    )
+
+
+class Episodes(BaseCallback):
+    """The lengths of episodes; ends the learning after ``n`` of them."""
+
+    def __init__(self, n):
+        super().__init__()
+        self.n = n
+        self.lengths = []
+
+    def _on_step(self):
+        self.lengths += [info["episode"]["l"] for info in self.locals["infos"] if "episode" in info]
+        return len(self.lengths) < self.n
+
+
+LIMIT = 500
+
+
+def learned(transfer, seed, n_episodes):
+    env = make_vec_env("combrel/MountainCar2D-v0", seed=seed, env_kwargs=dict(max_episode_steps=LIMIT))
+    model = FittedRMax(env, transfer=transfer, model_breadth=1 / 16, resolution=4, seed=seed)
+    episodes = Episodes(n_episodes)
+    model.learn(10**6, callback=episodes)
+    return model, np.array(episodes.lengths)
+
+
+def test_a_source_that_is_the_target_saves_the_exploration():
+    for seed in range(2):
+        _, with_transfer = learned(COMBREL(mountain_car(1000, 0)), seed, 3)
+        _, without = learned(None, seed, 3)
+        assert with_transfer.max() < 250
+        assert with_transfer.sum() < without.sum() * 3 / 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_source_that_has_nothing_to_do_with_the_target_does_not_hold_learning_up_for_long(seed):
+    _, with_transfer = learned(COMBREL(noise(seed)), seed, 10)
+    _, without = learned(None, seed, 10)
+    assert with_transfer[-5:].max() < 250
+    assert with_transfer.sum() < 2.5 * without.sum()
+
+
+IDENTITY = {"state": [0, 1], "action": [0, 1, 2]}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"mappings": "all"},
+        {"mappings": "surjective"},
+        {"mappings": "balanced"},
+        {"mappings": IDENTITY},
+        {"mappings": [IDENTITY, InterTaskMapping([1, 0], [0, 1, 2])]},
+        {"mappings": MappingSet.injective(2, 2, 3, 3, signs=True)},
+        {"measured": "first_episode"},
+        {"n_neighbors": 1},
+        {"n_neighbors": 10, "max_transitions": 50},
+        {"relevance": True, "relevance_fraction": 0.3},
+        {"relevance": True, "measured": "first_episode"},
+        {"believe_terminal": True, "breadth": 0.2, "fading": 1.0, "bandwidths": (0.02, 0.0002, 1.0)},
+    ],
+    ids=str,
+)
+def test_every_variant_reaches_the_goal_and_transfers(arguments):
+    model, lengths = learned(COMBREL(mountain_car(1000, 0), **arguments), 0, 2)
+    assert lengths[-1] < LIMIT
+    transfer = model.policy.transfer
+    counts = transfer.mapping_counts()
+    assert sum(n for _, n in counts) > 20
+    assert counts == sorted(counts, key=lambda entry: -entry[1])
+    figures = model.policy.statistics()
+    assert figures["transfer/uses"] == sum(n for _, n in counts)
+    assert 0.0 <= figures["transfer/choice_entropy"] <= np.log(figures["transfer/distinct_mappings"]) + 1e-9
+    assert figures["transfer/transitions_measured"] <= lengths.sum() + 1
+
+
+def test_with_relevance_the_instances_that_the_target_contradicts_come_last():
+    """Half of the source's instances are from the target, the other half say that nothing ever moves."""
+    good = mountain_car(400, 0)
+    still = SourceInstances(
+        np.vstack([good.states, good.states + 1e-6]),
+        np.tile(good.actions, 2),
+        np.tile(good.rewards, 2),
+        np.vstack([good.next_states, good.states + 1e-6]),
+        np.zeros(800, dtype=bool),
+        good.low,
+        good.high,
+        3,
+    )
+    target = mountain_car(300, 1)
+    task = naive.target_task(np.random.default_rng(0).uniform(0.1, 0.9, (100, 2)), 3)
+    stillness = {}
+    for by_relevance in (False, True):
+        method = bound(COMBREL(still, IDENTITY, relevance=by_relevance), task)
+        starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
+        for i in range(len(target)):
+            show(method, naive.Transition(starts[i], int(target.actions[i]), -1.0, ends[i]))
+        effects = np.array([effect for _, of_pair, _ in supply_of(method, task) for effect in of_pair])
+        stillness[by_relevance] = np.mean(np.abs(effects).max(axis=1) == 0.0)
+    assert stillness[False] > 0.4
+    assert stillness[True] < 0.1
