@@ -15,6 +15,7 @@ def demo(
     seeds: int = 8,
     episodes: int = 12,
     max_episode_steps: int = 2000,
+    model_breadth: float = 0.1,
     workers: int | None = None,
     fresh: bool = False,
 ) -> None:
@@ -27,12 +28,13 @@ def demo(
     :param seeds: runs of each method
     :param episodes: episodes of each run
     :param max_episode_steps: steps after which an episode is cut off
+    :param model_breadth: breadth of the learner's kernel; with 0.4 there is little for transfer to gain
     :param workers: processes at a time; one a core by default
     :param fresh: delete earlier results in the folder and begin anew
     """
     from sb3_combrel.experiments.demo import run_demo
 
-    run_demo(output, seeds, episodes, max_episode_steps, workers, fresh)
+    run_demo(output, seeds, episodes, max_episode_steps, model_breadth, workers, fresh)
 
 
 def record(

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from sb3_combrel.common.compiled import compiled
 
-BLOCK = 32
+BLOCK = 8
 
 
 class InstanceArrays(NamedTuple):

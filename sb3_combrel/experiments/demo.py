@@ -40,6 +40,7 @@ def run_demo(
     n_seeds: int,
     n_episodes: int,
     max_episode_steps: int,
+    model_breadth: float = mountain_car.LEARNER["model_breadth"],
     workers: int | None = None,
     fresh: bool = False,
     console: Console | None = None,
@@ -53,6 +54,7 @@ def run_demo(
     :param n_seeds: runs of each method
     :param n_episodes: episodes of each run
     :param max_episode_steps: steps after which an episode is cut off
+    :param model_breadth: breadth of the learner's kernel
     :param workers: processes at a time; None for one a core
     :param fresh: begin anew and delete the results in the folder
     :param console: where to write; None for the standard output
@@ -63,11 +65,14 @@ def run_demo(
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
+    if not model_breadth > 0.0:
+        raise ValueError(f"model_breadth must be positive, got {model_breadth}")
     console = console or Console()
-    prepare_folder(output, _settings(max_episode_steps), fresh)
+    learner = {**mountain_car.LEARNER, "model_breadth": model_breadth}
+    prepare_folder(output, _settings(learner, max_episode_steps), fresh)
     source = _source(output / SOURCE, console)
     runs = [
-        Run(output, method, seed, mountain_car.TARGET_ID, n_episodes, max_episode_steps, transfer, mountain_car.LEARNER)
+        Run(output, method, seed, mountain_car.TARGET_ID, n_episodes, max_episode_steps, transfer, learner)
         for seed in range(n_seeds)
         for method, transfer in mountain_car.methods(source).items()
     ]
@@ -110,7 +115,7 @@ def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool) -> None:
     os.replace(unfinished, file)
 
 
-def _settings(max_episode_steps: int) -> dict[str, Any]:
+def _settings(learner: dict[str, Any], max_episode_steps: int) -> dict[str, Any]:
     """What a run's results depend on, its seed and number of episodes excepted."""
     return {
         "version": sb3_combrel.__version__,
@@ -118,7 +123,7 @@ def _settings(max_episode_steps: int) -> dict[str, Any]:
         "target": mountain_car.TARGET_ID,
         "source_instances": mountain_car.N_INSTANCES,
         "source_seed": SOURCE_SEED,
-        "learner": mountain_car.LEARNER,
+        "learner": learner,
         "max_episode_steps": max_episode_steps,
     }
 

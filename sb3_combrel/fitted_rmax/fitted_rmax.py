@@ -156,7 +156,7 @@ class FittedRMax(BaseAlgorithm):
             self._rng = np.random.default_rng(np.random.randint(2**31))
         self.set_random_seed(self.seed)
         names = _names(self.env)
-        self.policy = self.policy_class(
+        self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
             model_breadth=self._breadth(),
@@ -271,8 +271,8 @@ class FittedRMax(BaseAlgorithm):
         callback.update_locals(locals())
         if not callback.on_step():
             return False
-        for e in np.flatnonzero(dones):
-            self._end_episode(int(e), bool(terminated[e]))
+        for ended in np.flatnonzero(dones):
+            self._end_episode(int(ended), bool(terminated[ended]))
             if log_interval is not None and self._episode_num % log_interval == 0:
                 self.dump_logs()
         return True

@@ -60,7 +60,7 @@ class VirtualSourceTransfer(Transfer):
         check_positive("fading", fading, largest=1.0)
         check_positive("relevance_fraction", relevance_fraction, largest=1.0)
         if bandwidths is not None:
-            if len(tuple(bandwidths)) != 3:
+            if isinstance(bandwidths, str) or not isinstance(bandwidths, Sequence | np.ndarray) or len(bandwidths) != 3:
                 raise ValueError(f"bandwidths must be three numbers (start, outcome, reward) or None, got {bandwidths!r}")
             for value in bandwidths:
                 check_positive("bandwidths", value)

@@ -275,7 +275,7 @@ def changed(source, columns=slice(None), mirror=False, actions=None):
 
 
 def choices_after(method, target, resolution=8):
-    """The method's choices after it has seen the target's transitions: {(target action, state, sign, source action): share}."""
+    """What the method has chosen after it has seen the target: for each action (source, state, sign, source action)s."""
     d = target.n_variables
     axes = [np.linspace(0.05, 0.95, resolution)] * d
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)

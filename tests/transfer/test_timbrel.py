@@ -1,0 +1,219 @@
+"""TIMBREL: what a given mapping transfers to which pairs, and that the target's own instances take over."""
+
+import copy
+
+import naive_transfer as naive
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+
+import combrel_envs  # noqa: F401 - registers the Mountain Cars
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax
+from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
+
+POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+ONE = InterTaskMapping([0, None, 1], [1, 0])
+OTHER = InterTaskMapping([None, 1, 0], [0, 0], [1, -1, 1])
+
+
+@pytest.fixture
+def source():
+    return naive.random_source(np.random.default_rng(0), 300, 2, 2)
+
+
+@pytest.fixture
+def task():
+    return naive.target_task(POINTS, 2)
+
+
+def bound(method, task, seed=0):
+    method.bind(task, np.random.default_rng(seed))
+    return method
+
+
+def supply_of(method, task, own=0.0):
+    pairs = np.arange(task.n_actions * len(task.sample_states))
+    own = np.full(len(pairs), own)
+    return method.supply(pairs, own, own >= task.exploration_threshold)
+
+
+def assert_supplies(method, task, drawn_from, breadth):
+    """Every pair is supplied, naively, from ``drawn_from(action)``; at an exact state, too."""
+    supply, n_points, n_transferred = supply_of(method, task), len(task.sample_states), 0
+    for point, state in enumerate(task.sample_states):
+        at = method.supply_at(state, np.zeros(task.n_actions))
+        for action in range(task.n_actions):
+            expected = naive.transferred(state, 0.0, drawn_from(action), task, breadth)
+            n_transferred += len(expected)
+            for found, row in ((supply, action * n_points + point), (at, action)):
+                n = found.count[row]
+                assert n == len(expected)
+                np.testing.assert_allclose(found.weight[row, :n], [e[0] for e in expected], rtol=1e-9)
+                np.testing.assert_allclose(found.effect[row, :n], np.array([e[1] for e in expected]).reshape(n, 3), atol=1e-12)
+    assert n_transferred > len(task.sample_states)
+
+
+def test_one_mapping_serves_all_actions(source, task):
+    method = bound(TIMBREL(source, ONE, breadth=0.2), task)
+    assert_supplies(method, task, lambda action: [(source, ONE, action)], 0.2)
+
+
+def test_each_action_may_have_a_mapping_of_its_own(source, task):
+    method = bound(TIMBREL(source, [ONE, OTHER], breadth=0.2), task)
+    assert_supplies(method, task, lambda action: [(source, [ONE, OTHER][action], action)], 0.2)
+
+
+def test_the_pool_holds_the_translations_by_all_mappings(source, task):
+    method = bound(TIMBREL(source, "pool", mappings=[ONE, OTHER], breadth=0.1), task)
+    assert_supplies(method, task, lambda action: [(source, ONE, action), (source, OTHER, action)], 0.1)
+
+
+def test_random_draws_a_mapping_of_the_set_at_each_transfer(source, task):
+    method = bound(TIMBREL(source, "random", mappings=[ONE, OTHER], breadth=0.2), task)
+    state = np.full(3, 0.4)
+    possible = [
+        np.array([e[1] for e in naive.transferred(state, 0.0, [(source, mapping, 0)], task, 0.2)]) for mapping in (ONE, OTHER)
+    ]
+    drawn = []
+    for _ in range(60):
+        supply = method.supply_at(state, np.array([0.0, 1.0]))
+        effects = supply.effect[0, : supply.count[0]]
+        [which] = [k for k, p in enumerate(possible) if p.shape == effects.shape and np.allclose(p, effects)]
+        drawn.append(which)
+    assert 15 < sum(drawn) < 45
+
+
+def test_at_first_every_pair_is_renewed_and_then_none(source, task):
+    method = bound(TIMBREL(source, ONE), task)
+    assert method.renewed().tolist() == list(range(2 * len(POINTS)))
+    method.observe(POINTS[5], 0, -1.0, POINTS[6], False)
+    assert method.renewed().tolist() == []
+
+
+def test_pairs_that_are_known_are_given_nothing(source, task):
+    method = bound(TIMBREL(source, ONE, breadth=0.3), task)
+    assert supply_of(method, task, own=0.5).count.any()
+    assert not supply_of(method, task, own=1.0).count.any()
+    assert method.supply_at(POINTS[20], np.array([0.0, 1.0])).count.tolist()[1] == 0
+    assert method.supply_at(POINTS[20], np.array([1.0, 0.0])).count.tolist()[0] == 0
+    assert not method.supply_at(POINTS[20], np.array([1.0, 3.0])).count.any()
+
+
+def test_a_sources_first_mapping_and_action_names_describe_what_was_used(source, task):
+    method = bound(TIMBREL(source, ONE, breadth=0.3), task)
+    for _ in range(3):
+        method.supply_at(POINTS[21], np.zeros(2))
+    method.supply_at(POINTS[21], np.array([0.0, 1.0]))
+    assert method.mapping_counts() == [("a0<-a1 with s0<-s0, s2<-s1", 4), ("a1<-a0 with s0<-s0, s2<-s1", 3)]
+
+
+# ------------------------------------------------------------------- in learning
+
+
+def mountain_car(transfer, seed=0, **kwargs):
+    env = make_vec_env("combrel/MountainCar2D-v0", seed=seed, env_kwargs=dict(max_episode_steps=200))
+    return FittedRMax(env, transfer=transfer, model_breadth=1 / 16, resolution=4, seed=seed, **kwargs)
+
+
+IDENTITY = InterTaskMapping([0, 1], [0, 1, 2])
+
+
+def test_a_known_pairs_row_is_built_of_its_own_instances_only(source):
+    """The same experience gives the same rows with transfer and without, wherever the pair is known."""
+    three_actions = naive.random_source(np.random.default_rng(0), 500, 2, 3)
+    model, plain = mountain_car(TIMBREL(three_actions, IDENTITY)), mountain_car(None)
+    rng = np.random.default_rng(1)
+    model.policy.prepare()
+    before = {pair: row_of(model, pair) for pair in range(3 * 17 * 17)}
+    state = rng.uniform(0.3, 0.7, 2)
+    for _ in range(400):
+        action, after = int(rng.integers(3)), np.clip(state + 0.03 * rng.normal(size=2), 0.0, 1.0)
+        for each in (model, plain):
+            each.policy.learn_from(state, action, -1.0, after, False)
+        state = after
+    arrays, of_plain = model.policy.model.arrays, plain.policy.model.arrays
+    known = np.flatnonzero(arrays.known)
+    assert known.tolist() == np.flatnonzero(of_plain.known).tolist()
+    assert len(known) > 30
+    n_changed = 0
+    for pair in known:
+        assert row_of(model, pair) == row_of(plain, pair)
+        n_changed += pair in before and row_of(model, pair) != before[pair]
+    assert n_changed > 0.9 * len(known), "what was transferred there before was something else"
+    transferred = arrays.settled.astype(bool) & ~arrays.known
+    assert transferred.sum() > 100
+    assert not of_plain.settled[transferred].any()
+
+
+def row_of(model, pair):
+    arrays = model.policy.model.arrays
+    start, length = arrays.rows.start[pair], arrays.rows.length[pair]
+    if not arrays.settled[pair]:
+        return None
+    return (
+        float(arrays.reward[pair]),
+        arrays.rows.index[start : start + length].tolist(),
+        arrays.rows.weight[start : start + length].tolist(),
+    )
+
+
+@pytest.mark.parametrize("method", [TIMBREL, COMBREL])
+def test_the_object_that_was_given_is_left_alone_and_serves_two_models(method):
+    source = naive.random_source(np.random.default_rng(0), 200, 2, 3)
+    given = method(source, IDENTITY)
+    before = copy.deepcopy(vars(given))
+    one, other = mountain_car(given), mountain_car(given)
+    alone = mountain_car(method(source, IDENTITY))
+    for _ in range(3):
+        one.learn(60, reset_num_timesteps=False)
+        other.learn(60, reset_num_timesteps=False)
+        alone.learn(60, reset_num_timesteps=False)
+    assert one.policy.transfer is not other.policy.transfer
+    assert one.policy.transfer is not given
+    assert given.source is source
+    assert set(vars(given)) == set(before)
+    assert {k: v for k, v in vars(given).items() if k != "source"} == {k: v for k, v in before.items() if k != "source"}
+    for model in (other, alone):
+        np.testing.assert_array_equal(trace(one), trace(model))
+
+
+def trace(model):
+    """Every instance of the model, in the order of the actions."""
+    instances = model.policy.model.instances
+    return np.vstack([instances.state[a, :n] for a, n in enumerate(instances.count)])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda source: TIMBREL(source, "random"),
+        lambda source: TIMBREL(source, "pool", relevance=True),
+        lambda source: COMBREL(source),
+        lambda source: COMBREL(source, "all", relevance=True),
+    ],
+    ids=["random", "pool", "COMBREL", "COMBREL with relevance"],
+)
+def test_the_same_seed_gives_the_same_run(make):
+    source = naive.random_source(np.random.default_rng(0), 200, 2, 3)
+    one, same = (mountain_car(make(source), seed=4).learn(250) for _ in range(2))
+    np.testing.assert_array_equal(trace(one), trace(same))
+    np.testing.assert_array_equal(one.policy.planner.values, same.policy.planner.values)
+    assert one.policy.transfer.mapping_counts() == same.policy.transfer.mapping_counts()
+
+
+@pytest.mark.parametrize("mapping", ["random", "pool", IDENTITY, [IDENTITY] * 3])
+@pytest.mark.parametrize("relevance", [False, True])
+def test_every_variant_learns(mapping, relevance):
+    source = naive.random_source(np.random.default_rng(0), 200, 2, 3)
+    model = mountain_car(TIMBREL(source, mapping, relevance=relevance)).learn(150)
+    assert model.policy.statistics()["model/transferred"] > 0.0
+    assert model.policy.model.n_instances == 150
+
+
+def test_random_and_pool_draw_from_the_injective_mappings_unless_told():
+    source = naive.random_source(np.random.default_rng(0), 50, 2, 3)
+    model = mountain_car(TIMBREL(source))
+    expected = {(0, 1), (1, 0)}
+    assert {tuple(row) for row in model.policy.transfer._sets[0].state_mappings.tolist()} == expected
+    all_of_them = mountain_car(TIMBREL(source, "pool", mappings=MappingSet.all(2, 2, 3, 3, signs=True)))
+    assert all_of_them.policy.transfer._sets[0].n_state_mappings > len(expected)
