@@ -11,6 +11,11 @@ from numba.core import event
 compiled = njit(cache=True, _nrt=False, error_model="numpy")  # type: ignore[call-overload]
 
 
+# The same for loops whose sums may be taken in any order, as vector registers do.
+compiled_fast = njit(  # type: ignore[call-overload]
+    cache=True, _nrt=False, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
+)
+
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).
 

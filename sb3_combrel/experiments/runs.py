@@ -163,7 +163,7 @@ def carry_out(run: Run) -> Run:
         env.close()
     if model.policy.transfer is not None:
         _write_mappings(run.mappings_file, model.policy.transfer)
-    unfinished = run.model_file.with_suffix(".part.zip")
+    unfinished = run.model_file.with_suffix(".part")
     model.save(unfinished)
     os.replace(unfinished, run.model_file)
     return run
@@ -192,7 +192,7 @@ def make_task(env_id: str, **kwargs: Any) -> Any:
 
 
 def _remove_leftovers(run: Run) -> None:
-    for path in (run.episodes_file, run.mappings_file, run.model_file):
+    for path in (run.episodes_file, run.mappings_file, run.model_file, run.model_file.with_suffix(".part")):
         path.unlink(missing_ok=True)
     for path in run.tensorboard_folder.glob(f"{run.name}_[0-9]*"):
         with contextlib.suppress(OSError):

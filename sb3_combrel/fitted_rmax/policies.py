@@ -29,7 +29,7 @@ LONGEST_PLAN = 10_000
 # Backups, in multiples of max_backups or of the grid's points, and for each pair that transfer has changed.
 AT_EPISODE_END = 100
 BEFORE_THE_FIRST_STEP = 300
-BACKUPS_PER_RENEWED_PAIR = 3
+BACKUPS_PER_RENEWED_PAIR = 10
 NO_PAIRS = np.empty(0, dtype=np.int64)
 
 

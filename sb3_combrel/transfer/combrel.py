@@ -87,7 +87,7 @@ class COMBREL(VirtualSourceTransfer):
         super().bind(target, rng)
         n_rows, n_actions = len(self._table.index), len(self._instances.count)
         n_points = len(target.sample_states)
-        self._compliance_scratch = ComplianceScratch.for_mappings(self._table)
+        self._compliance_scratch = ComplianceScratch.for_mappings(self._table, int(self._instances.count.max()))
         self._tables = np.empty((64, n_rows, n_actions))
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
         self._distance = np.full((target.n_actions, n_points, self.n_neighbors), np.inf)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, compiled_fast
 from sb3_combrel.common.instances import InstanceArrays
 
 
@@ -50,10 +50,11 @@ class ComplianceScratch(NamedTuple):
     :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are
         ``factors[first[m] : first[m + 1]]``
     :param factors: int64
-    :param start: float64, shape (n_factors,): kernel of where a transition and a source instance start
+    :param start: float64, shape (n_factors, most): kernel of where a transition and each source instance start
     :param outcome: the same for outcomes
+    :param reward: float64, shape (most,): the same for rewards
+    :param weight: float64, shape (most,): product of a mapping's start kernels; ``hit``: of its outcome kernels
     :param still: float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
-    :param sums: float64, shape (n_state_mappings, 3): sums over instances of weight, weight x outcome, weight x reward
     """
 
     variable: np.ndarray
@@ -63,12 +64,14 @@ class ComplianceScratch(NamedTuple):
     factors: np.ndarray
     start: np.ndarray
     outcome: np.ndarray
+    reward: np.ndarray
+    weight: np.ndarray
+    hit: np.ndarray
     still: np.ndarray
-    sums: np.ndarray
 
     @classmethod
-    def for_mappings(cls, mappings: MappingTable) -> "ComplianceScratch":
-        """Work space for a table of state mappings."""
+    def for_mappings(cls, mappings: MappingTable, most: int) -> "ComplianceScratch":
+        """Work space for a table of state mappings and up to ``most`` instances of a source action."""
         number: dict[tuple[int, int, bool], int] = {}
         first, factors = [0], []
         for index, sign in zip(mappings.index, mappings.sign, strict=True):
@@ -82,10 +85,12 @@ class ComplianceScratch(NamedTuple):
             mirrored=np.array([m for _, _, m in keys], dtype=np.bool_),
             first=np.array(first, dtype=np.int64),
             factors=np.array(factors, dtype=np.int64),
-            start=np.empty(len(keys)),
-            outcome=np.empty(len(keys)),
+            start=np.empty((len(keys), most)),
+            outcome=np.empty((len(keys), most)),
+            reward=np.empty(most),
+            weight=np.empty(most),
+            hit=np.empty(most),
             still=np.empty(n_mappings),
-            sums=np.empty((n_mappings, 3)),
         )
 
 
@@ -94,24 +99,84 @@ class ComplianceScratch(NamedTuple):
 LEAST_EVIDENCE = 0.1
 
 
-# Kernel arguments beyond this make less than 1e-17 and are taken as 0, without an exponential.
-NOTHING = 40.0
+# Kernel arguments beyond this make less than 1e-17: the kernel is cut there.
+FARTHEST = 40.0
 
 
-@compiled
-def _kernel_factors(state, effect, source, action, j, bandwidths, scratch):
-    """Fill ``scratch.start`` and ``scratch.outcome`` for source instance ``j`` of ``action``."""
+@compiled_fast
+def _exponentiate(row, n):
+    """Replace the first ``n`` entries x >= 0 by exp(-min(x, FARTHEST)), to 12 digits.
+
+    The Taylor polynomial of exp(-x / 64), raised to the 64th power by squaring six times: multiplications only, so the
+    loop runs in vector registers, which a call of exp would not.
+    """
+    for j in range(n):
+        x = row[j]
+        y = (x if x < FARTHEST else FARTHEST) * (-1.0 / 64.0)
+        value = 1.0 + y * (1.0 / 13.0)
+        value = 1.0 + y * (1.0 / 12.0) * value
+        value = 1.0 + y * (1.0 / 11.0) * value
+        value = 1.0 + y * (1.0 / 10.0) * value
+        value = 1.0 + y * (1.0 / 9.0) * value
+        value = 1.0 + y * (1.0 / 8.0) * value
+        value = 1.0 + y * (1.0 / 7.0) * value
+        value = 1.0 + y * (1.0 / 6.0) * value
+        value = 1.0 + y * (1.0 / 5.0) * value
+        value = 1.0 + y * (1.0 / 4.0) * value
+        value = 1.0 + y * (1.0 / 3.0) * value
+        value = 1.0 + y * (1.0 / 2.0) * value
+        value = 1.0 + y * value
+        value *= value
+        value *= value
+        value *= value
+        value *= value
+        value *= value
+        row[j] = value * value
+
+
+@compiled_fast
+def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
+    """Fill ``scratch.start``, ``outcome`` and ``reward`` for all source instances of ``action``."""
+    n = source.count[action]
     for f in range(len(scratch.variable)):
         v = scratch.variable[f]
-        here = source.state[action, j, scratch.source[f]]
-        moved = source.effect[action, j, scratch.source[f]]
-        if scratch.mirrored[f]:
-            here = 1.0 - here
-            moved = -moved
-        apart = (state[v] - here) * (state[v] - here) / bandwidths.start
-        missed = (effect[v] - moved) * (effect[v] - moved) / bandwidths.outcome
-        scratch.start[f] = np.exp(-apart) if apart < NOTHING else 0.0
-        scratch.outcome[f] = np.exp(-missed) if missed < NOTHING else 0.0
+        k = scratch.source[f]
+        side = -1.0 if scratch.mirrored[f] else 1.0
+        offset = 1.0 if scratch.mirrored[f] else 0.0
+        at = state[v]
+        moved = effect[v]
+        for j in range(n):
+            apart = at - (offset + side * source.state[action, j, k])
+            missed = moved - side * source.effect[action, j, k]
+            scratch.start[f, j] = apart * apart / bandwidths.start
+            scratch.outcome[f, j] = missed * missed / bandwidths.outcome
+        _exponentiate(scratch.start[f], n)
+        _exponentiate(scratch.outcome[f], n)
+    for j in range(n):
+        off = reward - source.reward[action, j]
+        scratch.reward[j] = off * off / bandwidths.reward
+    _exponentiate(scratch.reward, n)
+
+
+@compiled_fast
+def _mapping_compliance(m, n, scratch):
+    """Compliance through state mapping ``m``, but for its unmapped variables, with ``n`` instances of one action."""
+    for j in range(n):
+        scratch.weight[j] = 1.0
+        scratch.hit[j] = 1.0
+    for t in range(scratch.first[m], scratch.first[m + 1]):
+        f = scratch.factors[t]
+        for j in range(n):
+            scratch.weight[j] *= scratch.start[f, j]
+            scratch.hit[j] *= scratch.outcome[f, j]
+    total = 0.0
+    transition = 0.0
+    rewarded = 0.0
+    for j in range(n):
+        total += scratch.weight[j]
+        transition += scratch.weight[j] * scratch.hit[j]
+        rewarded += scratch.weight[j] * scratch.reward[j]
+    return 0.0 if total < LEAST_EVIDENCE else (transition / total) * (rewarded / total)
 
 
 @compiled
@@ -140,29 +205,11 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
     :param scratch: ComplianceScratch for ``mappings``
     :param table: receives the compliances, shape (n_state_mappings, n_source_actions); 0 where no instance is near
     """
-    n_mappings = mappings.index.shape[0]
     _still_factors(effect, mappings, bandwidths.outcome, scratch.still)
     for action in range(len(source.count)):
-        scratch.sums[:, :] = 0.0
-        for j in range(source.count[action]):
-            _kernel_factors(state, effect, source, action, j, bandwidths, scratch)
-            off = reward - source.reward[action, j]
-            same_reward = np.exp(-off * off / bandwidths.reward) if off != 0.0 else 1.0
-            for m in range(n_mappings):
-                weight = 1.0
-                outcome = 1.0
-                for t in range(scratch.first[m], scratch.first[m + 1]):
-                    weight *= scratch.start[scratch.factors[t]]
-                    outcome *= scratch.outcome[scratch.factors[t]]
-                scratch.sums[m, 0] += weight
-                scratch.sums[m, 1] += weight * outcome
-                scratch.sums[m, 2] += weight * same_reward
-        for m in range(n_mappings):
-            total = scratch.sums[m, 0]
-            if total < LEAST_EVIDENCE:
-                table[m, action] = 0.0
-            else:
-                table[m, action] = scratch.still[m] * (scratch.sums[m, 1] / total) * (scratch.sums[m, 2] / total)
+        _kernel_factors(state, effect, reward, source, action, bandwidths, scratch)
+        for m in range(mappings.index.shape[0]):
+            table[m, action] = scratch.still[m] * _mapping_compliance(m, source.count[action], scratch)
 
 
 @compiled

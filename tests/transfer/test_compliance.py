@@ -35,7 +35,7 @@ def tables_of(transitions, sources, sets, bandwidths):
         instances,
         table,
         bandwidths,
-        ComplianceScratch.for_mappings(table),
+        ComplianceScratch.for_mappings(table, int(instances.count.max())),
         tables,
     )
     return tables
@@ -167,7 +167,8 @@ def test_one_transition_and_many_go_through_the_same_equations():
     transitions = [naive.random_transition(rng, 3, 2) for _ in range(5)]
     bandwidths = Bandwidths(0.1, 0.1, 1.0)
     tables = tables_of(transitions, [source], [mappings], bandwidths)
-    table, scratch = stacked_table([mappings]), ComplianceScratch.for_mappings(stacked_table([mappings]))
+    table = stacked_table([mappings])
+    scratch = ComplianceScratch.for_mappings(table, 40)
     for i in reversed(range(5)):
         t, one = transitions[i], np.full(tables[0].shape, np.nan)
         effect = t.next_state - t.state
