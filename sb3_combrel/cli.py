@@ -12,7 +12,7 @@ OF_EXTRA = ("combrel_envs", "joblib", "matplotlib", "mujoco", "dm_control", "mov
 
 def demo(
     output: Path = Path("demo_output"),
-    seeds: int = 8,
+    seeds: int = 10,
     episodes: int = 12,
     max_episode_steps: int = 2000,
     model_breadth: float = 0.1,
