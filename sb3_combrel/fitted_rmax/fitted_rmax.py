@@ -271,7 +271,7 @@ class FittedRMax(BaseAlgorithm):
         callback.update_locals(locals())
         if not callback.on_step():
             return False
-        for ended in np.flatnonzero(dones):
+        for ended in np.flatnonzero(dones) if dones.any() else ():
             self._end_episode(int(ended), bool(terminated[ended]))
             if log_interval is not None and self._episode_num % log_interval == 0:
                 self.dump_logs()
@@ -379,6 +379,8 @@ def _refuse_normalized_observations(env: VecEnv) -> None:
 
 def _true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """Where each step led, before an environment reset itself, and whether that was a terminal state."""
+    if not dones.any():
+        return np.asarray(new_obs), dones
     next_obs = np.array(new_obs)
     terminated = np.array(dones, dtype=bool)
     for e in np.flatnonzero(dones):

@@ -78,6 +78,7 @@ class KernelModel:
         self.reach_low = np.zeros(grid.n_variables, dtype=np.int64)
         self.reach_high = np.zeros(grid.n_variables, dtype=np.int64)
         self._scratch = Scratch.for_grid(grid)
+        self._no_supply = Supply.none(MOST_PAIRS_AT_ONCE, grid.n_variables)
         self.list_room = list_room(min_fraction)
 
     @property
@@ -161,7 +162,7 @@ class KernelModel:
 
     def _supply_for(self, pairs: np.ndarray) -> Supply:
         if self.transfer is None:
-            return Supply.none(len(pairs), self.grid.n_variables)
+            return self._no_supply
         return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
 
     def restore(self, known: np.ndarray) -> None:
