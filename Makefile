@@ -29,9 +29,11 @@ figures: demo
 	mkdir -p docs/figures
 	cp demo_output/learning_curves.png docs/figures/
 
-test pytest: $(VENV)/.installed-all gl
+test: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal
+
+pytest: test
 
 bench: $(VENV)/.installed-all
 	$(BIN)/python -m sb3_combrel.experiments.bench

@@ -142,7 +142,6 @@ class FittedRMax(BaseAlgorithm):
         self.max_backups = max_backups
         self.max_instances = max_instances
         self.bounds = bounds
-        self._best_return = -np.inf
         self._warned_of_max_value = False
         if _init_setup_model:
             self._setup_model()
@@ -299,7 +298,6 @@ class FittedRMax(BaseAlgorithm):
         for reward in reversed(rewards):
             value = reward + self.gamma * value
             best = max(best, value)
-        self._best_return = max(self._best_return, best)
         if not self._warned_of_max_value and best > self.max_value + 1e-6 * max(1.0, abs(self.max_value)):
             self._warned_of_max_value = True
             warnings.warn(
