@@ -10,6 +10,8 @@ from numba.core import event
 # an array cost more than the loops themselves, and so does wrapping every array that comes in from Python.
 compiled = njit(cache=True, _nrt=False, error_model="numpy")  # type: ignore[call-overload]
 
+# The same for functions called in the innermost loops: handing over a handful of arrays costs more than such a function.
+inlined = njit(cache=True, _nrt=False, error_model="numpy", forceinline=True)  # type: ignore[call-overload]
 
 # The same for loops whose sums may be taken in any order, as vector registers do.
 compiled_fast = njit(  # type: ignore[call-overload]
@@ -18,6 +20,30 @@ compiled_fast = njit(  # type: ignore[call-overload]
 
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).
+
+
+class SameTypes:
+    """A compiled function for a caller that hands over arguments of the same types every time.
+
+    On each call numba looks at the types of all arguments, and tuples of arrays take it longer than our loops take.
+    Here only the first call does. What comes from outside must be brought to its type before.
+
+    :param function: made by :data:`compiled`
+    """
+
+    def __init__(self, function: Any):
+        self.function = function
+        self._entry: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._entry is None:
+            types = tuple(self.function.typeof_pyval(argument) for argument in arguments)
+            self.function.compile(types)
+            self._entry = self.function.overloads[types].entry_point
+        return self._entry(*arguments)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SameTypes, (self.function,)
 
 
 class _Announcer(event.Listener):

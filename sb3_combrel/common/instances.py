@@ -19,8 +19,11 @@ class InstanceArrays(NamedTuple):
     :param reward: float64, shape (n_actions, capacity)
     :param terminated: bool, same shape: the episode ended in a terminal state (not by a time limit)
     :param count: int64, shape (n_actions,)
-    :param block_low: float64, shape (n_actions, capacity / BLOCK, n_variables), lower corners of the blocks' boxes
+    :param block_low: float64, shape (n_actions, n_variables, capacity / BLOCK), lower corners of the blocks' boxes
     :param block_high: the same for the upper corners
+    :param gap: float64 scratch, shape (capacity / BLOCK,): how far a state is from the boxes
+    :param seen: int64 scratch, shape (n_actions, capacity): the last search that looked at each instance ahead of its turn
+    :param searches: int64 scratch, shape (1,): how many there were
     """
 
     state: np.ndarray
@@ -30,6 +33,9 @@ class InstanceArrays(NamedTuple):
     count: np.ndarray  # type: ignore[assignment]
     block_low: np.ndarray
     block_high: np.ndarray
+    gap: np.ndarray
+    seen: np.ndarray
+    searches: np.ndarray
 
     @classmethod
     def empty(cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK) -> "InstanceArrays":
@@ -41,8 +47,11 @@ class InstanceArrays(NamedTuple):
             reward=np.empty((n_actions, capacity)),
             terminated=np.zeros((n_actions, capacity), dtype=np.bool_),
             count=np.zeros(n_actions, dtype=np.int64),
-            block_low=np.full((n_actions, n_blocks, n_variables), np.inf),
-            block_high=np.full((n_actions, n_blocks, n_variables), -np.inf),
+            block_low=np.full((n_actions, n_variables, n_blocks), np.inf),
+            block_high=np.full((n_actions, n_variables, n_blocks), -np.inf),
+            gap=np.empty(n_blocks),
+            seen=np.zeros((n_actions, capacity), dtype=np.int64),
+            searches=np.zeros(1, dtype=np.int64),
         )
 
     @property
@@ -55,10 +64,7 @@ class InstanceArrays(NamedTuple):
         n_actions, capacity, n_variables = self.state.shape
         larger = InstanceArrays.empty(n_actions, n_variables, 2 * capacity)
         for old, new in zip(self, larger, strict=True):
-            if old.ndim > 1:
-                new[:, : old.shape[1]] = old
-            else:
-                new[:] = old
+            new[tuple(slice(n) for n in old.shape)] = old
         return larger
 
     def with_room(self, action: int) -> "InstanceArrays":
@@ -73,8 +79,8 @@ def put_instance(instances, action, slot, state, next_state, reward, terminated)
     for k in range(len(state)):
         instances.state[action, slot, k] = state[k]
         instances.effect[action, slot, k] = next_state[k] - state[k]
-        instances.block_low[action, block, k] = min(instances.block_low[action, block, k], state[k])
-        instances.block_high[action, block, k] = max(instances.block_high[action, block, k], state[k])
+        instances.block_low[action, k, block] = min(instances.block_low[action, k, block], state[k])
+        instances.block_high[action, k, block] = max(instances.block_high[action, k, block], state[k])
     instances.reward[action, slot] = reward
     instances.terminated[action, slot] = terminated
     if slot == instances.count[action]:

@@ -1,31 +1,36 @@
 """Compiled inner loops shared by model and transfer: arrays in, arrays out, all in unit coordinates."""
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inlined
 
 from sb3_combrel.common.instances import BLOCK
 
 
-@compiled
-def insert_by_weight(indices, weights, start, length, index, weight, min_fraction):
+@inlined
+def insert_by_weight(indices, weights, start, length, total, index, weight, min_fraction):
     """Put an instance into a list sorted by falling weight, then cut the list where ``min_fraction`` ends it.
 
     An instance is kept while its weight is at least ``min_fraction`` of the sum of the weights before it. That sum
-    only grows, so an instance cut once would be cut for ever: the list needs no memory of what it dropped.
+    only grows, so an instance cut once would be cut for ever: the list needs no memory of what it dropped. Of equal
+    weights that of the instance in the lower slot comes first.
 
+    :param total: sum of the weights so far
     :return: new length, sum of the kept weights
     """
     k = start + length
-    while k > start and weights[k - 1] < weight:
+    while k > start and (weights[k - 1] < weight or (weights[k - 1] == weight and indices[k - 1] > index)):
         weights[k] = weights[k - 1]
         indices[k] = indices[k - 1]
         k -= 1
     weights[k] = weight
     indices[k] = index
+    last = weights[start + length]
+    if length == 0 or last > min_fraction * (total + weight - last) * (1 + 1e-12):
+        return length + 1, total + weight
     return cut_by_fraction(weights, start, length + 1, min_fraction)
 
 
-@compiled
+@inlined
 def cut_by_fraction(weights, start, length, min_fraction):
     """How many of the sorted weights ``min_fraction`` keeps, and their sum."""
     total = 0.0
@@ -39,45 +44,88 @@ def cut_by_fraction(weights, start, length, min_fraction):
     return kept, total
 
 
+@inlined
+def squared_distance(state, other):
+    """Of two states."""
+    distance = 0.0
+    for k in range(len(state)):
+        along = state[k] - other[k]
+        distance += along * along
+    return distance
+
+
 @compiled
-def near_instances(instances, action, state, breadth, min_weight, min_fraction, indices, weights):
+def measure_gaps(state, low, high, n_blocks, gap):
+    """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers.
+
+    :param low: float64, shape (n_variables, at least n_blocks); ``high``: the same
+    """
+    gap[:n_blocks] = 0.0
+    for k in range(len(state)):
+        at = state[k]
+        low_k = low[k]
+        high_k = high[k]
+        for block in range(n_blocks):
+            below = low_k[block] - at
+            above = at - high_k[block]
+            outside = below if below > above else above
+            outside = outside if outside > 0.0 else 0.0
+            gap[block] += outside * outside
+
+
+@compiled
+def near_instances(instances, action, state, breadth, min_weight, min_fraction, indices, weights, n_before):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first.
+
+    What was near at the last query is likely to be near again. Looked at first, it gives at once a list that most
+    other instances are too far away to enter. The result does not depend on it.
 
     :param indices: int32 scratch that receives them, at least ``list_room(min_fraction)`` long
     :param weights: float64 scratch of the same length that receives their weights exp(-d^2 / breadth^2)
+    :param n_before: how many instances of the last query are in ``indices``
     :return: how many, sum of their weights
     """
     scale = -1.0 / (breadth * breadth)
-    n_variables = len(state)
     farthest = np.log(min_weight) / scale
     start = np.int64(0)
     length = np.int64(0)
     total = 0.0
     count = instances.count[action]
-    for block in range((count + BLOCK - 1) // BLOCK):
-        gap = 0.0
-        for k in range(n_variables):
-            low = instances.block_low[action, block, k] - state[k]
-            high = state[k] - instances.block_high[action, block, k]
-            outside = max(low, high, 0.0)
-            gap += outside * outside
-        if gap > farthest:
+    instances.searches[0] += 1
+    search = instances.searches[0]
+    for b in range(n_before):
+        i = indices[b]
+        if i < count:
+            instances.seen[action, i] = search
+            w = np.exp(squared_distance(state, instances.state[action, i]) * scale)
+            if w >= min_weight:
+                length, total = insert_by_weight(indices, weights, start, length, total, i, w, min_fraction)
+    if length > 0:
+        farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
+    n_blocks = (count + BLOCK - 1) // BLOCK
+    measure_gaps(state, instances.block_low[action], instances.block_high[action], n_blocks, instances.gap)
+    for block in range(n_blocks):
+        if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = 0.0
-            for k in range(n_variables):
-                along = state[k] - instances.state[action, i, k]
-                distance += along * along
-            if distance > farthest:
+            distance = squared_distance(state, instances.state[action, i])
+            if distance > farthest or instances.seen[action, i] == search:
                 continue
             w = np.exp(distance * scale)
             if w < min_weight:
                 continue
-            length, total = insert_by_weight(indices, weights, start, length, i, w, min_fraction)
-            least = min(weights[length - 1], min_fraction * total)
-            if least > min_weight:
-                farthest = np.log(least) / scale * (1 + 1e-12)
+            length, total = insert_by_weight(indices, weights, start, length, total, i, w, min_fraction)
+            farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
+    total = 0.0
+    for k in range(length):
+        total += weights[k]
     return length, total
+
+
+@inlined
+def farthest_to_enter(last, total, min_weight, min_fraction, scale):
+    """The squared distance beyond which no instance enters a list, ``last`` being its least weight."""
+    return np.log(max(min_weight, min(last, min_fraction * total))) / scale * (1 + 1e-12)
 
 
 def list_room(min_fraction: float) -> int:
@@ -85,7 +133,7 @@ def list_room(min_fraction: float) -> int:
     return int(np.floor(1.0 / min_fraction)) + 3
 
 
-@compiled
+@inlined
 def corners_of(position, shape, strides, corner_index, corner_weight):
     """Grid points around ``position`` and their multilinear weights.
 
@@ -113,7 +161,7 @@ def corners_of(position, shape, strides, corner_index, corner_weight):
     return n_corners
 
 
-@compiled
+@inlined
 def interpolate(values, position, shape, strides, corner_index, corner_weight):
     """The value at ``position`` (see :func:`corners_of`), multilinear between the grid points."""
     value = 0.0

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_combrel.common.compiled import compiled
+
 if TYPE_CHECKING:
     from gymnasium import spaces
 
@@ -166,3 +168,22 @@ def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64]
     low, high = np.broadcast_to(low, n_variables), np.broadcast_to(high, n_variables)
     _check_order(low, high, "bounds")
     return low, high
+
+
+@compiled
+def scale_into_box(states, low, ranges, units):
+    """:meth:`StateScaling.to_unit`, and what is outside the unit cube is moved to its boundary.
+
+    :param states: float64, raw units, shape (n, n_variables)
+    :param low: shape (n_variables,); ``ranges``: high - low
+    :param units: receives the unit coordinates, shape (n, n_variables)
+    :return: whether anything was outside, or no number
+    """
+    outside = False
+    for i in range(len(states)):
+        for k in range(len(low)):
+            unit = (states[i, k] - low[k]) / ranges[k]
+            units[i, k] = min(max(unit, 0.0), 1.0)
+            if units[i, k] != unit:
+                outside = True
+    return outside

@@ -125,21 +125,22 @@ def count_visit(corrections, key, episode):
 
 
 @compiled
-def visit(values, corrections, state, best_q, episode, grid, tolerance, scratch):
+def visit(values, corrections, state, best_q, visitor, grid, scratch):
     """Count a visit to ``state``; renew what is remembered of its cell, or start to remember it (see the module).
 
     :param best_q: the largest action value at ``state``
-    :param episode: a number that tells episodes (of all environments) apart
-    :param tolerance: excess of the interpolated value that is not yet a wrong promise
+    :param visitor: (episode, tolerance, patience): a number that tells episodes (of all environments) apart; the excess
+        of the interpolated value that is not yet a wrong promise; visits in an episode that do not count
     """
     for k in range(len(state)):
         scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
     key = cell_key(scratch.position, grid.shape)
     at = find_cell(corrections, key)
     m = corrections.table[at]
+    episode, tolerance, patience = visitor
     visits = count_visit(corrections, key, episode)
     if m < 0:
-        if visits <= PATIENCE:
+        if visits <= patience:
             return
         value = interpolate(values, scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
         if value - best_q <= tolerance:

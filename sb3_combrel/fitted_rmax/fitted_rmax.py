@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 import warnings
@@ -55,7 +56,7 @@ class FittedRMax(BaseAlgorithm):
     ones first, as in learning.
 
     Cost: a step's time grows with the instances near it and in a slow line with all instances (a look at one box for
-    every 8 of them); memory is about 150 bytes an instance, and per state-action pair of the grid, once known, some
+    every 8 of them); memory is about 400 bytes an instance, and per state-action pair of the grid, once known, some
     500 bytes. Both are bounded, by ``max_instances`` and by the grid.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", for habit's sake); may be left out: ``FittedRMax(env)``
@@ -106,7 +107,7 @@ class FittedRMax(BaseAlgorithm):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 100,
+        max_backups: int = 50,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,
@@ -260,10 +261,8 @@ class FittedRMax(BaseAlgorithm):
         next_obs, terminated = _true_outcomes(new_obs, dones, infos)
         next_states = self.policy.to_unit(next_obs)
         for e, choice in enumerate(choices):
-            self._backups += self.policy.learn_from(
-                states[e], choice, float(raw_rewards[e]), next_states[e], bool(terminated[e])
-            )
-            self._episode_rewards[e].append(float(raw_rewards[e]))
+            self._backups += self.policy.learn_from(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]))
+            self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
         self._last_states = self.policy.to_unit(np.asarray(new_obs)) if dones.any() else next_states
         self._last_episode_starts = dones
@@ -276,12 +275,13 @@ class FittedRMax(BaseAlgorithm):
                 self.dump_logs()
         return True
 
-    def _raw_rewards(self, rewards: np.ndarray) -> np.ndarray:
+    def _raw_rewards(self, rewards: np.ndarray) -> list[float]:
         """The environment's own rewards: a normalization that drifts would mix scales in one model."""
         raw = self._vec_normalize_env.get_original_reward() if self._vec_normalize_env is not None else rewards
-        if not np.isfinite(raw).all():
+        as_floats = raw.tolist()
+        if not all(map(math.isfinite, as_floats)):
             raise ValueError(f"the environment returned a reward that is not finite: {raw}")
-        return raw
+        return as_floats
 
     def _end_episode(self, env_index: int, terminated: bool) -> None:
         self._episode_num += 1

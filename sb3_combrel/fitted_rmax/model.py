@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.instances import InstanceArrays, put_instance
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.pool import Pool
@@ -10,10 +11,10 @@ from sb3_combrel.fitted_rmax.grid import StateGrid
 from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
-    enter_lists,
-    extend_reach,
+    enter,
     leave_lists,
     points_in_reach,
+    put_and_enter,
     settle,
 )
 from sb3_combrel.transfer.base import Transfer
@@ -59,8 +60,8 @@ class KernelModel:
         self.model_breadth = model_breadth
         self.min_weight = min_weight
         self.min_fraction = min_fraction
-        self.exploration_threshold = exploration_threshold
-        self.gamma = gamma
+        self.exploration_threshold = float(exploration_threshold)
+        self.gamma = float(gamma)
         self.transfer = transfer
         self.max_instances = max_instances
         self.instances = InstanceArrays.empty(n_actions, grid.n_variables)
@@ -73,11 +74,13 @@ class KernelModel:
             settled=np.zeros(n_pairs, dtype=np.bool_),
             reward=np.zeros(n_pairs),
             n_optimistic=np.full(grid.n_points, n_actions, dtype=np.int64),
-            members=np.zeros((n_actions, self.instances.capacity), dtype=np.int32),
+            reach=np.zeros((2, grid.n_variables), dtype=np.int64),
+            **self._of_instances(),
         )
-        self.reach_low = np.zeros(grid.n_variables, dtype=np.int64)
-        self.reach_high = np.zeros(grid.n_variables, dtype=np.int64)
-        self._scratch = Scratch.for_grid(grid)
+        self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
+        self.scratch = Scratch.for_grid(grid)
+        self._put_and_enter = SameTypes(put_and_enter)
+        self._progress = np.empty(2, dtype=np.int64)
         self._no_supply = Supply.none(MOST_PAIRS_AT_ONCE, grid.n_variables)
         self.list_room = list_room(min_fraction)
 
@@ -95,9 +98,19 @@ class KernelModel:
         :return: the pairs whose model changed, int64
         """
         slot, without = self._slot_for(action)
-        put_instance(self.instances, action, slot, state, next_state, reward, terminated)
-        self._extend_reach(next_state - state)
-        changed = self._enter(state, action, slot)
+        instance = (action, slot, state, next_state, reward, terminated)
+        self._progress[:] = -1, 0
+        entered = self._put_and_enter(
+            self.instances,
+            self.arrays,
+            self.grid.arrays,
+            self._kernel,
+            self.exploration_threshold,
+            *instance,
+            self.scratch,
+            self._progress,
+        )
+        changed = self._pairs_entered(action) if entered else self._enter(action, slot)
         return changed if len(without) == 0 else np.union1d(without, changed)
 
     def _slot_for(self, action: int) -> tuple[int, np.ndarray]:
@@ -107,42 +120,57 @@ class KernelModel:
             slot = int(self.arrays.members[action, :count].argmin())
             return slot, self._leave(action, slot)
         self.instances = self.instances.with_room(action)
-        if self.arrays.members.shape[1] < self.instances.capacity:
-            members = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int32)
-            members[:, : self.arrays.members.shape[1]] = self.arrays.members
-            self.arrays = self.arrays._replace(members=members)
+        room = self.arrays.members.shape[1]
+        if room < self.instances.capacity:
+            larger = self._of_instances()
+            for name, array in larger.items():
+                array[:, :room] = getattr(self.arrays, name)
+            self.arrays = self.arrays._replace(**larger)
         return count, np.empty(0, dtype=np.int64)
 
-    def _enter(self, state: np.ndarray, action: int, slot: int) -> np.ndarray:
-        n_points = self.grid.n_points
-        entry = self.arrays.entry[action * n_points : (action + 1) * n_points]
-        found = points_in_reach(state, self.model_breadth, self.min_weight, self.grid.arrays, entry, self._scratch)
-        done = 0
-        while True:
-            done = enter_lists(
-                self.arrays, action, slot, found, done, self.min_fraction, self.exploration_threshold, self._scratch
-            )
-            if done == found:
-                return self._scratch.point[:found] + action * n_points
+    def _of_instances(self) -> dict[str, np.ndarray]:
+        """Those of the model's arrays that have a place for each instance, empty."""
+        d, places = self.grid.n_variables, (self.n_actions, self.instances.capacity)
+        return dict(
+            members=np.zeros(places, dtype=np.int32),
+            corner_low=np.zeros((*places, d), dtype=np.int32),
+            corner_offset=np.zeros((*places, 2**d), dtype=np.int32),
+            corner_weight=np.zeros((*places, 2**d)),
+        )
+
+    def _enter(self, action: int, slot: int) -> np.ndarray:
+        """Put an instance into the lists it reaches, going on from ``_progress``; the pairs whose list has it."""
+        while not enter(
+            self.instances,
+            self.arrays,
+            self.grid.arrays,
+            self._kernel,
+            self.exploration_threshold,
+            action,
+            slot,
+            self.scratch,
+            self._progress,
+        ):
             self.arrays = self.arrays._replace(lists=self.arrays.lists.grown())
+        return self._pairs_entered(action)
+
+    def _pairs_entered(self, action: int) -> np.ndarray:
+        return self.scratch.point[: self._progress[0]] + action * self.grid.n_points
 
     def _leave(self, action: int, slot: int) -> np.ndarray:
         if self.arrays.members[action, slot] == 0:
             return np.empty(0, dtype=np.int64)
         state = self.instances.state[action, slot]
         anywhere = np.zeros(self.grid.n_points)
-        found = points_in_reach(state, self.model_breadth, self.min_weight, self.grid.arrays, anywhere, self._scratch)
-        changed = leave_lists(self.arrays, action, slot, found, self.min_fraction, self._scratch)
-        return self._scratch.point[:changed] + action * self.grid.n_points
-
-    def _extend_reach(self, effect: np.ndarray) -> None:
-        extend_reach(effect, self.grid.arrays.cells, self.reach_low, self.reach_high)
+        found = points_in_reach(state, self.model_breadth, self.min_weight, self.grid.arrays, anywhere, self.scratch)
+        changed = leave_lists(self.arrays, action, slot, found, self.min_fraction, self.scratch)
+        return self.scratch.point[:changed] + action * self.grid.n_points
 
     def settle(self, pairs: np.ndarray) -> None:
         """Bring the rows of ``pairs`` up to date: with their lists, and with what transfer has for them."""
         for first in range(0, len(pairs), MOST_PAIRS_AT_ONCE):
             some = pairs[first : first + MOST_PAIRS_AT_ONCE]
-            supply = self._supply_for(some)
+            supply = self.supply_for(some)
             done = 0
             while done < len(some):
                 done = settle(
@@ -153,14 +181,13 @@ class KernelModel:
                     some,
                     done,
                     supply,
-                    self.reach_low,
-                    self.reach_high,
-                    self._scratch,
+                    self.scratch,
                 )
                 if done < len(some):
                     self.arrays = self.arrays._replace(rows=self.arrays.rows.grown())
 
-    def _supply_for(self, pairs: np.ndarray) -> Supply:
+    def supply_for(self, pairs: np.ndarray) -> Supply:
+        """Transferred instances for ``pairs``, at most ``MOST_PAIRS_AT_ONCE``."""
         if self.transfer is None:
             return self._no_supply
         return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
@@ -170,14 +197,10 @@ class KernelModel:
 
         :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
         """
-        arrays = self.arrays
-        self.arrays = arrays._replace(members=np.zeros((self.n_actions, self.instances.capacity), dtype=np.int32))
+        self.arrays = self.arrays._replace(**self._of_instances())
         for action in range(self.n_actions):
             for slot in range(self.instances.count[action]):
-                self._enter(self.instances.state[action, slot], action, slot)
-            if self.instances.count[action]:
-                effects = self.instances.effect[action, : self.instances.count[action]]
-                self._extend_reach(effects.min(axis=0))
-                self._extend_reach(effects.max(axis=0))
+                self._progress[:] = -1, 0
+                self._enter(action, slot)
         self.arrays.known[:] |= known & (self.arrays.lists.length > 0)
         self.settle(np.arange(len(known)))

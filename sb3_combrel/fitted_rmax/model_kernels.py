@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inlined
 
+from sb3_combrel.common.instances import put_instance
 from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
 from sb3_combrel.common.pool import Pool, reserve
 
@@ -21,6 +22,11 @@ class ModelArrays(NamedTuple):
     :param reward: float64, shape (n_pairs,): reward of the pair until its state is left
     :param n_optimistic: int64, shape (n_points,): actions of a grid point without a row
     :param members: int32, shape (n_actions, capacity): in how many lists each instance stands
+    :param reach: int64, shape (2, n_variables): farthest that any effect leads down and up each variable, in cells
+    :param corner_low: int32, shape (n_actions, capacity, n_variables): the effect of each instance in cells, rounded down
+    :param corner_offset: int32, shape (n_actions, capacity, 2 ** n_variables): where, counted from a grid point that it
+        is applied to, the grid points around the place lie that the effect leads to; ``corner_weight``: float64, same
+        shape, their multilinear weights
     """
 
     lists: Pool
@@ -32,6 +38,10 @@ class ModelArrays(NamedTuple):
     reward: np.ndarray
     n_optimistic: np.ndarray
     members: np.ndarray
+    reach: np.ndarray
+    corner_low: np.ndarray
+    corner_offset: np.ndarray
+    corner_weight: np.ndarray
 
 
 class Scratch(NamedTuple):
@@ -125,31 +135,42 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
             return found
 
 
-@compiled
-def extend_reach(effect, cells, reach_low, reach_high):
+@inlined
+def extend_reach(effect, cells, reach):
     """How far one effect can lead along each variable, in cells: what the planner must look back over."""
     for k in range(len(effect)):
         moved = int(np.floor(effect[k] * cells[k]))
-        reach_low[k] = min(reach_low[k], moved)
-        reach_high[k] = max(reach_high[k], moved + 1)
+        reach[0, k] = min(reach[0, k], moved)
+        reach[1, k] = max(reach[1, k], moved + 1)
 
 
 @compiled
-def enter_lists(arrays, action, slot, n_found, done, min_fraction, threshold, scratch):
-    """Put an instance into the lists of the pairs found by :func:`points_in_reach`.
+def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, progress):
+    """Put an instance into the lists of all pairs that it reaches.
 
-    :param done: how many of them are done already
-    :return: how many are done now; fewer than ``n_found`` if the lists' pool must grow first
+    :param kernel: (breadth, min_weight, min_fraction)
+    :param progress: int64, shape (2,): pairs in reach, and how many of them are done; {-1, 0} at first
+    :return: False if the lists' pool must grow before another call goes on
     """
-    first_pair = action * len(arrays.n_optimistic)
+    breadth, min_weight, min_fraction = kernel
+    n_points = len(arrays.n_optimistic)
+    first_pair = action * n_points
+    if progress[0] < 0:
+        extend_reach(instances.effect[action, slot], grid.cells, arrays.reach)
+        note_corners(arrays, instances.effect[action, slot], grid, action, slot)
+        entry = arrays.entry[first_pair : first_pair + n_points]
+        progress[0] = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, entry, scratch)
     lists = arrays.lists
-    while done < n_found:
-        pair = first_pair + scratch.point[done]
+    while progress[1] < progress[0]:
+        pair = first_pair + scratch.point[progress[1]]
         length = lists.length[pair]
         if not reserve(lists, pair, length + 1):
-            return done
+            return False
         start = lists.start[pair]
-        kept, total = insert_by_weight(lists.index, lists.weight, start, length, slot, scratch.weight[done], min_fraction)
+        weight = scratch.weight[progress[1]]
+        kept, total = insert_by_weight(
+            lists.index, lists.weight, start, length, arrays.total[pair], slot, weight, min_fraction
+        )
         arrays.members[action, slot] += 1
         for k in range(start + kept, start + length + 1):
             arrays.members[action, lists.index[k]] -= 1
@@ -158,8 +179,17 @@ def enter_lists(arrays, action, slot, n_found, done, min_fraction, threshold, sc
         arrays.entry[pair] = min(lists.weight[start + kept - 1], min_fraction * total)
         if total >= threshold:
             arrays.known[pair] = True
-        done += 1
-    return done
+        progress[1] += 1
+    return True
+
+
+@compiled
+def put_and_enter(
+    instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress
+):
+    """Write an instance to its slot, and :func:`enter` it into lists; returns as that does."""
+    put_instance(instances, action, slot, state, next_state, reward, terminated)
+    return enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, progress)
 
 
 @compiled
@@ -198,6 +228,45 @@ def leave_lists(arrays, action, slot, n_found, min_fraction, scratch):
     return changed
 
 
+@inlined
+def note_corners(arrays, effect, grid, action, slot):
+    """Work out ``corner_low``, ``corner_offset`` and ``corner_weight`` of an instance: the same for all grid points."""
+    low = arrays.corner_low[action, slot]
+    offset = arrays.corner_offset[action, slot]
+    weight = arrays.corner_weight[action, slot]
+    offset[0] = 0
+    weight[0] = 1.0
+    n_corners = 1
+    for k in range(len(effect)):
+        moved = effect[k] * grid.cells[k]
+        low[k] = int(np.floor(moved))
+        part = moved - low[k]
+        for c in range(n_corners):
+            offset[c] += low[k] * grid.strides[k]
+            offset[n_corners + c] = offset[c] + grid.strides[k]
+            weight[n_corners + c] = weight[c] * part
+            weight[c] *= 1.0 - part
+        n_corners *= 2
+
+
+@inlined
+def scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_touched):
+    """Spread probability ``p`` of the effect of an instance from a grid point, at ``scratch.at``, over grid points."""
+    for k in range(len(grid.shape)):
+        low = scratch.at[k] + arrays.corner_low[action, i, k]
+        if low < 0 or low + 1 >= grid.shape[k]:
+            return scatter(p, instances.effect[action, i], scratch, grid, n_touched)
+    for c in range(arrays.corner_offset.shape[2]):
+        weight = arrays.corner_weight[action, i, c]
+        if weight > 0.0:
+            to = point + arrays.corner_offset[action, i, c]
+            if scratch.dense[to] == 0.0:
+                scratch.touched[n_touched] = to
+                n_touched += 1
+            scratch.dense[to] += p * weight
+    return n_touched
+
+
 @compiled
 def scatter(p, effect, scratch, grid, n_touched):
     """Spread probability ``p`` of moving by ``effect`` from the grid coordinate ``scratch.at`` over grid points."""
@@ -213,7 +282,7 @@ def scatter(p, effect, scratch, grid, n_touched):
     return n_touched
 
 
-@compiled
+@inlined
 def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
 
@@ -245,7 +314,7 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
         p = arrays.lists.weight[k] / total
         reward += p * instances.reward[action, i]
         if not instances.terminated[action, i]:
-            n_touched = scatter(p, instances.effect[action, i], scratch, grid, n_touched)
+            n_touched = scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_touched)
     for j in range(n_supplied):
         p = supply.weight[s, j] / total
         reward += p * supply.reward[s, j]
@@ -276,10 +345,8 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
 
 
 @compiled
-def settle(arrays, instances, grid, gamma, pairs, done, supply, reach_low, reach_high, scratch):
+def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
-
-    :param reach_low: extended by the effects supplied (see ``extend_reach``); ``reach_high``: the same
 
     :return: how many of them are done; fewer than all if the rows' pool must grow first
     """
@@ -290,7 +357,7 @@ def settle(arrays, instances, grid, gamma, pairs, done, supply, reach_low, reach
         if has_row and not build_row(arrays, instances, grid, gamma, pair, supply, done, scratch):
             return done
         for j in range(supply.count[done]):
-            extend_reach(supply.effect[done, j], grid.cells, reach_low, reach_high)
+            extend_reach(supply.effect[done, j], grid.cells, arrays.reach)
         if has_row != arrays.settled[pair]:
             arrays.settled[pair] = has_row
             arrays.n_optimistic[pair % n_points] += -1 if has_row else 1

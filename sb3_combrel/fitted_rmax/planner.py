@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import SameTypes, compiled, inlined
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
-from sb3_combrel.fitted_rmax.model import KernelModel
+from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel
+from sb3_combrel.fitted_rmax.model_kernels import settle
 
 N_LEVELS = 24
 EXPLOITATION_SWEEPS = 300
@@ -42,7 +43,7 @@ class SweepQueue(NamedTuple):
         )
 
 
-@compiled
+@inlined
 def push(queue, point, level):
     """Let ``point`` wait for a backup; points of higher levels come first."""
     queue.level[point] = level
@@ -54,7 +55,7 @@ def push(queue, point, level):
         queue.queued[level, point] = True
 
 
-@compiled
+@inlined
 def pop(queue):
     """The point to back up next, -1 if none waits."""
     n_points = queue.ring.shape[1]
@@ -89,8 +90,8 @@ def backed_up_value(values, arrays, point, max_value, min_value):
     return min(best, max_value)
 
 
-@compiled
-def announce(values, n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at):
+@inlined
+def announce(values, n_optimistic, queue, point, reach, grid, tolerance, at):
     """Have every grid point that may lead to ``point`` wait for a backup, the sooner the larger the change."""
     change = abs(values[point] - queue.announced[point])
     if change <= tolerance:
@@ -104,8 +105,8 @@ def announce(values, n_optimistic, queue, point, reach_low, reach_high, grid, to
     for k in range(d):
         c = rest // grid.strides[k]
         rest -= c * grid.strides[k]
-        at[0, k] = max(0, c - reach_high[k])
-        at[1, k] = min(grid.shape[k] - 1, c - reach_low[k])
+        at[0, k] = max(0, c - reach[1, k])
+        at[1, k] = min(grid.shape[k] - 1, c - reach[0, k])
         at[2, k] = at[0, k]
         if k < inner:
             base += at[0, k] * grid.strides[k]
@@ -127,12 +128,10 @@ def announce(values, n_optimistic, queue, point, reach_low, reach_high, grid, to
 
 
 @compiled
-def sweep(values, arrays, queue, changed, reach_low, reach_high, grid, bounds, tolerance, max_backups, at):
+def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, at):
     """Back up the points of ``changed``, then those that wait, largest change first.
 
     :param values: float64, shape (n_points,), updated in place
-    :param reach_low: int64, shape (n_variables,): farthest that one effect leads down each variable, in cells (<= 0);
-        ``reach_high``: the same upwards
     :param bounds: (min_value, max_value)
     :param max_backups: of those that wait; the rest waits for the next call
     :param at: int64 scratch, shape (3, n_variables)
@@ -141,7 +140,7 @@ def sweep(values, arrays, queue, changed, reach_low, reach_high, grid, bounds, t
     for c in range(len(changed)):
         point = changed[c]
         values[point] = backed_up_value(values, arrays, point, bounds[1], bounds[0])
-        announce(values, arrays.n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at)
+        announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
     backups = 0
     while backups < max_backups:
         point = pop(queue)
@@ -151,8 +150,24 @@ def sweep(values, arrays, queue, changed, reach_low, reach_high, grid, bounds, t
             continue
         values[point] = backed_up_value(values, arrays, point, bounds[1], bounds[0])
         backups += 1
-        announce(values, arrays.n_optimistic, queue, point, reach_low, reach_high, grid, tolerance, at)
+        announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
     return backups + len(changed)
+
+
+@compiled
+def settle_and_sweep(
+    values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch, points, at
+):
+    """``settle`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
+
+    :param pairs: as many as ``points`` has room for at most
+    :return: backups done; -1, and nothing swept, if the rows' pool must grow first
+    """
+    if settle(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
+        return -1
+    for p in range(len(pairs)):
+        points[p] = pairs[p] % len(values)
+    return sweep(values, arrays, queue, points[: len(pairs)], grid, bounds, tolerance, max_backups, at)
 
 
 class Planner:
@@ -166,10 +181,13 @@ class Planner:
 
     def __init__(self, model: KernelModel, *, max_value: float, min_value: float, tolerance: float):
         self.model = model
-        self.tolerance = tolerance
+        self.tolerance = float(tolerance)
         self.bounds = (float(min_value), float(max_value))
         self.values = np.full(model.grid.n_points, float(max_value))
         self.queue = SweepQueue.empty(self.values)
+        self._settle_and_sweep = SameTypes(settle_and_sweep)
+        self._sweep = SameTypes(sweep)
+        self._points = np.empty(MOST_PAIRS_AT_ONCE, dtype=np.int64)
         self._at = np.empty((3, model.grid.n_variables), dtype=np.int64)
         self._exploitation: np.ndarray | None = None
 
@@ -180,20 +198,39 @@ class Planner:
         :param max_backups: of the points that wait; the others wait for the next call
         :return: backups done
         """
-        self.model.settle(pairs)
-        return self.sweep(pairs % self.model.grid.n_points, max_backups)
+        model = self.model
+        if len(pairs) <= MOST_PAIRS_AT_ONCE:
+            self._exploitation = None
+            backups = self._settle_and_sweep(
+                self.values,
+                model.arrays,
+                model.instances,
+                self.queue,
+                pairs,
+                model.supply_for(pairs),
+                model.grid.arrays,
+                model.gamma,
+                self.bounds,
+                self.tolerance,
+                max_backups,
+                model.scratch,
+                self._points,
+                self._at,
+            )
+            if backups >= 0:
+                return backups
+        model.settle(pairs)
+        return self.sweep(pairs % model.grid.n_points, max_backups)
 
     def sweep(self, points: np.ndarray, max_backups: int) -> int:
         """Back up ``points``, then up to ``max_backups`` of those that wait; how many it did."""
-        model = self.model
         self._exploitation = None
-        return sweep(
+        model = self.model
+        return self._sweep(
             self.values,
             model.arrays,
             self.queue,
             points,
-            model.reach_low,
-            model.reach_high,
             model.grid.arrays,
             self.bounds,
             self.tolerance,

@@ -12,14 +12,15 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.instances import InstanceArrays, put_instance
-from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.scaling import StateScaling, scale_into_box
 from sb3_combrel.common.supply import Supply
-from sb3_combrel.fitted_rmax.corrections import CorrectionArrays, find_cell, visit
+from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays, find_cell
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import Planner
-from sb3_combrel.fitted_rmax.q_values import QueryScratch, look_around, q_values
+from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around, q_values
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
@@ -61,7 +62,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 100,
+        max_backups: int = 50,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | None = None,
@@ -77,6 +78,10 @@ class FittedRMaxPolicy(BasePolicy):
         self.transfer = transfer
         self.rng = np.random.default_rng() if rng is None else rng
         self.scaling = StateScaling.from_space(observation_space, bounds)
+        self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
+        self._scale_into_box = SameTypes(scale_into_box)
+        self._look_around, self._choose, self._look_and_choose = map(SameTypes, (look_around, choose, look_and_choose))
+        self._flat = (-1, self.scaling.n_variables)
         self.n_actions = int(action_space.n)
         self._first_action = int(action_space.start)
         self._constructor_parameters = dict(
@@ -146,10 +151,10 @@ class FittedRMaxPolicy(BasePolicy):
         :param observations: raw units, shape (..., n_variables)
         :raises ValueError: if an observation is not finite
         """
-        unit = self.scaling.to_unit(observations)
-        inside = np.minimum(np.maximum(unit, 0.0), 1.0)
-        if not (inside == unit).all():
-            self._check_outside(observations, unit - inside)
+        raw = np.asarray(observations, dtype=np.float64)
+        inside = np.empty_like(raw)
+        if self._scale_into_box(raw.reshape(self._flat), self._low, self._range, inside.reshape(self._flat)):
+            self._check_outside(observations, self.scaling.to_unit(raw) - inside)
         return inside
 
     def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:
@@ -172,8 +177,7 @@ class FittedRMaxPolicy(BasePolicy):
         :param values: at the grid points; by default the planner's, optimistic ones
         :return: shape (n_actions,)
         """
-        breadth, min_weight, min_fraction = self.kernel
-        look_around(self.model.instances, state, breadth, min_weight, min_fraction, self._query)
+        look_around(self.model.instances, state, self.kernel, self._query)
         supply = self._no_supply if self.transfer is None else self.transfer.supply_at(state, self._query.total)
         q_values(
             self.model.instances,
@@ -198,22 +202,29 @@ class FittedRMaxPolicy(BasePolicy):
         :param episode: a number that tells the episodes of all environments apart
         :return: action, from 0 on
         """
-        q = self.q_values(state)
-        best = q.max()
         if self.corrections.count[0] == len(self.corrections.key):
             self.corrections = self.corrections.with_room()
-        visit(
+        rest = (
+            self.exploration_threshold,
+            self.gamma,
             self.planner.values,
             self.corrections,
-            state,
-            best,
-            episode,
             self.model.grid.arrays,
-            5 * self.planner.tolerance,
-            self._query,
+            self.planner.bounds,
         )
-        ties = np.flatnonzero(q == best)
-        return int(ties[0] if len(ties) == 1 else ties[self.rng.integers(len(ties))])
+        visitor = (episode, 5 * self.planner.tolerance, PATIENCE)
+        if self.transfer is None:
+            best = self._look_and_choose(
+                self.model.instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor
+            )
+        else:
+            self._look_around(self.model.instances, state, self.kernel, self._query)
+            supply = self.transfer.supply_at(state, self._query.total)
+            best = self._choose(self.model.instances, state, *rest, supply, self._query, self._q, visitor)
+        if best >= 0:
+            return best
+        ties = np.flatnonzero(self._q == self._q.max())
+        return int(ties[self.rng.integers(len(ties))])
 
     def exploit(self, state: np.ndarray) -> int:
         """

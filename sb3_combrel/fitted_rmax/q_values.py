@@ -6,7 +6,7 @@ import numpy as np
 from sb3_combrel.common.compiled import compiled
 
 from sb3_combrel.common.kernels import near_instances
-from sb3_combrel.fitted_rmax.corrections import corrected_value
+from sb3_combrel.fitted_rmax.corrections import corrected_value, visit
 
 
 class QueryScratch(NamedTuple):
@@ -44,11 +44,23 @@ class QueryScratch(NamedTuple):
 
 
 @compiled
-def look_around(instances, state, breadth, min_weight, min_fraction, query):
-    """Fill ``query`` with the instances that the kernel keeps at ``state``, for every action."""
+def look_around(instances, state, kernel, query):
+    """Fill ``query`` with the instances that the kernel keeps at ``state``, for every action.
+
+    :param kernel: (breadth, min_weight, min_fraction)
+    """
+    breadth, min_weight, min_fraction = kernel
     for action in range(len(query.length)):
         query.length[action], query.total[action] = near_instances(
-            instances, action, state, breadth, min_weight, min_fraction, query.index[action], query.weight[action]
+            instances,
+            action,
+            state,
+            breadth,
+            min_weight,
+            min_fraction,
+            query.index[action],
+            query.weight[action],
+            query.length[action],
         )
 
 
@@ -114,3 +126,30 @@ def q_values(instances, state, threshold, gamma, values, corrections, grid, boun
         else:
             value = np.inf * reward
         q[action] = min(max(value, bounds[0]), bounds[1])
+
+
+@compiled
+def look_and_choose(instances, state, kernel, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
+    """:func:`look_around` and :func:`choose` in one call: handing over arrays takes as long as the work."""
+    look_around(instances, state, kernel, query)
+    return choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)
+
+
+@compiled
+def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
+    """Action values at a visited state, from the lists in ``query``.
+
+    :param visitor: see ``corrections.visit``
+    :return: the best action, -1 if several are
+    """
+    q_values(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q)
+    best = 0
+    ties = 0
+    for action in range(1, len(q)):
+        if q[action] > q[best]:
+            best = action
+            ties = 0
+        elif q[action] == q[best]:
+            ties += 1
+    visit(values, corrections, state, q[best], visitor, grid, query)
+    return -1 if ties > 0 else best

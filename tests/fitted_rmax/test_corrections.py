@@ -71,7 +71,7 @@ def lengths_of_episodes(seed, n_episodes, step=0.05):
 @pytest.mark.parametrize("seed", range(3))
 def test_without_corrections_every_episode_runs_into_its_limit(seed, monkeypatch):
     """The trap is real; otherwise the next test would say nothing."""
-    monkeypatch.setattr(policies, "visit", lambda *_: None)
+    monkeypatch.setattr(policies, "PATIENCE", 10**9)
     assert (lengths_of_episodes(seed, 40)[-30:] == STEP_LIMIT).all()
 
 
@@ -103,7 +103,8 @@ def scratch():
 def visit_often(values, memory, state, best_q, episode=0, times=1, tolerance=0.05):
     for _ in range(times):
         memory = memory.with_room()
-        c.visit(values, memory, np.asarray(state, dtype=float), best_q, episode, GRID.arrays, tolerance, scratch())
+        visitor = (episode, tolerance, c.PATIENCE)
+        c.visit(values, memory, np.asarray(state, dtype=float), best_q, visitor, GRID.arrays, scratch())
     return memory
 
 

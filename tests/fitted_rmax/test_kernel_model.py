@@ -237,7 +237,7 @@ class ListsByHand:
             self.instances[slot] = instance
         for point in range(self.naive.n_points):
             candidates = [*self.lists[point], slot]
-            ordered = sorted(candidates, key=lambda s, point=point: -self.weight(point, s))
+            ordered = sorted(candidates, key=lambda s, point=point: (-self.weight(point, s), s))
             kept = kept_instances(self.naive.grid.unit(point), [self.instances[s] for s in ordered], *self.naive.kernel)
             self.lists[point] = [ordered[number] for number, _ in kept]
             self.known[point] |= sum(w for _, w in kept) >= self.naive.threshold
