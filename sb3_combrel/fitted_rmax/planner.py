@@ -20,6 +20,7 @@ class SweepQueue(NamedTuple):
     :param level: int8, shape (n_points,): where a point waits, -1 if nowhere
     :param queued: bool, shape (N_LEVELS, n_points): the point stands in that ring, waiting or passed over
     :param announced: float64, shape (n_points,): the value that the point's predecessors were last told
+    :param greedy: int16, shape (n_points,): the action that gave the point its value, -1 if none did
     """
 
     ring: np.ndarray
@@ -28,6 +29,7 @@ class SweepQueue(NamedTuple):
     level: np.ndarray
     queued: np.ndarray
     announced: np.ndarray
+    greedy: np.ndarray
 
     @classmethod
     def empty(cls, values: np.ndarray) -> "SweepQueue":
@@ -40,6 +42,7 @@ class SweepQueue(NamedTuple):
             level=np.full(n_points, -1, dtype=np.int8),
             queued=np.zeros((N_LEVELS, n_points), dtype=np.bool_),
             announced=values.copy(),
+            greedy=np.full(n_points, -1, dtype=np.int16),
         )
 
 
@@ -74,20 +77,49 @@ def pop(queue):
     return -1
 
 
+@inlined
+def value_of_pair(values, arrays, pair):
+    """Q of a pair that is settled."""
+    q = arrays.reward[pair]
+    start = arrays.rows.start[pair]
+    for k in range(start, start + arrays.rows.length[pair]):
+        q += arrays.rows.weight[k] * values[arrays.rows.index[k]]
+    return q
+
+
 @compiled
-def backed_up_value(values, arrays, point, max_value, min_value):
-    """max over a of Q(point, a), Fitted R-Max's backup; ``max_value`` while an action is optimistic."""
-    if arrays.n_optimistic[point] > 0:
-        return max_value
+def back_up(values, arrays, queue, point, bounds):
+    """V(point) = max over a of Q(point, a), Fitted R-Max's backup; ``max_value`` while an action is optimistic."""
     n_points = len(values)
-    best = min_value
-    for pair in range(point, len(arrays.reward), n_points):
-        q = arrays.reward[pair]
-        start = arrays.rows.start[pair]
-        for k in range(start, start + arrays.rows.length[pair]):
-            q += arrays.rows.weight[k] * values[arrays.rows.index[k]]
-        best = max(best, q)
-    return min(best, max_value)
+    queue.greedy[point] = -1
+    if arrays.n_optimistic[point] > 0:
+        values[point] = bounds[1]
+        return
+    best = bounds[0]
+    for action in range(len(arrays.reward) // n_points):
+        q = value_of_pair(values, arrays, point + action * n_points)
+        if q > best:
+            best = q
+            queue.greedy[point] = action
+    values[point] = min(best, bounds[1])
+
+
+@inlined
+def take_over(values, arrays, queue, pair, bounds):
+    """Bring V of the pair's point up to date when nothing but the pair's row has changed."""
+    n_points = len(values)
+    action = pair // n_points
+    point = pair - action * n_points
+    greedy = queue.greedy[point]
+    if greedy < 0 or arrays.n_optimistic[point] > 0:
+        back_up(values, arrays, queue, point, bounds)
+        return
+    q = value_of_pair(values, arrays, pair)
+    if q >= values[point]:
+        values[point] = min(q, bounds[1])
+        queue.greedy[point] = action
+    elif greedy == action:
+        back_up(values, arrays, queue, point, bounds)
 
 
 @inlined
@@ -129,7 +161,7 @@ def announce(values, n_optimistic, queue, point, reach, grid, tolerance, at):
 
 @compiled
 def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, at):
-    """Back up the points of ``changed``, then those that wait, largest change first.
+    """Take over the pairs ``changed``, then back up the points that wait, largest change first.
 
     :param values: float64, shape (n_points,), updated in place
     :param bounds: (min_value, max_value)
@@ -138,8 +170,8 @@ def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, 
     :return: backups done
     """
     for c in range(len(changed)):
-        point = changed[c]
-        values[point] = backed_up_value(values, arrays, point, bounds[1], bounds[0])
+        take_over(values, arrays, queue, changed[c], bounds)
+        point = changed[c] % len(values)
         announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
     backups = 0
     while backups < max_backups:
@@ -148,7 +180,7 @@ def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, 
             break
         if arrays.n_optimistic[point] > 0 and values[point] == bounds[1]:
             continue
-        values[point] = backed_up_value(values, arrays, point, bounds[1], bounds[0])
+        back_up(values, arrays, queue, point, bounds)
         backups += 1
         announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
     return backups + len(changed)
@@ -156,18 +188,16 @@ def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, 
 
 @compiled
 def settle_and_sweep(
-    values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch, points, at
+    values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch, at
 ):
     """``settle`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
 
-    :param pairs: as many as ``points`` has room for at most
+    :param pairs: at most MOST_PAIRS_AT_ONCE
     :return: backups done; -1, and nothing swept, if the rows' pool must grow first
     """
     if settle(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
         return -1
-    for p in range(len(pairs)):
-        points[p] = pairs[p] % len(values)
-    return sweep(values, arrays, queue, points[: len(pairs)], grid, bounds, tolerance, max_backups, at)
+    return sweep(values, arrays, queue, pairs, grid, bounds, tolerance, max_backups, at)
 
 
 class Planner:
@@ -187,7 +217,6 @@ class Planner:
         self.queue = SweepQueue.empty(self.values)
         self._settle_and_sweep = SameTypes(settle_and_sweep)
         self._sweep = SameTypes(sweep)
-        self._points = np.empty(MOST_PAIRS_AT_ONCE, dtype=np.int64)
         self._at = np.empty((3, model.grid.n_variables), dtype=np.int64)
         self._exploitation: np.ndarray | None = None
 
@@ -214,23 +243,22 @@ class Planner:
                 self.tolerance,
                 max_backups,
                 model.scratch,
-                self._points,
                 self._at,
             )
             if backups >= 0:
                 return backups
         model.settle(pairs)
-        return self.sweep(pairs % model.grid.n_points, max_backups)
+        return self.sweep(pairs, max_backups)
 
-    def sweep(self, points: np.ndarray, max_backups: int) -> int:
-        """Back up ``points``, then up to ``max_backups`` of those that wait; how many it did."""
+    def sweep(self, pairs: np.ndarray, max_backups: int) -> int:
+        """Take over settled ``pairs``, then back up ``max_backups`` points of those that wait; backups done."""
         self._exploitation = None
         model = self.model
         return self._sweep(
             self.values,
             model.arrays,
             self.queue,
-            points,
+            pairs,
             model.grid.arrays,
             self.bounds,
             self.tolerance,
