@@ -16,10 +16,14 @@ from sb3_combrel.fitted_rmax.model_kernels import (
     points_in_reach,
     put_and_enter,
     settle,
+    worth_settling,
 )
 from sb3_combrel.transfer.base import Transfer
 
 MOST_PAIRS_AT_ONCE = 4096
+# Part of the threshold by which own weight must have grown before a pair that draws on transferred instances is settled
+# anew within an episode.
+NEWS = 0.1
 
 
 class KernelModel:
@@ -73,12 +77,14 @@ class KernelModel:
             known=np.zeros(n_pairs, dtype=np.bool_),
             settled=np.zeros(n_pairs, dtype=np.bool_),
             reward=np.zeros(n_pairs),
+            heard=np.zeros(n_pairs),
             n_optimistic=np.full(grid.n_points, n_actions, dtype=np.int64),
             reach=np.zeros((2, grid.n_variables), dtype=np.int64),
             **self._of_instances(),
         )
         self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
         self.scratch = Scratch.for_grid(grid)
+        self._worth_settling = SameTypes(worth_settling)
         self._put_and_enter = SameTypes(put_and_enter)
         self._progress = np.empty(2, dtype=np.int64)
         self._no_supply = Supply.none(MOST_PAIRS_AT_ONCE, grid.n_variables)
@@ -165,6 +171,15 @@ class KernelModel:
         found = points_in_reach(state, self.model_breadth, self.min_weight, self.grid.arrays, anywhere, self.scratch)
         changed = leave_lists(self.arrays, action, slot, found, self.min_fraction, self.scratch)
         return self.scratch.point[:changed] + action * self.grid.n_points
+
+    def worth_settling(self, pairs: np.ndarray) -> np.ndarray:
+        """Those of ``pairs`` (which is overwritten) that have news; the others wait for :meth:`waiting`."""
+        return pairs[: self._worth_settling(self.arrays, pairs, NEWS * self.exploration_threshold)]
+
+    def waiting(self) -> np.ndarray:
+        """The pairs that are not known and whose own weight has changed since they were settled."""
+        arrays = self.arrays
+        return np.flatnonzero(~arrays.known & (arrays.total != arrays.heard))
 
     def settle(self, pairs: np.ndarray) -> None:
         """Bring the rows of ``pairs`` up to date: with their lists, and with what transfer has for them."""

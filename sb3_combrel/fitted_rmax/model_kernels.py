@@ -20,6 +20,7 @@ class ModelArrays(NamedTuple):
     :param known: bool, shape (n_pairs,): the target's own instances settle the pair
     :param settled: bool, shape (n_pairs,): the pair has a row, from its own or with transferred instances
     :param reward: float64, shape (n_pairs,): reward of the pair until its state is left
+    :param heard: float64, shape (n_pairs,): what ``total`` was when the row was brought up to date
     :param n_optimistic: int64, shape (n_points,): actions of a grid point without a row
     :param members: int32, shape (n_actions, capacity): in how many lists each instance stands
     :param reach: int64, shape (2, n_variables): farthest that any effect leads down and up each variable, in cells
@@ -36,6 +37,7 @@ class ModelArrays(NamedTuple):
     known: np.ndarray
     settled: np.ndarray
     reward: np.ndarray
+    heard: np.ndarray
     n_optimistic: np.ndarray
     members: np.ndarray
     reach: np.ndarray
@@ -345,6 +347,21 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
 
 
 @compiled
+def worth_settling(arrays, pairs, news):
+    """Move to the front of ``pairs`` the known ones, and those whose own weight has changed by ``news``; how many.
+
+    An instance that hardly counts among transferred ones would have hundreds of pairs translated and planned anew.
+    """
+    kept = 0
+    for p in range(len(pairs)):
+        pair = pairs[p]
+        if arrays.known[pair] or abs(arrays.total[pair] - arrays.heard[pair]) >= news:
+            pairs[kept] = pair
+            kept += 1
+    return kept
+
+
+@compiled
 def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
 
@@ -356,6 +373,7 @@ def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
         has_row = arrays.known[pair] or supply.count[done] > 0
         if has_row and not build_row(arrays, instances, grid, gamma, pair, supply, done, scratch):
             return done
+        arrays.heard[pair] = arrays.total[pair]
         for j in range(supply.count[done]):
             extend_reach(supply.effect[done, j], grid.cells, arrays.reach)
         if has_row != arrays.settled[pair]:

@@ -78,6 +78,18 @@ def pop(queue):
 
 
 @inlined
+def forget(values, queue):
+    """Nothing waits any more, and everybody knows ``values``."""
+    for point in range(len(values)):
+        queue.announced[point] = values[point]
+        queue.level[point] = -1
+        for level in range(N_LEVELS):
+            queue.queued[level, point] = False
+    for level in range(N_LEVELS):
+        queue.size[level] = 0
+
+
+@inlined
 def value_of_pair(values, arrays, pair):
     """Q of a pair that is settled."""
     q = arrays.reward[pair]
@@ -187,6 +199,34 @@ def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, 
 
 
 @compiled
+def sweep_all(values, arrays, queue, grid, bounds, tolerance, most_passes, at):
+    """Back up all points, one after the other, up and down the grid until little changes; what is left waits.
+
+    Points in the order in which their rows lie in memory take a fourth of the time of points here and there: where
+    most of the model is new this comes to rest several times sooner than :func:`sweep`.
+
+    :return: backups done
+    """
+    n_points = len(values)
+    backups = 0
+    for n in range(most_passes):
+        largest = 0.0
+        for step in range(n_points):
+            point = step if n % 2 == 0 else n_points - 1 - step
+            before = values[point]
+            if arrays.n_optimistic[point] == 0 or before != bounds[1]:
+                back_up(values, arrays, queue, point, bounds)
+                largest = max(largest, abs(values[point] - before))
+                backups += 1
+        if largest <= tolerance:
+            forget(values, queue)
+            return backups
+    for point in range(n_points):
+        announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
+    return backups
+
+
+@compiled
 def settle_and_sweep(
     values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch, at
 ):
@@ -216,6 +256,7 @@ class Planner:
         self.values = np.full(model.grid.n_points, float(max_value))
         self.queue = SweepQueue.empty(self.values)
         self._settle_and_sweep = SameTypes(settle_and_sweep)
+        self._sweep_all = SameTypes(sweep_all)
         self._sweep = SameTypes(sweep)
         self._at = np.empty((3, model.grid.n_variables), dtype=np.int64)
         self._exploitation: np.ndarray | None = None
@@ -263,6 +304,21 @@ class Planner:
             self.bounds,
             self.tolerance,
             max_backups,
+            self._at,
+        )
+
+    def sweep_all(self, most_passes: int) -> int:
+        """Back up all points up to ``most_passes`` times, where most of the model is new; backups done."""
+        self._exploitation = None
+        model = self.model
+        return self._sweep_all(
+            self.values,
+            model.arrays,
+            self.queue,
+            model.grid.arrays,
+            self.bounds,
+            self.tolerance,
+            most_passes,
             self._at,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
 LONGEST_PLAN = 10_000
 
-# Backups, in multiples of max_backups or of the grid's points, and for each pair that transfer has changed.
+# Backups in multiples of max_backups, passes over the grid, and backups for each pair that transfer has changed.
 AT_EPISODE_END = 100
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 10
@@ -98,8 +99,10 @@ class FittedRMaxPolicy(BasePolicy):
             bounds=bounds,
         )
         grid = fitting_grid(self.scaling.n_variables, self.n_actions, resolution, model_breadth, min_weight)
+        self.state_names = tuple(state_names or (f"s{k}" for k in range(grid.n_variables)))
+        self.action_names = tuple(action_names or (f"a{k}" for k in range(self.n_actions)))
         if transfer is not None:
-            self._task = self._target_task(grid, state_names, action_names)
+            self._task = self._target_task(grid)
             transfer.bind(self._task, self.rng)
         self.model = KernelModel(
             grid,
@@ -123,10 +126,10 @@ class FittedRMaxPolicy(BasePolicy):
         self._q = np.empty(self.n_actions)
         self._unsettled: list[np.ndarray] = []
         self._warned_outside = False
+        self.timed = False
+        self.planning_seconds = 0.0
 
-    def _target_task(
-        self, grid: StateGrid, state_names: Sequence[str] | None, action_names: Sequence[str] | None
-    ) -> TargetTask:
+    def _target_task(self, grid: StateGrid) -> TargetTask:
         return TargetTask(
             scaling=self.scaling,
             n_actions=self.n_actions,
@@ -134,8 +137,8 @@ class FittedRMaxPolicy(BasePolicy):
             exploration_threshold=self.exploration_threshold,
             min_weight=self.kernel[1],
             min_fraction=self.kernel[2],
-            state_names=tuple(state_names or (f"s{k}" for k in range(grid.n_variables))),
-            action_names=tuple(action_names or (f"a{k}" for k in range(self.n_actions))),
+            state_names=self.state_names,
+            action_names=self.action_names,
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -261,8 +264,11 @@ class FittedRMaxPolicy(BasePolicy):
         :return: backups done
         """
         self._widen(reward)
-        self._unsettled.append(self.model.add(state, action, reward, next_state, terminated))
-        if self.transfer is not None:
+        changed = self.model.add(state, action, reward, next_state, terminated)
+        if self.transfer is None:
+            self._unsettled.append(changed)
+        else:
+            self._unsettled.append(self.model.worth_settling(changed))
             self.transfer.observe(state, action, reward, next_state, terminated)
         return self._plan(self.max_backups)
 
@@ -270,27 +276,41 @@ class FittedRMaxPolicy(BasePolicy):
         """Time to think: plan on while no action is due; backups done."""
         if self.transfer is not None:
             self.transfer.end_episode(truncated)
+            self._unsettled.append(self.model.waiting())
         return self._plan(AT_EPISODE_END * self.max_backups)
 
     def prepare(self) -> int:
         """Take up what transfer has to say before the first step, and plan until that is thought through."""
-        return self._plan(BEFORE_THE_FIRST_STEP * self.model.grid.n_points)
+        backups = self._plan(0)
+        return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
 
     def _plan(self, max_backups: int) -> int:
+        """Plan, and note how long it took if that is wanted (``timed``); backups done."""
+        if not self.timed:
+            return self._settle_and_plan(max_backups)
+        began = perf_counter()
+        backups = self._settle_and_plan(max_backups)
+        self.planning_seconds += perf_counter() - began
+        return backups
+
+    def _settle_and_plan(self, max_backups: int) -> int:
         """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
+        passes = 0
         if self.transfer is not None:
             renewed = self.transfer.renewed()
             renewed = renewed[~self.model.arrays.known[renewed]]
             if len(renewed):
                 self._unsettled.append(renewed)
-                max_backups += BACKUPS_PER_RENEWED_PAIR * len(renewed)
+                backups = BACKUPS_PER_RENEWED_PAIR * len(renewed)
+                passes = backups // self.model.grid.n_points
+                max_backups += backups if passes == 0 else 0
         if not self._unsettled:
             return self.planner.sweep(NO_PAIRS, max_backups)
         # Left on the list until all is done: an interrupt in between loses no change.
         pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
         backups = self.planner.update(pairs, max_backups)
         self._unsettled.clear()
-        return backups
+        return backups + (self.planner.sweep_all(passes) if passes else 0)
 
     def _widen(self, reward: float) -> None:
         """Keep the lower bound of the values below what the worst reward seen could add up to."""

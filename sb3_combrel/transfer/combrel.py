@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_count
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.checks import check_count, check_finite
+from sb3_combrel.common.compiled import SameTypes, compiled
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.compliance import ComplianceScratch, transition_compliance
+from sb3_combrel.transfer.compliance import ComplianceScratch, standstill_compliance, transition_compliance
 from sb3_combrel.transfer.virtual_source import (
     DEFAULT_BREADTH,
     DEFAULT_FADING,
@@ -38,6 +38,9 @@ class COMBREL(VirtualSourceTransfer):
     :param measured: when compliance is measured: "online", with every transition (the default, which works best); or
         "first_episode", once, after the first episode, as in the paper
     :param max_transitions: target transitions measured at most
+    :param min_compliance: a mapping transfers nothing where its mean compliance does not exceed this many times that of
+        the guess that nothing ever changes; so a source that has nothing to do with the target is left alone. 0: any
+        mapping that has evidence may transfer, as in the paper.
     :param breadth: kernel breadth of transferred instances, in unit coordinates; the paper names none
     :param fading: factor on ``breadth`` for each episode that runs into its time limit (the paper: none, 1). Whatever
         the source, pairs that it settled wrongly are explored in the end.
@@ -58,6 +61,7 @@ class COMBREL(VirtualSourceTransfer):
         n_neighbors: int = 3,
         measured: str = "online",
         max_transitions: int = 3000,
+        min_compliance: float = 0.8,
         breadth: float = DEFAULT_BREADTH,
         fading: float = DEFAULT_FADING,
         believe_terminal: bool = False,
@@ -67,6 +71,9 @@ class COMBREL(VirtualSourceTransfer):
     ):
         check_count("n_neighbors", n_neighbors)
         check_count("max_transitions", max_transitions)
+        check_finite("min_compliance", min_compliance)
+        if min_compliance < 0.0:
+            raise ValueError(f"min_compliance must be at least 0, got {min_compliance!r}")
         if measured not in ("online", "first_episode"):
             raise ValueError(f'measured must be "online" or "first_episode", got {measured!r}')
         super().__init__(
@@ -82,6 +89,7 @@ class COMBREL(VirtualSourceTransfer):
         self.n_neighbors = n_neighbors
         self.measured = measured
         self.max_transitions = max_transitions
+        self.min_compliance = min_compliance
 
     def bind(self, target: TargetTask, rng: np.random.Generator) -> None:
         super().bind(target, rng)
@@ -89,10 +97,14 @@ class COMBREL(VirtualSourceTransfer):
         n_points = len(target.sample_states)
         self._compliance_scratch = ComplianceScratch.for_mappings(self._table, int(self._instances.count.max()))
         self._tables = np.empty((64, n_rows, n_actions))
+        self._least = np.empty(64)
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
         self._distance = np.full((target.n_actions, n_points, self.n_neighbors), np.inf)
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._changed_points = np.empty(n_points, dtype=np.int64)
+        self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._choose_at = map(
+            SameTypes, (transition_compliance, standstill_compliance, note_neighbor, vote, choose_at)
+        )
         self._first_episode = True
         self._switches = 0
         self._choice_at = np.empty(target.n_actions, dtype=np.int64)
@@ -124,8 +136,9 @@ class COMBREL(VirtualSourceTransfer):
         assert self.target is not None
         if i == len(self._tables):
             self._tables = np.concatenate([self._tables, np.empty_like(self._tables)])
+            self._least = np.concatenate([self._least, np.empty_like(self._least)])
         action = int(self._seen.actions[i])
-        transition_compliance(
+        self._transition_compliance(
             self._seen.states[i],
             self._seen.effects[i],
             float(self._seen.rewards[i]),
@@ -135,7 +148,11 @@ class COMBREL(VirtualSourceTransfer):
             self._compliance_scratch,
             self._tables[i],
         )
-        n = note_neighbor(
+        standstill = self._standstill_compliance(
+            self._seen.effects[i], float(self._seen.rewards[i]), self._instances, self._bandwidths
+        )
+        self._least[i] = self.min_compliance * standstill
+        n = self._note_neighbor(
             i,
             self._seen.states[i],
             self.target.sample_states,
@@ -144,10 +161,11 @@ class COMBREL(VirtualSourceTransfer):
             self._changed_points,
         )
         n_points = len(self.target.sample_states)
-        changed = vote(
+        changed = self._vote(
             self._changed_points[:n],
             self._near[action],
             self._tables,
+            self._least,
             self._ways,
             action,
             self._choice[action * n_points : (action + 1) * n_points],
@@ -185,13 +203,14 @@ class COMBREL(VirtualSourceTransfer):
         if self._seen.n == 0 or not missing.any():
             return self._nothing_for(len(own_weight))
         n_measured = self._seen.n if self.measured == "online" or not self._first_episode else 0
-        choose_at(
+        self._choose_at(
             state,
             missing,
             self._seen.states,
             self._seen.actions,
             n_measured,
             self._tables,
+            self._least,
             self._ways,
             self._near_at,
             self._distance_at,
@@ -199,6 +218,28 @@ class COMBREL(VirtualSourceTransfer):
         )
         first = np.maximum(self._choice_at, 0)
         return self._draw_at(state, own_weight, first, first + (self._choice_at >= 0))
+
+    @property
+    def makes_choices(self) -> bool:
+        return True
+
+    def choices(self) -> np.ndarray:
+        return self._choice.copy()
+
+    def chosen_compliance(self, pairs: np.ndarray) -> np.ndarray:
+        """
+        Mean compliance of the chosen mapping with the nearest transitions (line 19 of Algorithm 1).
+
+        :param pairs: pairs of the sample, int64, shape (n,)
+        :return: float64, shape (n,); NaN where nothing is chosen
+        """
+        near = self._near.reshape(-1, self.n_neighbors)[pairs]
+        voting = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
+        chosen = np.maximum(self._choice[pairs], 0)[:, None]
+        compliance = self._tables[np.maximum(near, 0), self._ways.row[chosen], self._ways.action[chosen]]
+        n_voting = voting.sum(axis=1)
+        total = np.where(voting, compliance, 0.0).sum(axis=1)
+        return np.where(n_voting > 0, total / np.maximum(n_voting, 1), np.nan)
 
     def statistics(self) -> dict[str, float]:
         chosen = self._choice[self._choice >= 0]
@@ -245,10 +286,16 @@ def note_neighbor(i, state, sample_states, near, distance, changed):
 
 
 @compiled
-def best_candidate(near, tables, ways, action):
-    """The candidate of ``action`` with the highest mean compliance with the transitions ``near``; -1 if none has any."""
+def best_candidate(near, tables, least, ways, action):
+    """The candidate of ``action`` with the highest mean compliance with the transitions ``near``; -1 if none has enough.
+
+    :param least: float64: of each transition, what the compliances of ``near`` must exceed in the mean
+    """
     best = -1
     highest = 0.0
+    for k in range(len(near)):
+        if near[k] >= 0:
+            highest += least[near[k]]
     for c in range(ways.first[action], ways.first[action + 1]):
         total = 0.0
         for k in range(len(near)):
@@ -261,7 +308,7 @@ def best_candidate(near, tables, ways, action):
 
 
 @compiled
-def vote(points, near, tables, ways, action, choice):
+def vote(points, near, tables, least, ways, action, choice):
     """Renew the choice at some sample states; those where it changed are moved to the front of ``points``.
 
     :param choice: int64, shape (n_points,), updated
@@ -270,7 +317,7 @@ def vote(points, near, tables, ways, action, choice):
     n_changed = 0
     for f in range(len(points)):
         p = points[f]
-        chosen = best_candidate(near[p], tables, ways, action)
+        chosen = best_candidate(near[p], tables, least, ways, action)
         if chosen != choice[p]:
             choice[p] = chosen
             points[n_changed] = p
@@ -279,7 +326,7 @@ def vote(points, near, tables, ways, action, choice):
 
 
 @compiled
-def choose_at(state, missing, states, actions, n, tables, ways, near, distance, choice):
+def choose_at(state, missing, states, actions, n, tables, least, ways, near, distance, choice):
     """The candidate for every action with ``missing`` at an exact state, by the same vote; -1 for none.
 
     :param states: target transitions' states, of which the first ``n`` are measured; ``actions``: their actions
@@ -310,4 +357,4 @@ def choose_at(state, missing, states, actions, n, tables, ways, near, distance, 
                 k -= 1
             distance[k] = apart
             near[k] = i
-        choice[action] = best_candidate(near, tables, ways, action)
+        choice[action] = best_candidate(near, tables, least, ways, action)

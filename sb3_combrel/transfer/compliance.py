@@ -213,6 +213,25 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
 
 
 @compiled
+def standstill_compliance(effect, reward, source, bandwidths):
+    """Compliance of one target transition with a world in which nothing moves, and rewards are the source's anywhere.
+
+    What a mapping is worth: one that predicts worse than this has nothing to say about the target.
+    """
+    moved = 0.0
+    for v in range(len(effect)):
+        moved += effect[v] * effect[v]
+    rewarded = 0.0
+    n = 0
+    for action in range(len(source.count)):
+        for j in range(source.count[action]):
+            off = reward - source.reward[action, j]
+            rewarded += 1.0 if off == 0.0 else np.exp(-off * off / bandwidths.reward)
+        n += source.count[action]
+    return np.exp(-moved / bandwidths.outcome) * rewarded / n
+
+
+@compiled
 def compliance_table(states, effects, rewards, source, mappings, bandwidths, scratch, tables):
     """:func:`transition_compliance` of many transitions; ``tables`` has one table a transition."""
     for i in range(len(rewards)):

@@ -101,6 +101,16 @@ class TIMBREL(VirtualSourceTransfer):
             )
         return chosen
 
+    @property
+    def makes_choices(self) -> bool:
+        return not isinstance(self.mapping, str)
+
+    def choices(self) -> np.ndarray:
+        if self._fixed is None:
+            return super().choices()
+        assert self.target is not None
+        return np.repeat(self._fixed, len(self.target.sample_states))
+
     def _most_ways_at_once(self) -> int:
         return int(np.diff(self._ways.first).max()) if self.mapping == "pool" else 1
 

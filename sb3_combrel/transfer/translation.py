@@ -40,82 +40,108 @@ class TransferRules(NamedTuple):
 
 
 @compiled
-def gather(state, source, row, action, mappings, rules, merit, found, indices, weights, merits, candidates, candidate):
-    """Collect the translated instances of one candidate that weigh at least ``min_weight`` at ``state``.
+def consider(j, candidate, w, merit, own, kept, rules, best):
+    """Enter an instance into the list of the best, heaviest (or worthiest) first, and cut what is not needed any more.
 
-    :param merit: relevance of the candidate's instances; read only if ``rules.by_merit``
-    :param found: how many were collected before
-    :return: how many now
+    An instance is needed while those before it and ``own`` do not reach the threshold, and while it has at least
+    ``min_fraction`` of their weight. These sums only grow, so what is cut once would be cut for ever.
+
+    :param kept: how many are in the list
+    :return: how many are now, and the least weight with which a further instance could enter (by weight)
     """
-    far = -np.log(rules.min_weight) * rules.breadth * rules.breadth
-    for j in range(source.count[action]):
-        apart = 0.0
-        for v in range(len(state)):
-            k = mappings.index[row, v]
-            if k >= 0:
-                here = source.state[action, j, k]
-                along = state[v] - (1.0 - here if mappings.sign[row, v] < 0.0 else here)
-                apart += along * along
-        if apart <= far:
-            w = np.exp(-apart / (rules.breadth * rules.breadth))
-            indices[found] = j
-            weights[found] = w
-            merits[found] = merit[j] if rules.by_merit else w
-            candidates[found] = candidate
-            found += 1
-    return found
+    most = len(best.weight) - 1
+    k = kept
+    while k > 0 and best.merit[k - 1] < merit:
+        best.index[k] = best.index[k - 1]
+        best.weight[k] = best.weight[k - 1]
+        best.merit[k] = best.merit[k - 1]
+        best.candidate[k] = best.candidate[k - 1]
+        k -= 1
+    best.index[k] = j
+    best.weight[k] = w
+    best.merit[k] = merit
+    best.candidate[k] = candidate
+    total = own
+    for k in range(min(kept + 1, most)):
+        if not rules.by_merit and best.weight[k] < rules.min_fraction * total:
+            return k, rules.min_fraction * total
+        total += best.weight[k]
+        if total >= rules.threshold:
+            return k + 1, best.weight[k]
+    return min(kept + 1, most), best.weight[most - 1] if kept + 1 >= most else 0.0
 
 
 @compiled
-def fill_row(s, own, found, source, ways, mappings, rules, indices, weights, merits, candidates, supply):
-    """Write the best of the gathered instances to row ``s`` of ``supply``, until they and ``own`` reach the threshold."""
+def gather(state, source, row, action, mappings, rules, merit, own, kept, best, candidate):
+    """Enter the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` into ``best``.
+
+    :param merit: relevance of the candidate's instances; read only if ``rules.by_merit``
+    :param best: BestInstances, of which ``kept`` are filled
+    :return: how many are now
+    """
+    scale = -1.0 / (rules.breadth * rules.breadth)
+    far = np.log(rules.min_weight) / scale
+    n_mapped = 0
+    for v in range(len(state)):
+        k = mappings.index[row, v]
+        if k >= 0:
+            mirrored = mappings.sign[row, v] < 0.0
+            best.variable[n_mapped] = k
+            best.at[n_mapped] = 1.0 - state[v] if mirrored else state[v]
+            n_mapped += 1
+    nearest = far
+    for j in range(source.count[action]):
+        apart = 0.0
+        for m in range(n_mapped):
+            along = best.at[m] - source.state[action, j, best.variable[m]]
+            apart += along * along
+        if apart <= nearest:
+            w = np.exp(apart * scale)
+            kept, least = consider(j, candidate, w, merit[j] if rules.by_merit else w, own, kept, rules, best)
+            if least > rules.min_weight and not rules.by_merit:
+                nearest = np.log(least) / scale * (1 + 1e-12)
+    return kept
+
+
+@compiled
+def write_row(s, own, kept, source, ways, mappings, rules, best, supply):
+    """Write the best instances to row ``s`` of ``supply``, if they and ``own`` reach the threshold."""
     total = own
-    n = 0
-    most = supply.weight.shape[1]
-    while total < rules.threshold and n < most and found > 0:
-        best = 0
-        for f in range(1, found):
-            if merits[f] > merits[best]:
-                best = f
-        w = weights[best]
-        if not rules.by_merit and w < rules.min_fraction * total:
-            break
-        row = ways.row[candidates[best]]
-        action = ways.action[candidates[best]]
-        j = indices[best]
-        supply.weight[s, n] = w
+    for n in range(kept):
+        total += best.weight[n]
+    supply.count[s] = 0
+    if total < rules.threshold:
+        return
+    supply.count[s] = kept
+    for n in range(kept):
+        row = ways.row[best.candidate[n]]
+        action = ways.action[best.candidate[n]]
+        j = best.index[n]
+        supply.weight[s, n] = best.weight[n]
         supply.reward[s, n] = source.reward[action, j]
         supply.terminated[s, n] = rules.believe_terminal and source.terminated[action, j]
         for v in range(mappings.index.shape[1]):
             k = mappings.index[row, v]
             supply.effect[s, n, v] = mappings.sign[row, v] * source.effect[action, j, k] if k >= 0 else 0.0
-        total += w
-        n += 1
-        found -= 1
-        indices[best] = indices[found]
-        weights[best] = weights[found]
-        merits[best] = merits[found]
-        candidates[best] = candidates[found]
-    supply.count[s] = n if total >= rules.threshold else 0
 
 
 @compiled
-def translate(states, own, first, last, source, ways, mappings, rules, merit, scratch, supply):
+def translate(states, own, first, last, source, ways, mappings, rules, merit, best, supply):
     """Supply instances to a number of pairs (see ``Transfer.supply``).
 
     :param states: unit coordinates, shape (n, n_variables)
     :param own: weight of each pair's own instances, shape (n,)
     :param first: first candidate that each pair may draw from; ``last``: one past the last (none if equal)
     :param merit: relevance, shape (n_candidates, most instances of an action); or (1, 0) if not used
-    :param scratch: GatherScratch
+    :param best: BestInstances
     """
     for s in range(len(own)):
         supply.count[s] = 0
         if own[s] >= rules.threshold:
             continue
-        found = np.int64(0)
+        kept = np.int64(0)
         for c in range(first[s], last[s]):
-            found = gather(
+            kept = gather(
                 states[s],
                 source,
                 ways.row[c],
@@ -123,41 +149,38 @@ def translate(states, own, first, last, source, ways, mappings, rules, merit, sc
                 mappings,
                 rules,
                 merit[c] if rules.by_merit else merit[0],
-                found,
-                scratch.index,
-                scratch.weight,
-                scratch.merit,
-                scratch.candidate,
+                own[s],
+                kept,
+                best,
                 c,
             )
-        fill_row(
-            s,
-            own[s],
-            found,
-            source,
-            ways,
-            mappings,
-            rules,
-            scratch.index,
-            scratch.weight,
-            scratch.merit,
-            scratch.candidate,
-            supply,
-        )
+        write_row(s, own[s], kept, source, ways, mappings, rules, best, supply)
 
 
-class GatherScratch(NamedTuple):
-    """Work space for the instances gathered at one state.
+class BestInstances(NamedTuple):
+    """Work space for the instances needed at one state, best first, with room for one more than are ever needed.
 
     :param index: int64, shape (room,); ``weight``, ``merit``: float64; ``candidate``: int64
+    :param variable: int64, shape (n_variables,): source variables that a candidate compares with; ``at``: float64, same
+        shape: where the state lies along each
     """
 
     index: np.ndarray  # type: ignore[assignment]
     weight: np.ndarray
     merit: np.ndarray
     candidate: np.ndarray
+    variable: np.ndarray
+    at: np.ndarray
 
     @classmethod
-    def empty(cls, room: int) -> "GatherScratch":
-        """Work space for ``room`` instances."""
-        return cls(np.empty(room, dtype=np.int64), np.empty(room), np.empty(room), np.empty(room, dtype=np.int64))
+    def empty(cls, most: int, n_variables: int) -> "BestInstances":
+        """Work space for ``most`` instances."""
+        room = most + 1
+        return cls(
+            index=np.empty(room, dtype=np.int64),
+            weight=np.empty(room),
+            merit=np.empty(room),
+            candidate=np.empty(room, dtype=np.int64),
+            variable=np.empty(n_variables, dtype=np.int64),
+            at=np.empty(n_variables),
+        )

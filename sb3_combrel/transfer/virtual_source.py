@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.checks import check_positive
+from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.instances import BLOCK, InstanceArrays, put_instance
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.supply import Supply
@@ -18,7 +19,7 @@ from sb3_combrel.transfer.compliance import Bandwidths, MappingTable, default_ba
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet, resolve
 from sb3_combrel.transfer.relevance import relevance
 from sb3_combrel.transfer.source import SourceInstances
-from sb3_combrel.transfer.translation import CandidateArrays, GatherScratch, TransferRules, translate
+from sb3_combrel.transfer.translation import BestInstances, CandidateArrays, TransferRules, translate
 
 SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances | str | os.PathLike[str]]
 MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
@@ -26,6 +27,20 @@ MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequenc
 DEFAULT_BREADTH = 0.3
 DEFAULT_FADING = 0.8
 MOST_TRANSFERRED = 32
+
+
+class Way(NamedTuple):
+    """
+    What a candidate stands for.
+
+    :param target_action: number of the target action
+    :param source_action: name of the source action that stands for it
+    :param state_mapping: the variables that stand for each other, in words
+    """
+
+    target_action: int
+    source_action: str
+    state_mapping: str
 
 
 class VirtualSourceTransfer(Transfer):
@@ -96,13 +111,16 @@ class VirtualSourceTransfer(Transfer):
         n_candidates = len(self._ways.row)
         most = int(self._instances.count.max())
         self._merit = np.ones((n_candidates, most)) if self.relevance else np.empty((1, 0))
-        self._scratch = GatherScratch.empty(most * self._most_ways_at_once())
         self._seen = TargetTransitions(target.n_actions, target.n_variables)
         self._uses: Counter[int] = Counter()
+        self._instances_used = 0
         self._merit_of = 0
         self._renewed: list[np.ndarray] = []
+        self._renewal_due = 0.0
         self._states_at = np.empty((target.n_actions, target.n_variables))
         self._most_transferred = min(list_room(target.min_fraction), MOST_TRANSFERRED)
+        self._translate = SameTypes(translate)
+        self._best = BestInstances.empty(self._most_transferred, target.n_variables)
 
     def _most_ways_at_once(self) -> int:
         """Candidates from which one pair may draw at the same time."""
@@ -148,7 +166,7 @@ class VirtualSourceTransfer(Transfer):
             reward=np.empty((n, most)),
             terminated=np.empty((n, most), dtype=np.bool_),
         )
-        translate(
+        self._translate(
             states,
             own,
             first,
@@ -158,7 +176,7 @@ class VirtualSourceTransfer(Transfer):
             self._table,
             self._rules,
             self._merit,
-            self._scratch,
+            self._best,
             supply,
         )
         return supply
@@ -169,11 +187,13 @@ class VirtualSourceTransfer(Transfer):
         supply = self._draw(self._states_at, own, first, last)
         if self._most_ways_at_once() == 1:
             self._uses.update(first[supply.count > 0].tolist())
+        self._instances_used += int(supply.count.sum())
         return supply
 
     def renewed(self) -> np.ndarray:
-        if not self._renewed:
+        if not self._renewed or self._seen.n < self._renewal_due:
             return NO_PAIRS
+        self._renewal_due = RENEWAL_GROWTH * self._seen.n
         renewed = self._renewed[0] if len(self._renewed) == 1 else np.unique(np.concatenate(self._renewed))
         self._renewed = []
         return renewed
@@ -186,10 +206,13 @@ class VirtualSourceTransfer(Transfer):
         self._renewed = [np.arange(self.target.n_actions * len(self.target.sample_states))]
 
     def end_episode(self, truncated: bool) -> None:
-        """An episode that ran into its time limit speaks against the transferred model: it reaches less far from now on.
+        """Time to renew what has changed.
+
+        An episode that ran into its time limit speaks against the transferred model: it reaches less far from now on.
 
         Where transferred instances settle every pair, wrongly, nothing is optimistic and nothing would ever be tried.
         """
+        self._renewal_due = 0.0
         if truncated and self.fading < 1.0:
             self._rules = self._rules._replace(breadth=self._rules.breadth * self.fading)
             self._renew_all()
@@ -223,20 +246,47 @@ class VirtualSourceTransfer(Transfer):
 
     def describe(self, candidate: int) -> str:
         """A candidate in words: target action, source action and the variables that stand for each other."""
+        assert self.target is not None
+        way = self.way(candidate)
+        words = f"{self.target.action_names[way.target_action]}<-{way.source_action} with {way.state_mapping}"
+        return words if len(self._sources) == 1 else f"source {self._origin[candidate][0]}: {words}"
+
+    def way(self, candidate: int) -> Way:
+        """A candidate's parts, by name."""
         number, action, state_index, source_action = self._origin[candidate]
         mappings = self._sets[number]
         whole = repr(mappings[mappings.find(state_index, action, source_action)])
-        assert self.target is not None
         variables = whole[whole.index("(") + 1 : whole.index(";")]
-        words = f"{self.target.action_names[action]}<-{self._sources[number].action_names[source_action]} with {variables}"
-        return words if len(self._sources) == 1 else f"source {number}: {words}"
+        return Way(action, self._sources[number].action_names[source_action], variables)
+
+    @property
+    def makes_choices(self) -> bool:
+        """Whether :meth:`choices` ever says anything."""
+        return False
+
+    def choices(self) -> np.ndarray:
+        """The candidate from which each pair of the sample would draw; -1 where there is none, or no single one."""
+        assert self.target is not None
+        return np.full(self.target.n_actions * len(self.target.sample_states), -1, dtype=np.int64)
+
+    def source_action_names(self) -> list[str]:
+        """Names of the source actions of all sources, each name once."""
+        return list(dict.fromkeys(name for source in self._sources for name in source.action_names))
+
+    def uses(self) -> dict[int, int]:
+        """How many decisions each candidate supplied instances to."""
+        return dict(self._uses)
 
     def mapping_counts(self) -> list[tuple[str, int]]:
         """How often each mapping supplied instances to a decision, the most used first, by name."""
         return [(self.describe(candidate), n) for candidate, n in self._uses.most_common()]
 
     def statistics(self) -> dict[str, float]:
-        return {"transfer/uses": sum(self._uses.values()), "transfer/mappings_used": len(self._uses)}
+        return {
+            "transfer/instances_used": self._instances_used,
+            "transfer/uses": sum(self._uses.values()),
+            "transfer/mappings_used": len(self._uses),
+        }
 
     # --------------------------------------------------------------- saving
 
@@ -259,6 +309,10 @@ class VirtualSourceTransfer(Transfer):
         """Take up a saved transition."""
         self._seen.add(state, action, reward, effect)
 
+
+# Within an episode the model is renewed by what transfer has to say whenever it has seen this many times as much as at the
+# last renewal: every transition changes some choices, and to plan anew with each would cost more than all the rest.
+RENEWAL_GROWTH = 1.05
 
 NO_PAIRS = np.empty(0, dtype=np.int64)
 

@@ -72,6 +72,24 @@ def test_sweeping_to_convergence_gives_the_values_of_exact_value_iteration(resol
     assert np.unique(np.round(problem.planner.values, 6)).size > 5, "a problem without interest"
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_passes_over_the_grid_come_to_the_same_values_and_leave_nothing_waiting(seed):
+    problem = Problem((3, 2), 1, gamma=0.9, max_value=5.0)
+    problem.learn(walk(seed, 120), max_backups=0)
+    problem.planner.sweep_all(10_000)
+    assert problem.planner.n_waiting == 0
+    np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
+
+
+def test_a_few_passes_leave_the_rest_of_the_work_waiting():
+    problem = Problem((3, 2), 1, gamma=0.99, max_value=5.0)
+    problem.learn(walk(1, 120), max_backups=0)
+    problem.planner.sweep_all(2)
+    assert problem.planner.n_waiting > 0
+    problem.think()
+    np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
+
+
 def test_values_follow_while_pairs_become_known_one_by_one():
     problem = Problem((3,), 1, gamma=0.95)
     ever_hopeful = problem.hopeful.copy()

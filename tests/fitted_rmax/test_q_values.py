@@ -170,3 +170,18 @@ def test_asking_for_q_changes_nothing(one_variable):
     np.testing.assert_array_equal(one_variable.q_values(np.array([0.52])), first)
     for name, array in one_variable._saved_arrays().items():
         np.testing.assert_array_equal(array, before[name])
+
+
+def test_what_was_near_before_has_no_part_in_the_result():
+    """A search starts from what the last one found; wherever that was, it must come to the same."""
+    rng = np.random.default_rng(3)
+    policy, naive = policy_and_definition(2, 3, breadth=0.15, min_fraction=0.05)
+    states = np.round(rng.random((300, 2)) * 12) / 12
+    take_up(policy, naive, [(s, int(rng.integers(N_ACTIONS)), -1.0, np.clip(s + 0.05, 0, 1), False) for s in states])
+    policy.planner.values[:] = rng.normal(size=len(policy.planner.values)) - 5.0
+    queries = np.round(rng.random((40, 2)) * 24) / 24
+    first = [policy.q_values(state) for state in queries]
+    for number in rng.permutation(len(queries)):
+        np.testing.assert_array_equal(policy.q_values(queries[number]), first[number])
+        policy._query.length[:] = 0
+        np.testing.assert_array_equal(policy.q_values(queries[number]), first[number])

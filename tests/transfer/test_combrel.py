@@ -154,14 +154,19 @@ def test_renewed_names_exactly_the_pairs_whose_choice_changed():
     method = bound(COMBREL(source, bandwidths=BANDWIDTHS), task)
     assert len(method.renewed()) == 0
     choice, supply, n_renewed = method._choice.copy(), supply_of(method, task), 0
-    for _ in range(40):
+    for n in range(60):
         show(method, naive.random_transition(rng, 3, 2))
         renewed = method.renewed()
-        assert renewed.tolist() == np.flatnonzero(method._choice != choice).tolist()
+        if n > 20 and len(renewed) == 0:
+            continue  # the more it has seen, the longer changes wait for each other
+        assert set(renewed) >= set(np.flatnonzero(method._choice != choice))
+        assert n > 20 or renewed.tolist() == np.flatnonzero(method._choice != choice).tolist()
         now = supply_of(method, task)
         assert all(now[pair] == supply[pair] for pair in np.setdiff1d(pairs_of(task), renewed))
         choice, supply, n_renewed = method._choice.copy(), now, n_renewed + len(renewed)
     assert n_renewed > 40
+    method.end_episode(False)
+    assert set(method.renewed()) >= set(np.flatnonzero(method._choice != choice)), "an episode's end waits for nothing"
     assert len(method.renewed()) == 0
 
 
@@ -393,8 +398,8 @@ def test_a_source_that_is_the_target_saves_the_exploration():
 def test_a_source_that_has_nothing_to_do_with_the_target_does_not_hold_learning_up_for_long(seed):
     _, with_transfer = learned(COMBREL(noise(seed)), seed, 10)
     _, without = learned(None, seed, 10)
-    assert with_transfer[-5:].max() < LIMIT
-    assert with_transfer.sum() < 2.5 * without.sum()
+    assert with_transfer[-5:].max() < 250
+    assert with_transfer.sum() < 1.2 * without.sum()
 
 
 IDENTITY = {"state": [0, 1], "action": [0, 1, 2]}

@@ -118,6 +118,9 @@ BAD_ARGUMENTS = [
     ("bandwidths", "auto"),
 ]
 BAD_ARGUMENTS_OF_COMBREL = [
+    ("min_compliance", -0.1),
+    ("min_compliance", np.nan),
+    ("min_compliance", None),
     ("n_neighbors", 0),
     ("n_neighbors", -1),
     ("n_neighbors", 2.5),

@@ -11,7 +11,7 @@ from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
 from sb3_combrel.transfer.source import SourceInstances
-from sb3_combrel.transfer.translation import CandidateArrays, GatherScratch, TransferRules, translate
+from sb3_combrel.transfer.translation import CandidateArrays, BestInstances, TransferRules, translate
 from sb3_combrel.transfer.virtual_source import stacked_instances, stacked_table
 
 seeds = st.integers(0, 2**32 - 1)
@@ -43,7 +43,7 @@ def supplied(states, own, mappings, source, task, breadth, believe_terminal=True
             task.exploration_threshold, breadth, task.min_weight, task.min_fraction, believe_terminal, merit is not None
         ),
         np.empty((1, 0)) if merit is None else merit,
-        GatherScratch.empty(len(rows) * len(source)),
+        BestInstances.empty(most, d),
         supply,
     )
     drawn_from = []
