@@ -1,7 +1,7 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
 # make test    all tests, the slow ones too
 # make bench   speed and memory                make lint, type, format, commit-checks    as in Stable-Baselines3
-# make figures the figures of README.md and docs/
+# make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
 # Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
 # the interpreter, make VENV=path another environment. As in any pip install, PIP_EXTRA_INDEX_URL and the like are heeded.
@@ -20,7 +20,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures test pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard test pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -28,6 +28,13 @@ demo: $(VENV)/.installed-demo
 figures: demo
 	mkdir -p docs/figures
 	cp demo_output/learning_curves.png docs/figures/
+
+# Needs Chromium (Debian: chromium).
+dashboard: $(VENV)/.installed-demo
+	$(BIN)/python -m sb3_combrel.experiments.dashboard dashboard
+	mkdir -p docs/figures
+	cp dashboard/custom_scalars.png docs/figures/tensorboard_custom_scalars.png
+	cp dashboard/images.png docs/figures/tensorboard_images.png
 
 test: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up

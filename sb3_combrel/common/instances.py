@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+
 from sb3_combrel.common.compiled import compiled
 
 BLOCK = 8

@@ -1,8 +1,8 @@
 """Compiled inner loops shared by model and transfer: arrays in, arrays out, all in unit coordinates."""
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled, inlined
 
+from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.instances import BLOCK
 
 

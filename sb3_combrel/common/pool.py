@@ -8,6 +8,7 @@ them without pointers.
 from typing import NamedTuple
 
 import numpy as np
+
 from sb3_combrel.common.compiled import compiled
 
 SMALLEST_SLOT = 4

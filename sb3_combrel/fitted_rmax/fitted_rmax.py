@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_combrel.callbacks import with_dashboard
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
@@ -235,6 +236,7 @@ class FittedRMax(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         callback.on_training_start(locals(), globals())
+        callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]
         self._episode_tags = np.arange(self.n_envs)
         self._last_states = self.policy.to_unit(np.asarray(self._last_obs))
@@ -272,8 +274,14 @@ class FittedRMax(BaseAlgorithm):
         for ended in np.flatnonzero(dones) if dones.any() else ():
             self._end_episode(int(ended), bool(terminated[ended]))
             if log_interval is not None and self._episode_num % log_interval == 0:
+                callback.on_rollout_end()
                 self.dump_logs()
+                callback.on_rollout_start()
         return True
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        # By now the logger is set up, so it is known whether there is a log to write to.
+        return super()._init_callback(with_dashboard(callback, self.logger), progress_bar)
 
     def _raw_rewards(self, rewards: np.ndarray) -> list[float]:
         """The environment's own rewards: a normalization that drifts would mix scales in one model."""
@@ -319,8 +327,9 @@ class FittedRMax(BaseAlgorithm):
         self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
         self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        for name, value in self.policy.statistics().items():
-            self.logger.record(name, value)
+        if self.logger.output_formats and self.policy.reporting:
+            for name, value in self.policy.statistics().items():
+                self.logger.record(name, value)
         self.logger.record("planner/backups", self._backups)
         self.logger.dump(step=self.num_timesteps)
 

@@ -1,9 +1,11 @@
 """Fitted R-Max's kernel model: T and R of every state-action pair of the grid, from instances."""
 
+from typing import Any
+
 import numpy as np
 
 from sb3_combrel.common.compiled import SameTypes
-from sb3_combrel.common.instances import InstanceArrays, put_instance
+from sb3_combrel.common.instances import InstanceArrays
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.pool import Pool
 from sb3_combrel.common.supply import Supply
@@ -134,7 +136,7 @@ class KernelModel:
             self.arrays = self.arrays._replace(**larger)
         return count, np.empty(0, dtype=np.int64)
 
-    def _of_instances(self) -> dict[str, np.ndarray]:
+    def _of_instances(self) -> dict[str, Any]:
         """Those of the model's arrays that have a place for each instance, empty."""
         d, places = self.grid.n_variables, (self.n_actions, self.instances.capacity)
         return dict(

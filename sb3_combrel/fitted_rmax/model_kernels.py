@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled, inlined
 
+from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.instances import put_instance
 from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
 from sb3_combrel.common.pool import Pool, reserve

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+
 from sb3_combrel.common.compiled import SameTypes, compiled, inlined
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
 from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel

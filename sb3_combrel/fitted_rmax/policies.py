@@ -126,7 +126,7 @@ class FittedRMaxPolicy(BasePolicy):
         self._q = np.empty(self.n_actions)
         self._unsettled: list[np.ndarray] = []
         self._warned_outside = False
-        self.timed = False
+        self.timed, self.reporting = False, True
         self.planning_seconds = 0.0
 
     def _target_task(self, grid: StateGrid) -> TargetTask:

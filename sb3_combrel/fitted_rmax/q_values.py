@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from sb3_combrel.common.compiled import compiled
 
+from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.kernels import near_instances
 from sb3_combrel.fitted_rmax.corrections import corrected_value, visit
 

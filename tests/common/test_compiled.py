@@ -4,6 +4,7 @@ import copy
 import pickle
 
 import numpy as np
+
 from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 

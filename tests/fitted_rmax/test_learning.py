@@ -10,7 +10,7 @@ import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import FittedRMax
 
 SEEDS = range(5)
-CART_POLE_BOUNDS = ([-2.6, -3.0, -0.23, -3.2], [2.6, 3.0, 0.23, 3.2])
+CART_POLE_BOUNDS = ([-4.8, -3.0, -0.23, -3.2], [4.8, 3.0, 0.23, 3.2])
 
 
 class Episodes(BaseCallback):
@@ -90,22 +90,18 @@ def test_mountain_car_v0_with_default_parameters(seed):
 
 
 @pytest.mark.slow
-def test_cart_pole():
-    """Solved is 475: four seeds of five are, and the worst comes near (453 when this was written)."""
-    means = sorted(
-        returns_in_evaluation(
-            "CartPole-v1",
-            4000,
-            seed,
-            bounds=CART_POLE_BOUNDS,
-            gamma=0.99,
-            max_value=100,
-            model_breadth=0.2,
-            resolution=4,
-            min_fraction=0.1,
-            max_backups=1000,
-        ).mean()
-        for seed in SEEDS
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cart_pole(seed):
+    """Solved is 475. A pole falls anywhere alike: with wide bounds for the position, its instances count farther along it."""
+    returns = returns_in_evaluation(
+        "CartPole-v1",
+        4000,
+        seed,
+        bounds=CART_POLE_BOUNDS,
+        gamma=0.99,
+        max_value=100,
+        exploration_threshold=0.5,
+        resolution=4,
+        max_backups=100,
     )
-    assert means[0] >= 400
-    assert means[1] >= 475
+    assert returns.mean() >= 475

@@ -6,11 +6,11 @@ from functools import cache
 import naive_transfer as naive
 import numpy as np
 import pytest
-from combrel_envs.mountain_car_dynamics import PUSHES, step_axis
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
+from combrel_envs.mountain_car_dynamics import PUSHES, step_axis
 from sb3_combrel import COMBREL, FittedRMax
 from sb3_combrel.transfer.compliance import Bandwidths
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet

@@ -11,7 +11,7 @@ from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
 from sb3_combrel.transfer.source import SourceInstances
-from sb3_combrel.transfer.translation import CandidateArrays, BestInstances, TransferRules, translate
+from sb3_combrel.transfer.translation import BestInstances, CandidateArrays, TransferRules, translate
 from sb3_combrel.transfer.virtual_source import stacked_instances, stacked_table
 
 seeds = st.integers(0, 2**32 - 1)

@@ -1,0 +1,125 @@
+"""Screenshots of TensorBoard with three runs on one page, by a headless Chromium: the pictures of the README."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+#: Tabs of TensorBoard to look at: file name, the part of the address after "#", window size.
+TABS = {
+    "scalars": ("scalars", (1300, 1100)),
+    "custom_scalars": ("custom_scalars", (1300, 1150)),
+    "images": ("images", (1000, 620)),
+    "text": ("text", (1200, 720)),
+    "hparams": ("hparams", (1500, 400)),
+}
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+SECONDS_TO_START = 60
+SECONDS_TO_DRAW = 20
+
+
+def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TABS)) -> list[Path]:
+    """
+    Start TensorBoard, look at it, stop it.
+
+    :param logs: folder with one folder a run
+    :param output: folder for PNG files, one a tab
+    :param tabs: names out of :data:`TABS`
+    :return: the files
+    :raises FileNotFoundError: if there is no Chromium
+    """
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        raise FileNotFoundError("no Chromium is installed (Debian and Ubuntu: apt-get install chromium)")
+    output.mkdir(parents=True, exist_ok=True)
+    with _tensorboard(logs) as address:
+        return [_photograph(browser, f"{address}/#{TABS[tab][0]}", output / f"{tab}.png", TABS[tab][1]) for tab in tabs]
+
+
+@contextlib.contextmanager
+def _tensorboard(logs: Path) -> Iterator[str]:
+    """A server of the logs on this machine only; its address."""
+    with contextlib.closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    logs = logs.resolve()
+    # Shown on the page: the folder's name says enough.
+    command = [sys.executable, "-m", "tensorboard.main", "--logdir", logs.name, "--host", "127.0.0.1", "--port", str(port)]
+    server = subprocess.Popen([*command, "--samples_per_plugin", "images=100"], cwd=logs.parent, stderr=subprocess.DEVNULL)
+    try:
+        address = f"http://127.0.0.1:{port}"
+        _wait_for(f"{address}/data/runs", server)
+        yield address
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def _wait_for(url: str, server: subprocess.Popen[bytes]) -> None:
+    """Until the runs have been read."""
+    end = time.monotonic() + SECONDS_TO_START
+    while time.monotonic() < end and server.poll() is None:
+        with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=5) as answer:
+            if len(answer.read()) > len("[]\n"):
+                return
+        time.sleep(0.5)
+    raise TimeoutError(f"TensorBoard shows no runs at {url} after {SECONDS_TO_START} seconds")
+
+
+def _photograph(browser: str, address: str, path: Path, size: tuple[int, int]) -> Path:
+    command = [browser, "--headless", "--disable-gpu", "--hide-scrollbars", f"--window-size={size[0]},{size[1]}"]
+    command.append("--force-device-scale-factor=1.5")
+    # Chromium's sandbox does not work for root, as in a container.
+    command += ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+    with tempfile.TemporaryDirectory() as profile:
+        command += [f"--user-data-dir={profile}", f"--virtual-time-budget={1000 * SECONDS_TO_DRAW}", f"--screenshot={path}"]
+        subprocess.run([*command, address], check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, timeout=300)
+    return path
+
+
+def learn_three_ways(logs: Path, total_timesteps: int) -> None:
+    """
+    One run without transfer, one with TIMBREL and one with COMBREL, logged side by side.
+
+    :param logs: folder for the logs
+    :param total_timesteps: environment steps of each run
+    """
+    from sb3_combrel import FittedRMax
+    from sb3_combrel.callbacks import DashboardCallback
+    from sb3_combrel.experiments import mountain_car
+    from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+
+    source = mountain_car.learn_source()
+    for method, transfer in mountain_car.methods(source).items():
+        env = make_task(mountain_car.TARGET_ID, max_episode_steps=1000)
+        with coarse_on_purpose(), warnings.catch_warnings(), contextlib.closing(env):
+            model = FittedRMax(env, transfer=transfer, seed=0, tensorboard_log=str(logs), **mountain_car.LEARNER)
+            dashboard = DashboardCallback(picture_freq=500, scalar_share=1.0)
+            model.learn(total_timesteps, dashboard, log_interval=1, tb_log_name=method.replace(" ", "_"))
+
+
+def main() -> None:
+    """``python -m sb3_combrel.experiments.dashboard [FOLDER] [LOGS]``: screenshots into FOLDER, of LOGS or of new runs."""
+    output = Path(sys.argv[1] if len(sys.argv) > 1 else "dashboard")
+    if len(sys.argv) > 2:
+        files = take_screenshots(Path(sys.argv[2]), output)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            logs = Path(folder) / "logs"
+            learn_three_ways(logs, total_timesteps=5000)
+            files = take_screenshots(logs, output)
+    print("\n".join(map(str, files)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""A plane through the grid of states: two state variables, the others held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.grid import StateGrid
+
+VariablePair = tuple[int | str, int | str]
+
+
+class Plane(NamedTuple):
+    """
+    The grid points of a plane, and what a picture of it says.
+
+    :param points: numbers of the grid points, int64, shape (points along the second variable, along the first)
+    :param names: names of the two variables; the second is empty for a task with one variable
+    :param extent: edges of the picture in raw units: left, right, bottom, top; half a cell beyond the outer points
+    :param held: the other variables and their values, in words
+    """
+
+    points: np.ndarray
+    names: tuple[str, str]
+    extent: tuple[float, float, float, float]
+    held: str
+
+
+def plane_through(
+    grid: StateGrid,
+    scaling: StateScaling,
+    names: Sequence[str],
+    variables: tuple[int, int],
+    at: ArrayLike | None = None,
+) -> Plane:
+    """
+    The plane of two variables through a state, moved to the nearest grid points; a margin of the grid is left out.
+
+    :param grid: the grid
+    :param scaling: raw <-> unit coordinates
+    :param names: of all state variables
+    :param variables: numbers of the two variables, the horizontal one first; twice the same for a line
+    :param at: raw units, shape (n_variables,); None for the middle of the state space
+    """
+    across, up = variables
+    g = grid.arrays
+    unit = np.full(grid.n_variables, 0.5) if at is None else np.clip(scaling.to_unit(at), 0.0, 1.0)
+    held = np.rint(unit * g.cells + g.margin).astype(np.int64)
+    inner = [np.arange(grid.margin, n - grid.margin) for n in g.shape]
+    held_state = scaling.to_raw((held - g.margin) / g.cells)
+    points = np.array(int(held @ g.strides)) + (inner[across] - held[across]) * g.strides[across]
+    rows = np.zeros(1, dtype=np.int64) if up == across else (inner[up] - held[up]) * g.strides[up]
+    left, right = _edges(grid, scaling, across)
+    bottom, top = (0.0, 1.0) if up == across else _edges(grid, scaling, up)
+    others = [f"{names[k]} = {held_state[k]:.3g}" for k in range(grid.n_variables) if k not in variables]
+    return Plane(
+        points=np.add.outer(rows, points),
+        names=(names[across], "" if up == across else names[up]),
+        extent=(left, right, bottom, top),
+        held=", ".join(others),
+    )
+
+
+def _edges(grid: StateGrid, scaling: StateScaling, variable: int) -> tuple[float, float]:
+    half_cell = 0.5 / grid.arrays.cells[variable]
+    low, high = scaling.low[variable], scaling.high[variable]
+    return float(low - half_cell * (high - low)), float(high + half_cell * (high - low))
+
+
+def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> list[tuple[int, int]]:
+    """
+    Pairs of state variables as pairs of numbers.
+
+    :param variables: pairs of names or numbers; None for the first two variables
+    :param names: of all state variables
+    :raises ValueError: if an entry is not a pair of two different variables
+    """
+    if variables is None:
+        return [(0, min(1, len(names) - 1))]
+    pairs = []
+    for pair in variables:
+        if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
+            raise ValueError(
+                f'variables must be pairs of state variables, such as [("{names[0]}", "{names[-1]}")], got {pair!r}'
+            )
+        across, up = (_number(variable, names) for variable in pair)
+        if across == up and len(names) > 1:
+            raise ValueError(f"variables must be pairs of two different state variables, got {pair!r}")
+        pairs.append((across, up))
+    return pairs
+
+
+def _number(variable: int | str, names: Sequence[str]) -> int:
+    if isinstance(variable, str) and variable in names:
+        return list(names).index(variable)
+    if isinstance(variable, int) and 0 <= variable < len(names):
+        return variable
+    raise ValueError(f"variables must be numbers below {len(names)} or names out of {', '.join(names)}, got {variable!r}")

@@ -1,0 +1,124 @@
+"""RL-Zoo's commands, with this package's algorithms in its tables."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import runpy
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Any
+from unittest import mock
+
+PROGRAM = "python -m sb3_combrel.zoo"
+NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[zoo]'"
+OF_EXTRA = ("rl_zoo3", "sb3_contrib", "optuna", "seaborn", "pytablewriter", "pandas", "matplotlib", "yaml", "huggingface_sb3")
+FUNCTIONS = {
+    "train": "rl_zoo3.train",
+    "enjoy": "rl_zoo3.enjoy",
+    "plot_train": "rl_zoo3.plots.plot_train",
+    "all_plots": "rl_zoo3.plots.all_plots",
+    "plot_from_file": "rl_zoo3.plots.plot_from_file",
+}
+"""Commands that are functions, by the module that has them."""
+SCRIPTS = {
+    "record_video": "rl_zoo3.record_video",
+    "record_training": "rl_zoo3.record_training",
+    "benchmark": "rl_zoo3.benchmark",
+}
+"""Commands that are scripts and do their work as ``__main__`` only; they know no ``--gym-packages``."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """
+    Run one of RL-Zoo's commands.
+
+    What is wrong with a configuration file or an argument is said in one sentence; ``--verbose 2`` shows where it arose.
+
+    :param args: command and its arguments, those of the process by default
+    :return: exit status: 0, or 1 if something was wrong, or 2 if there is no such command
+    """
+    command, *rest = list(sys.argv[1:] if args is None else args) or ["--help"]
+    if command not in FUNCTIONS | SCRIPTS:
+        print(f"usage: {PROGRAM} {{{','.join(FUNCTIONS | SCRIPTS)}}} ...   (each has --help)")
+        return 0 if command in ("-h", "--help") else 2
+    try:
+        return _run(command, rest)
+    except _what_users_cause() as error:
+        if _is_verbose(rest):
+            raise
+        print(f"sb3_combrel.zoo: {_in_words(error)}", file=sys.stderr)
+        return 1
+
+
+def _run(command: str, args: list[str]) -> int:
+    from sb3_combrel.zoo.registration import register
+
+    register()
+    with mock.patch.object(sys, "argv", [f"{PROGRAM} {command}", *args]):
+        if command in FUNCTIONS:
+            getattr(importlib.import_module(FUNCTIONS[command]), command)()
+        else:
+            _run_script(command)
+    return 0
+
+
+def _run_script(command: str) -> None:
+    packages, sys.argv[1:] = _without_gym_packages(sys.argv[1:])
+    for package in packages:
+        importlib.import_module(package)
+    import rl_zoo3.utils
+
+    trained_models, real_call = rl_zoo3.utils.get_trained_models, subprocess.call
+
+    def by_file_name(log_folder: str) -> dict[str, tuple[str, Any]]:
+        """RL-Zoo's benchmark looks for runs by the id of their task, which is no file name if it has a namespace."""
+        from huggingface_sb3 import EnvironmentName
+
+        return {name: (algo, EnvironmentName(env_id)) for name, (algo, env_id) in trained_models(log_folder).items()}
+
+    def enjoy_here(call: Any, **options_of_call: Any) -> int:
+        """RL-Zoo's benchmark calls ``python enjoy.py``, which only exists in a clone of RL-Zoo."""
+        if list(call[:2]) != ["python", "enjoy.py"]:
+            return real_call(call, **options_of_call)
+        words = [str(getattr(word, "gym_id", word)) for word in call[2:]]
+        options = ["--gym-packages", *packages] if packages else []
+        return subprocess.run([sys.executable, "-m", "sb3_combrel.zoo", "enjoy", *words, *options], check=False).returncode
+
+    with (
+        mock.patch.object(rl_zoo3.utils, "get_trained_models", by_file_name),
+        mock.patch.object(subprocess, "call", enjoy_here),
+    ):
+        runpy.run_module(SCRIPTS[command], run_name="__main__")
+
+
+def _without_gym_packages(args: list[str]) -> tuple[list[str], list[str]]:
+    """What follows ``--gym-packages``, and the other arguments."""
+    if "--gym-packages" not in args:
+        return [], args
+    at = args.index("--gym-packages")
+    end = next((i for i in range(at + 1, len(args)) if args[i].startswith("-")), len(args))
+    return args[at + 1 : end], args[:at] + args[end:]
+
+
+def _what_users_cause() -> tuple[type[Exception], ...]:
+    from gymnasium.error import Error
+
+    usual = (ValueError, AssertionError, OSError, ImportError, Error)
+
+    try:
+        from yaml import YAMLError
+    except ImportError:
+        return usual
+    return (*usual, YAMLError)
+
+
+def _in_words(error: Exception) -> str:
+    if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in OF_EXTRA:
+        return NEEDS_EXTRA.format(missing=error.name)
+    return str(error) or type(error).__name__
+
+
+def _is_verbose(args: list[str]) -> bool:
+    return any(a == "--verbose" and b.isdigit() and int(b) >= 2 for a, b in itertools.pairwise(args))

@@ -1,0 +1,26 @@
+"""What RL-Zoo must know of this package: algorithms, samplers of hyperparameters, environments."""
+
+from __future__ import annotations
+
+from sb3_combrel.zoo.algorithm import ZooFittedRMax
+from sb3_combrel.zoo.sampling import convert_fitted_rmax_params, sample_fitted_rmax_params
+
+ALGORITHMS = ("fitted_rmax", "timbrel", "combrel")
+"""Names for ``--algo``. All are Fitted R-Max; each has its own configuration file, log folder and column in tables."""
+
+
+def register() -> None:
+    """
+    Add the algorithms to RL-Zoo's tables and the environments to Gymnasium; doing it twice does no harm.
+
+    :raises ImportError: if RL-Zoo is not installed
+    """
+    from rl_zoo3 import ALGOS
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+
+    import combrel_envs  # noqa: F401 - registers the environments: benchmark and record_video know no --gym-packages
+
+    for name in ALGORITHMS:
+        ALGOS[name] = ZooFittedRMax
+        HYPERPARAMS_SAMPLER[name] = sample_fitted_rmax_params
+        HYPERPARAMS_CONVERTER[name] = convert_fitted_rmax_params

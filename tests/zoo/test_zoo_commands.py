@@ -1,0 +1,225 @@
+"""RL-Zoo's commands, end to end, with budgets too small to learn much."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_combrel import FittedRMax, SourceInstances
+from sb3_combrel.zoo import commands
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = ROOT / "zoo_configs"
+CAR = "combrel/MountainCar2D-v0"
+BIG_CAR = "combrel/MountainCar4D-v0"
+RECIPE = {"env": CAR, "n_instances": 50, "total_timesteps": 200}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_COMBREL_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("MPLBACKEND", "Agg")
+        yield
+
+
+def train_args(folder, *more, algo="fitted_rmax", env=CAR, conf=None, n=600):
+    conf = conf or CONFIGS / f"{algo}.yml"
+    fixed = ("--algo", algo, "--env", env, "--conf-file", conf, "--gym-packages", "combrel_envs", "-f", folder, "--seed", 1)
+    return [str(arg) for arg in (*fixed, "-n", n, "--eval-episodes", 2, "--eval-freq", 300, *more)]
+
+
+def call(command, *args):
+    return commands.main([command, *map(str, args)])
+
+
+def run(module, *args, **variables):
+    """The same in a process of its own."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", **{name: str(value) for name, value in variables.items()}}
+    return subprocess.run(
+        [sys.executable, "-m", *module.split(), *map(str, args)], env=environment, capture_output=True, text=True, timeout=300
+    )
+
+
+def write_config(path, **entry):
+    path.write_text(yaml.dump({"default": {"n_timesteps": 300, **entry}}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """What a training run has left: last and best model, checkpoints and evaluations."""
+    folder = tmp_path_factory.mktemp("logs")
+    assert call("train", *train_args(folder, "--save-freq", 200)) == 0
+    return folder
+
+
+class TestTrainAndEnjoy:
+    def test_it_evaluates_at_the_frequency_asked_and_keeps_models(self, logs):
+        (folder,) = (logs / "fitted_rmax").iterdir()
+        assert np.load(folder / "evaluations.npz")["timesteps"].tolist() == [300, 600]
+        names = {path.name for path in folder.glob("*.zip")}
+        checkpoints = {f"rl_model_{steps}_steps.zip" for steps in (200, 400, 600)}
+        assert names == {"best_model.zip", "combrel-MountainCar2D-v0.zip", *checkpoints}
+
+    @pytest.mark.parametrize("which", [(), ("--load-best",), ("--load-checkpoint", "200"), ("--load-last-checkpoint",)])
+    def test_enjoy_loads_last_and_best_model_and_checkpoints(self, logs, capsys, which):
+        options = ("--gym-packages", "combrel_envs", "-f", logs, "--no-render", "-n", 30)
+        assert call("enjoy", "--algo", "fitted_rmax", "--env", CAR, *options, *which) == 0
+        name = {"--load-best": "best_model", "--load-checkpoint": "rl_model_200", "--load-last-checkpoint": "rl_model_600"}
+        assert name.get("".join(which[:1]), "combrel-MountainCar2D-v0.zip") in capsys.readouterr().out
+
+    def test_training_can_be_resumed(self, logs, tmp_path):
+        agent = logs / "fitted_rmax" / "combrel-MountainCar2D-v0_1" / "combrel-MountainCar2D-v0.zip"
+        assert call("train", *train_args(tmp_path, "-i", agent)) == 0
+
+    @pytest.mark.slow
+    def test_environments_in_subprocesses_work(self, tmp_path):
+        conf = write_config(tmp_path / "two.yml", policy="FittedRMaxPolicy", n_envs=2)
+        done = run("sb3_combrel.zoo train", *train_args(tmp_path, "--vec-env", "subproc", conf=conf))
+        assert done.returncode == 0, done.stderr
+        assert len(list(tmp_path.glob("fitted_rmax/*/*.monitor.csv"))) == 2
+
+    @pytest.mark.slow
+    def test_an_unmodified_zoo_knows_the_algorithm_by_the_hook(self, tmp_path):
+        path = os.pathsep.join([str(CONFIGS), os.environ.get("PYTHONPATH", "")])
+        done = run("rl_zoo3.train", *train_args(tmp_path, n=100), PYTHONPATH=path)
+        assert done.returncode == 0, done.stderr
+
+    def test_an_unknown_command_is_refused(self, capsys):
+        assert call("dance") == 2
+        assert "train" in capsys.readouterr().out
+
+
+class TestTransfer:
+    @pytest.mark.parametrize("algo", ["timbrel", "combrel"])
+    @pytest.mark.parametrize("env", [CAR, BIG_CAR])
+    def test_the_shipped_configurations_run(self, tmp_path, algo, env):
+        conf = tmp_path / "short.yml"
+        entry = yaml.safe_load((CONFIGS / f"{algo}.yml").read_text())[env]
+        ((method, arguments),) = entry["transfer"].items()
+        entry["transfer"] = {method: {**arguments, "source": RECIPE}}
+        conf.write_text(yaml.dump({env: entry}))
+        assert call("train", *train_args(tmp_path, "--eval-freq", -1, algo=algo, env=env, conf=conf, n=60)) == 0
+        (model_file,) = tmp_path.glob(f"{algo}/*/*.zip")
+        assert len(FittedRMax.load(model_file).policy.transfer.source) == 50
+
+    def test_a_source_task_is_learnt_once_and_then_read(self, capsys):
+        from sb3_combrel.zoo.sources import find_source
+
+        first, printed = find_source({**RECIPE, "seed": 7}), capsys.readouterr().out
+        second = find_source({**RECIPE, "seed": 7})
+        assert "Learning the source task" in printed
+        assert not capsys.readouterr().out
+        assert np.array_equal(first.states, second.states)
+
+    def test_a_saved_model_needs_no_source_file(self, tmp_path):
+        source = SourceInstances.from_q_learning(CAR, n_instances=50, seed=0, total_timesteps=200).save(tmp_path / "car")
+        transfer = {"sb3_combrel.COMBREL": {"source": str(source)}}
+        conf = write_config(tmp_path / "combrel.yml", policy="FittedRMaxPolicy", transfer=transfer)
+        assert call("train", *train_args(tmp_path, "--eval-freq", -1, algo="combrel", conf=conf, n=60)) == 0
+        source.unlink()
+        options = ("--gym-packages", "combrel_envs", "-f", tmp_path, "--no-render", "-n", 5)
+        assert call("enjoy", "--algo", "combrel", "--env", CAR, *options) == 0
+
+
+class TestTuning:
+    def tune(self, folder, storage, *more):
+        tuning = ("-optimize", "--n-trials", 2, "--n-evaluations", 2, "--n-startup-trials", 1, "--no-optim-plots")
+        return train_args(folder, *tuning, "--storage", storage, "--study-name", "car", *more, n=300)
+
+    def test_it_runs_with_pruning_and_journal_storage(self, tmp_path):
+        pytest.importorskip("pandas")
+        optuna = pytest.importorskip("optuna")
+        file = tmp_path / "journal.log"
+        assert call("train", *self.tune(tmp_path, file, "--pruner", "median")) == 0
+        storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(file)))
+        study = optuna.load_study(storage=storage, study_name="car")
+        assert {trial.state.name for trial in study.trials} <= {"COMPLETE", "PRUNED"}
+        assert set(study.trials[0].params) >= {"model_breadth", "min_fraction", "max_backups_power"}
+        # A trial's settings can be trained with: they pass the converter.
+        options = ("--storage", file, "--study-name", "car", "--trial-id", 1)
+        assert call("train", *train_args(tmp_path, *options, n=100)) == 0
+
+    @pytest.mark.slow
+    def test_processes_share_a_study_in_a_database(self, tmp_path):
+        pytest.importorskip("pandas")
+        optuna = pytest.importorskip("optuna")
+        url = f"sqlite:///{tmp_path / 'study.db'}"
+        optuna.create_study(storage=url, study_name="car", direction="maximize")
+        command = [sys.executable, "-m", "sb3_combrel.zoo", "train"]
+        both = [
+            subprocess.Popen([*command, *self.tune(tmp_path / name, url)], stdout=subprocess.DEVNULL) for name in ("a", "b")
+        ]
+        assert [process.wait(timeout=300) for process in both] == [0, 0]
+        assert len(optuna.load_study(storage=url, study_name="car").trials) == 4
+
+
+class TestTablesAndPictures:
+    def test_plots_and_table(self, logs, tmp_path, capsys):
+        pytest.importorskip("seaborn")
+        pytest.importorskip("pandas")
+        assert call("plot_train", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs) == 0
+        options = ("--no-display", "--no-million", "-o", tmp_path / "all")
+        assert call("all_plots", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs, *options) == 0
+        assert "FITTED_RMAX" in capsys.readouterr().out
+        assert (tmp_path / "all.pkl").exists()
+
+    @pytest.mark.slow
+    def test_benchmark_writes_a_table(self, logs, tmp_path):
+        pytest.importorskip("pandas")
+        options = ("--no-hub", "--test-mode", "-n", 300, "--log-dir", logs, "--benchmark-dir", tmp_path)
+        assert call("benchmark", *options, "--gym-packages", "combrel_envs") == 0
+        assert "fitted_rmax|combrel-MountainCar2D-v0" in (tmp_path / "benchmark.md").read_text().replace(" ", "")
+
+    @pytest.mark.slow
+    def test_record_video(self, logs, tmp_path):
+        options = ("-n", 5, "-o", tmp_path, "-f", logs, "--gym-packages", "combrel_envs")
+        assert call("record_video", "--algo", "fitted_rmax", "--env", CAR, *options) == 0
+        assert list(tmp_path.glob("*.mp4"))
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("entry", "words"),
+        [
+            ({"transfer": {"sb3_combrel.NOBODY": {"source": RECIPE}}}, "sb3_combrel.NOBODY"),
+            ({"transfer": {"sb3_combrel.COMBREL": {"source": "nowhere.npz"}}}, "no source file nowhere.npz"),
+            ({"transfer": {"sb3_combrel.COMBREL": None}}, "has no 'source'"),
+            ({"transfer": {"sb3_combrel.COMBREL": {"source": RECIPE, "neighbours": 3}}}, "neighbours"),
+            ({"transfer": {"sb3_combrel.COMBREL": {"source": {"env": "Nowhere-v0"}}}}, "Nowhere"),
+            ({"transfer": {"sb3_combrel.COMBREL": {"source": {**RECIPE, "steps": 3}}}}, "steps"),
+            ({"bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]}, "bounds"),
+            ({"normalize": True}, "VecNormalize"),
+            ({"policy": None}, '"policy"'),
+            ({"breadth": 0.1}, "breadth"),
+        ],
+    )
+    def test_what_is_wrong_in_a_configuration_is_said_in_a_sentence(self, tmp_path, capsys, entry, words):
+        entry = {"policy": "FittedRMaxPolicy", **entry}
+        if entry["policy"] is None:
+            del entry["policy"]
+        assert call("train", *train_args(tmp_path, conf=write_config(tmp_path / "bad.yml", **entry))) == 1
+        said = capsys.readouterr().err
+        assert said.startswith("sb3_combrel.zoo: ")
+        assert words in said
+        assert "Traceback" not in said
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [({"env": "combrel/MountainCar3D-v0"}, "MountainCar3D"), ({"conf": "nowhere.yml"}, "nowhere.yml")],
+    )
+    def test_an_unknown_environment_or_file_is_named(self, tmp_path, capsys, change, words):
+        assert call("train", *train_args(tmp_path, **change)) == 1
+        assert words in capsys.readouterr().err
+
+    def test_an_unknown_algorithm_is_named(self, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            call("train", *train_args(tmp_path, algo="magic"))
+        assert "magic" in capsys.readouterr().err
