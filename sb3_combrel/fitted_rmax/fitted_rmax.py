@@ -269,15 +269,15 @@ class FittedRMax(BaseAlgorithm):
         self._last_states = self.policy.to_unit(np.asarray(new_obs)) if dones.any() else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
-        if not callback.on_step():
-            return False
+        # An episode that ended is ended, and planned through, whether or not a callback stops at this very step.
+        going_on = callback.on_step()
         for ended in np.flatnonzero(dones) if dones.any() else ():
             self._end_episode(int(ended), bool(terminated[ended]))
             if log_interval is not None and self._episode_num % log_interval == 0:
                 callback.on_rollout_end()
                 self.dump_logs()
                 callback.on_rollout_start()
-        return True
+        return going_on
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         # By now the logger is set up, so it is known whether there is a log to write to.

@@ -148,7 +148,9 @@ def test_a_callback_can_stop_the_learning():
     model = small().learn(1000, callback=recorder)
     assert (model.num_timesteps, recorder.ended) == (7, 1)
     episodes = StopTrainingOnMaxEpisodes(3)
-    assert small().learn(100_000, callback=episodes).num_timesteps < 100
+    model = small().learn(100_000, callback=episodes)
+    assert model.num_timesteps < 100
+    assert model._episode_num == 3, "the episode that ended with the stop counts"
 
 
 def test_an_interrupt_ends_the_training_and_leaves_a_model_that_saves_and_goes_on(tmp_path):
