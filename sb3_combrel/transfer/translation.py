@@ -64,7 +64,8 @@ def consider(j, candidate, w, merit, own, kept, rules, best):
     total = own
     for k in range(min(kept + 1, most)):
         if not rules.by_merit and best.weight[k] < rules.min_fraction * total:
-            return k, rules.min_fraction * total
+            # Heavier than the last of the list, one need not have that part of the last's weight as well.
+            return k, min(rules.min_fraction * total, best.weight[k - 1]) if k > 0 else rules.min_fraction * total
         total += best.weight[k]
         if total >= rules.threshold:
             return k + 1, best.weight[k]

@@ -3,7 +3,7 @@
 import naive_transfer as naive
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import TIMBREL
@@ -63,6 +63,7 @@ def assert_same(supply, row, expected, believe_terminal=True):
 
 
 @settings(max_examples=60, deadline=None)
+@example(2, (1, 2, 1, 1), 1, 0.5, 2.5, 0.5, False)
 @given(
     seeds,
     st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.just(1)),
