@@ -8,15 +8,17 @@ from numba.core import event
 
 # The loops allocate nothing, so they run without numba's reference counting: its atomic increments at every call with
 # an array cost more than the loops themselves, and so does wrapping every array that comes in from Python.
-compiled = njit(cache=True, _nrt=False, error_model="numpy")  # type: ignore[call-overload]
+_options: dict[str, Any] = dict(cache=True, _nrt=False, error_model="numpy", no_cfunc_wrapper=True)
+compiled = njit(**_options)
+
+# The same for functions that only compiled code calls. Each array that may come in from Python costs time to compile.
+inner = njit(**_options, no_cpython_wrapper=True)
 
 # The same for functions called in the innermost loops: handing over a handful of arrays costs more than such a function.
-inlined = njit(cache=True, _nrt=False, error_model="numpy", forceinline=True)  # type: ignore[call-overload]
+inlined = njit(**_options, no_cpython_wrapper=True, forceinline=True)
 
 # The same for loops whose sums may be taken in any order, as vector registers do.
-compiled_fast = njit(  # type: ignore[call-overload]
-    cache=True, _nrt=False, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
-)
+compiled_fast = njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).

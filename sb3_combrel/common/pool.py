@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import inner
 
 SMALLEST_SLOT = 4
 N_SIZE_CLASSES = 26
@@ -25,6 +25,7 @@ class Pool(NamedTuple):
     :param size_class: int8, shape (n_lists,): the slot holds ``SMALLEST_SLOT << size_class`` entries
     :param free: int64, shape (N_SIZE_CLASSES,): head of the chain of free slots of each class, -1 if none
     :param used: int64, shape (1,): entries of the slab handed out so far
+    :param full: bool, shape (1,): the slab was too small for what was last asked of it
     """
 
     index: np.ndarray  # type: ignore[assignment]
@@ -34,6 +35,7 @@ class Pool(NamedTuple):
     size_class: np.ndarray
     free: np.ndarray
     used: np.ndarray
+    full: np.ndarray
 
     @classmethod
     def empty(cls, n_lists: int, capacity: int) -> "Pool":
@@ -46,10 +48,14 @@ class Pool(NamedTuple):
             size_class=np.zeros(n_lists, dtype=np.int8),
             free=np.full(N_SIZE_CLASSES, -1, dtype=np.int64),
             used=np.zeros(1, dtype=np.int64),
+            full=np.zeros(1, dtype=np.bool_),
         )
 
-    def grown(self) -> "Pool":
-        """The same lists with twice the room."""
+    def with_room(self) -> "Pool":
+        """Itself, or the same lists with twice the room if it was full."""
+        if not self.full[0]:
+            return self
+        self.full[0] = False
         more = len(self.index)
         return self._replace(
             index=np.concatenate([self.index, np.empty(more, dtype=np.int32)]),
@@ -63,7 +69,7 @@ class Pool(NamedTuple):
         return self.index[first:last], self.weight[first:last]
 
 
-@compiled
+@inner
 def reserve(pool: Pool, p: int, n_entries: int) -> bool:
     """Make room for ``n_entries`` in list ``p``, keeping what it holds; False if the slab must grow first."""
     old_start = pool.start[p]
@@ -78,6 +84,7 @@ def reserve(pool: Pool, p: int, n_entries: int) -> bool:
     else:
         slot = pool.used[0]
         if slot + (SMALLEST_SLOT << size_class) > len(pool.index):
+            pool.full[0] = True
             return False
         pool.used[0] = slot + (SMALLEST_SLOT << size_class)
     if old_start >= 0:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inner
 from sb3_combrel.common.kernels import interpolate
 
 CELLS_PER_GRID_CELL = 3
@@ -94,7 +94,7 @@ def find_cell(corrections, key):
     return at
 
 
-@compiled
+@inner
 def corrected_value(values, corrections, position, grid, scratch):
     """The value at ``position`` (unit coordinates times cells): interpolated, and cut by what is remembered there."""
     value = interpolate(values, position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
@@ -109,7 +109,7 @@ def corrected_value(values, corrections, position, grid, scratch):
     return value + min(0.0, corrections.value[m] - there)
 
 
-@compiled
+@inner
 def count_visit(corrections, key, episode):
     """How often the cell was visited in this episode, this visit included.
 
@@ -124,7 +124,7 @@ def count_visit(corrections, key, episode):
     return corrections.visits[at]
 
 
-@compiled
+@inner
 def visit(values, corrections, state, best_q, visitor, grid, scratch):
     """Count a visit to ``state``; renew what is remembered of its cell, or start to remember it (see the module).
 

@@ -13,7 +13,7 @@ from sb3_combrel.fitted_rmax.grid import StateGrid
 from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
-    enter,
+    enter_all,
     leave_lists,
     points_in_reach,
     put_and_enter,
@@ -74,6 +74,7 @@ class KernelModel:
         self.arrays = ModelArrays(
             lists=Pool.empty(n_pairs, 1 << 12),
             rows=Pool.empty(n_pairs, 1 << 14),
+            predecessors=Pool.empty(grid.n_points, 1 << 14),
             entry=np.zeros(n_pairs),
             total=np.zeros(n_pairs),
             known=np.zeros(n_pairs, dtype=np.bool_),
@@ -81,7 +82,6 @@ class KernelModel:
             reward=np.zeros(n_pairs),
             heard=np.zeros(n_pairs),
             n_optimistic=np.full(grid.n_points, n_actions, dtype=np.int64),
-            reach=np.zeros((2, grid.n_variables), dtype=np.int64),
             **self._of_instances(),
         )
         self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
@@ -106,19 +106,7 @@ class KernelModel:
         :return: the pairs whose model changed, int64
         """
         slot, without = self._slot_for(action)
-        instance = (action, slot, state, next_state, reward, terminated)
-        self._progress[:] = -1, 0
-        entered = self._put_and_enter(
-            self.instances,
-            self.arrays,
-            self.grid.arrays,
-            self._kernel,
-            self.exploration_threshold,
-            *instance,
-            self.scratch,
-            self._progress,
-        )
-        changed = self._pairs_entered(action) if entered else self._enter(action, slot)
+        changed = self._enter(action, slot, state, next_state, reward, terminated)
         return changed if len(without) == 0 else np.union1d(without, changed)
 
     def _slot_for(self, action: int) -> tuple[int, np.ndarray]:
@@ -146,9 +134,12 @@ class KernelModel:
             corner_weight=np.zeros((*places, 2**d)),
         )
 
-    def _enter(self, action: int, slot: int) -> np.ndarray:
-        """Put an instance into the lists it reaches, going on from ``_progress``; the pairs whose list has it."""
-        while not enter(
+    def _enter(
+        self, action: int, slot: int, state: np.ndarray, next_state: np.ndarray, reward: float, terminated: bool
+    ) -> np.ndarray:
+        """Put an instance into its slot and into the lists it reaches; the pairs whose list has it."""
+        self._progress[:] = -1, 0
+        while not self._put_and_enter(
             self.instances,
             self.arrays,
             self.grid.arrays,
@@ -156,14 +147,20 @@ class KernelModel:
             self.exploration_threshold,
             action,
             slot,
+            state,
+            next_state,
+            reward,
+            terminated,
             self.scratch,
             self._progress,
         ):
-            self.arrays = self.arrays._replace(lists=self.arrays.lists.grown())
-        return self._pairs_entered(action)
-
-    def _pairs_entered(self, action: int) -> np.ndarray:
+            self.make_room()
         return self.scratch.point[: self._progress[0]] + action * self.grid.n_points
+
+    def make_room(self) -> None:
+        """Grow the pools that were too small for what was last asked of them."""
+        pools = {name: getattr(self.arrays, name).with_room() for name in ("lists", "rows", "predecessors")}
+        self.arrays = self.arrays._replace(**pools)
 
     def _leave(self, action: int, slot: int) -> np.ndarray:
         if self.arrays.members[action, slot] == 0:
@@ -201,7 +198,7 @@ class KernelModel:
                     self.scratch,
                 )
                 if done < len(some):
-                    self.arrays = self.arrays._replace(rows=self.arrays.rows.grown())
+                    self.make_room()
 
     def supply_for(self, pairs: np.ndarray) -> Supply:
         """Transferred instances for ``pairs``, at most ``MOST_PAIRS_AT_ONCE``."""
@@ -215,9 +212,10 @@ class KernelModel:
         :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
         """
         self.arrays = self.arrays._replace(**self._of_instances())
-        for action in range(self.n_actions):
-            for slot in range(self.instances.count[action]):
-                self._progress[:] = -1, 0
-                self._enter(action, slot)
+        at = np.zeros(2, dtype=np.int64)
+        self._progress[:] = -1, 0
+        rules = (self._kernel, self.exploration_threshold)
+        while not enter_all(self.instances, self.arrays, self.grid.arrays, *rules, at, self.scratch, self._progress):
+            self.make_room()
         self.arrays.known[:] |= known & (self.arrays.lists.length > 0)
         self.settle(np.arange(len(known)))

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.instances import put_instance
 from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
 from sb3_combrel.common.pool import Pool, reserve
@@ -15,6 +15,7 @@ class ModelArrays(NamedTuple):
 
     :param lists: kept instances of each pair, heaviest first, with their kernel weights
     :param rows: what each settled pair leads to: grid points, with discounted probabilities (see ``build_row``)
+    :param predecessors: for each grid point those whose rows have led to it, with the largest such probability
     :param entry: float64, shape (n_pairs,): the weight that a further instance needs to enter the pair's list
     :param total: float64, shape (n_pairs,): sum of the kept weights
     :param known: bool, shape (n_pairs,): the target's own instances settle the pair
@@ -23,7 +24,6 @@ class ModelArrays(NamedTuple):
     :param heard: float64, shape (n_pairs,): what ``total`` was when the row was brought up to date
     :param n_optimistic: int64, shape (n_points,): actions of a grid point without a row
     :param members: int32, shape (n_actions, capacity): in how many lists each instance stands
-    :param reach: int64, shape (2, n_variables): farthest that any effect leads down and up each variable, in cells
     :param corner_low: int32, shape (n_actions, capacity, n_variables): the effect of each instance in cells, rounded down
     :param corner_offset: int32, shape (n_actions, capacity, 2 ** n_variables): where, counted from a grid point that it
         is applied to, the grid points around the place lie that the effect leads to; ``corner_weight``: float64, same
@@ -32,6 +32,7 @@ class ModelArrays(NamedTuple):
 
     lists: Pool
     rows: Pool
+    predecessors: Pool
     entry: np.ndarray
     total: np.ndarray
     known: np.ndarray
@@ -40,7 +41,6 @@ class ModelArrays(NamedTuple):
     heard: np.ndarray
     n_optimistic: np.ndarray
     members: np.ndarray
-    reach: np.ndarray
     corner_low: np.ndarray
     corner_offset: np.ndarray
     corner_weight: np.ndarray
@@ -138,15 +138,6 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
 
 
 @inlined
-def extend_reach(effect, cells, reach):
-    """How far one effect can lead along each variable, in cells: what the planner must look back over."""
-    for k in range(len(effect)):
-        moved = int(np.floor(effect[k] * cells[k]))
-        reach[0, k] = min(reach[0, k], moved)
-        reach[1, k] = max(reach[1, k], moved + 1)
-
-
-@compiled
 def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, progress):
     """Put an instance into the lists of all pairs that it reaches.
 
@@ -158,7 +149,6 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
     n_points = len(arrays.n_optimistic)
     first_pair = action * n_points
     if progress[0] < 0:
-        extend_reach(instances.effect[action, slot], grid.cells, arrays.reach)
         note_corners(arrays, instances.effect[action, slot], grid, action, slot)
         entry = arrays.entry[first_pair : first_pair + n_points]
         progress[0] = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, entry, scratch)
@@ -186,11 +176,30 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
 
 
 @compiled
+def enter_all(instances, arrays, grid, kernel, threshold, at, scratch, progress):
+    """:func:`enter` all instances, one after the other; returns as that does.
+
+    :param at: int64, shape (2,): action and slot to go on with, {0, 0} at first
+    """
+    while at[0] < len(instances.count):
+        while at[1] < instances.count[at[0]]:
+            if not enter(instances, arrays, grid, kernel, threshold, at[0], at[1], scratch, progress):
+                return False
+            progress[0] = -1
+            progress[1] = 0
+            at[1] += 1
+        at[0] += 1
+        at[1] = 0
+    return True
+
+
+@compiled
 def put_and_enter(
     instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress
 ):
-    """Write an instance to its slot, and :func:`enter` it into lists; returns as that does."""
-    put_instance(instances, action, slot, state, next_state, reward, terminated)
+    """Write an instance to its slot, unless that was done before, and :func:`enter` it into lists; returns as that does."""
+    if progress[0] < 0:
+        put_instance(instances, action, slot, state, next_state, reward, terminated)
     return enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, progress)
 
 
@@ -269,7 +278,7 @@ def scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_to
     return n_touched
 
 
-@compiled
+@inner
 def scatter(p, effect, scratch, grid, n_touched):
     """Spread probability ``p`` of moving by ``effect`` from the grid coordinate ``scratch.at`` over grid points."""
     for k in range(len(effect)):
@@ -285,6 +294,24 @@ def scatter(p, effect, scratch, grid, n_touched):
 
 
 @inlined
+def note_predecessor(predecessors, to, point, weight):
+    """Enter ``point`` among those that lead ``to`` a point with a probability of ``weight``; False if the pool must grow."""
+    start = predecessors.start[to]
+    length = predecessors.length[to]
+    for k in range(start, start + length):
+        if predecessors.index[k] == point:
+            predecessors.weight[k] = max(predecessors.weight[k], weight)
+            return True
+    if not reserve(predecessors, to, length + 1):
+        return False
+    end = predecessors.start[to] + length
+    predecessors.index[end] = point
+    predecessors.weight[end] = weight
+    predecessors.length[to] = length + 1
+    return True
+
+
+@inlined
 def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
 
@@ -294,7 +321,7 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     planner cuts to its bounds; so does one whose instances are all that is known of a terminal reward of 0.
 
     :param s: row of ``supply`` that belongs to the pair; counts only while the pair is not known
-    :return: False if the rows' pool must grow first (nothing was changed then)
+    :return: False if a pool must grow first
     """
     n_points = len(arrays.n_optimistic)
     action = pair // n_points
@@ -330,14 +357,24 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     stays_for_ever = leave < 1e-9
     discount = 0.0 if stays_for_ever else gamma / leave
     slot = arrays.rows.start[pair]
+    old_length = arrays.rows.length[pair]
     length = 0
+    room = True
     for t in range(n_touched):
         to = scratch.touched[t]
         if to != point and not stays_for_ever:
-            arrays.rows.index[slot + length] = to
-            arrays.rows.weight[slot + length] = scratch.dense[to] * discount
+            at = slot + length
+            weight = scratch.dense[to] * discount
+            # Where nothing new leads there from here, nobody has to be told.
+            if length >= old_length or arrays.rows.index[at] != to or arrays.rows.weight[at] < weight:
+                room = room and note_predecessor(arrays.predecessors, to, point, weight)
+            arrays.rows.index[at] = to
+            arrays.rows.weight[at] = weight
             length += 1
         scratch.dense[to] = 0.0
+    if not room:
+        arrays.rows.length[pair] = 0
+        return False
     arrays.rows.length[pair] = length
     if stays_for_ever:
         arrays.reward[pair] = 0.0 if reward == 0.0 else np.inf * reward
@@ -365,7 +402,7 @@ def worth_settling(arrays, pairs, news):
 def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
 
-    :return: how many of them are done; fewer than all if the rows' pool must grow first
+    :return: how many of them are done; fewer than all if a pool must grow first
     """
     n_points = len(arrays.n_optimistic)
     while done < len(pairs):
@@ -374,8 +411,6 @@ def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
         if has_row and not build_row(arrays, instances, grid, gamma, pair, supply, done, scratch):
             return done
         arrays.heard[pair] = arrays.total[pair]
-        for j in range(supply.count[done]):
-            extend_reach(supply.effect[done, j], grid.cells, arrays.reach)
         if has_row != arrays.settled[pair]:
             arrays.settled[pair] = has_row
             arrays.n_optimistic[pair % n_points] += -1 if has_row else 1

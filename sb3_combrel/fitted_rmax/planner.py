@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import SameTypes, compiled, inlined
+from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
 from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel
 from sb3_combrel.fitted_rmax.model_kernels import settle
@@ -14,14 +14,19 @@ EXPLOITATION_SWEEPS = 300
 
 
 class SweepQueue(NamedTuple):
-    """Grid points that wait for a backup, in a ring for each power of two of the change that called for it.
+    """Grid points that wait for a backup, in a ring for each power of two of what the backup may change.
 
     :param ring: int32, shape (N_LEVELS, n_points)
     :param head: int64, shape (N_LEVELS,); ``size``: int64, same shape
     :param level: int8, shape (n_points,): where a point waits, -1 if nowhere
     :param queued: bool, shape (N_LEVELS, n_points): the point stands in that ring, waiting or passed over
     :param announced: float64, shape (n_points,): the value that the point's predecessors were last told
+    :param pending: float64, shape (n_points,): what has been announced to the point since its last backup, each change
+        times its probability: a bound on the change that a backup would make
+    :param limit: float64, shape (n_points,): a larger ``pending`` moves the point to a higher level
     :param greedy: int16, shape (n_points,): the action that gave the point its value, -1 if none did
+    :param q: float64, shape (n_points, n_actions): Q of each pair when it was last worked out
+    :param slack: float64, same shape: how far Q may have moved since, besides ``pending``; inf: by any amount
     """
 
     ring: np.ndarray
@@ -30,10 +35,14 @@ class SweepQueue(NamedTuple):
     level: np.ndarray
     queued: np.ndarray
     announced: np.ndarray
+    pending: np.ndarray
+    limit: np.ndarray
     greedy: np.ndarray
+    q: np.ndarray
+    slack: np.ndarray
 
     @classmethod
-    def empty(cls, values: np.ndarray) -> "SweepQueue":
+    def empty(cls, values: np.ndarray, n_actions: int, tolerance: float) -> "SweepQueue":
         """Nothing waits, and everybody knows ``values``."""
         n_points = len(values)
         return cls(
@@ -43,7 +52,11 @@ class SweepQueue(NamedTuple):
             level=np.full(n_points, -1, dtype=np.int8),
             queued=np.zeros((N_LEVELS, n_points), dtype=np.bool_),
             announced=values.copy(),
+            pending=np.zeros(n_points),
+            limit=np.full(n_points, tolerance),
             greedy=np.full(n_points, -1, dtype=np.int16),
+            q=np.zeros((n_points, n_actions)),
+            slack=np.full((n_points, n_actions), np.inf),
         )
 
 
@@ -79,10 +92,12 @@ def pop(queue):
 
 
 @inlined
-def forget(values, queue):
+def forget(values, queue, tolerance):
     """Nothing waits any more, and everybody knows ``values``."""
     for point in range(len(values)):
         queue.announced[point] = values[point]
+        queue.pending[point] = 0.0
+        queue.limit[point] = tolerance
         queue.level[point] = -1
         for level in range(N_LEVELS):
             queue.queued[level, point] = False
@@ -91,26 +106,47 @@ def forget(values, queue):
 
 
 @inlined
-def value_of_pair(values, arrays, pair):
-    """Q of a pair that is settled."""
+def work_out(values, arrays, queue, point, action):
+    """Q of a pair that is settled, from its row."""
+    pair = point + action * len(values)
     q = arrays.reward[pair]
     start = arrays.rows.start[pair]
     for k in range(start, start + arrays.rows.length[pair]):
         q += arrays.rows.weight[k] * values[arrays.rows.index[k]]
+    queue.q[point, action] = q
+    queue.slack[point, action] = 0.0
     return q
 
 
-@compiled
-def back_up(values, arrays, queue, point, bounds):
-    """V(point) = max over a of Q(point, a), Fitted R-Max's backup; ``max_value`` while an action is optimistic."""
-    n_points = len(values)
+@inner
+def back_up(values, arrays, queue, point, bounds, tolerance):
+    """V(point) = max over a of Q(point, a), Fitted R-Max's backup; ``max_value`` while an action is optimistic.
+
+    Starts with the action that was best. Of the others, only those are worked out that can have become better: rows
+    lie all over the memory, and to read them takes most of the time of planning.
+    """
+    pending = queue.pending[point]
+    greedy = queue.greedy[point]
+    queue.pending[point] = 0.0
+    queue.limit[point] = tolerance
     queue.greedy[point] = -1
     if arrays.n_optimistic[point] > 0:
         values[point] = bounds[1]
         return
     best = bounds[0]
-    for action in range(len(arrays.reward) // n_points):
-        q = value_of_pair(values, arrays, point + action * n_points)
+    if greedy >= 0:
+        q = work_out(values, arrays, queue, point, greedy)
+        if q > best:
+            best = q
+            queue.greedy[point] = greedy
+    for action in range(queue.q.shape[1]):
+        if action == greedy:
+            continue
+        # What nobody was told of adds up to two tolerances.
+        if queue.q[point, action] + queue.slack[point, action] + pending + 2.0 * tolerance <= best:
+            queue.slack[point, action] += pending
+            continue
+        q = work_out(values, arrays, queue, point, action)
         if q > best:
             best = q
             queue.greedy[point] = action
@@ -118,74 +154,49 @@ def back_up(values, arrays, queue, point, bounds):
 
 
 @inlined
-def take_over(values, arrays, queue, pair, bounds):
+def take_over(values, arrays, queue, pair, bounds, tolerance):
     """Bring V of the pair's point up to date when nothing but the pair's row has changed."""
-    n_points = len(values)
-    action = pair // n_points
-    point = pair - action * n_points
+    action = pair // len(values)
+    point = pair - action * len(values)
     greedy = queue.greedy[point]
-    if greedy < 0 or arrays.n_optimistic[point] > 0:
-        back_up(values, arrays, queue, point, bounds)
-        return
-    q = value_of_pair(values, arrays, pair)
-    if q >= values[point]:
-        values[point] = min(q, bounds[1])
+    queue.slack[point, action] = np.inf
+    if greedy < 0 or greedy == action or arrays.n_optimistic[point] > 0:
+        back_up(values, arrays, queue, point, bounds, tolerance)
+    elif work_out(values, arrays, queue, point, action) >= values[point]:
+        values[point] = min(queue.q[point, action], bounds[1])
         queue.greedy[point] = action
-    elif greedy == action:
-        back_up(values, arrays, queue, point, bounds)
 
 
-@inlined
-def announce(values, n_optimistic, queue, point, reach, grid, tolerance, at):
-    """Have every grid point that may lead to ``point`` wait for a backup, the sooner the larger the change."""
+@inner
+def announce(values, arrays, queue, point, tolerance):
+    """Tell the predecessors of ``point`` how far its value has moved; who may move by more than ``tolerance`` waits."""
     change = abs(values[point] - queue.announced[point])
     if change <= tolerance:
         return
     queue.announced[point] = values[point]
-    level = min(N_LEVELS - 1, int(np.log2(change / tolerance)))
-    d = len(grid.shape)
-    inner = d - 1
-    rest = point
-    base = 0
-    for k in range(d):
-        c = rest // grid.strides[k]
-        rest -= c * grid.strides[k]
-        at[0, k] = max(0, c - reach[1, k])
-        at[1, k] = min(grid.shape[k] - 1, c - reach[0, k])
-        at[2, k] = at[0, k]
-        if k < inner:
-            base += at[0, k] * grid.strides[k]
-    while True:
-        for j in range(at[0, inner], at[1, inner] + 1):
-            if queue.level[base + j] < level and n_optimistic[base + j] == 0 and base + j != point:
-                push(queue, base + j, level)
-        k = inner - 1
-        while k >= 0:
-            at[2, k] += 1
-            base += grid.strides[k]
-            if at[2, k] <= at[1, k]:
-                break
-            base -= (at[2, k] - at[0, k]) * grid.strides[k]
-            at[2, k] = at[0, k]
-            k -= 1
-        if k < 0:
-            return
+    start = arrays.predecessors.start[point]
+    for k in range(start, start + arrays.predecessors.length[point]):
+        before = arrays.predecessors.index[k]
+        pending = queue.pending[before] + change * arrays.predecessors.weight[k]
+        queue.pending[before] = pending
+        if pending > queue.limit[before] and arrays.n_optimistic[before] == 0:
+            level = min(N_LEVELS - 1, int(np.log2(pending / tolerance)))
+            queue.limit[before] = tolerance * 2.0 ** (level + 1)
+            push(queue, before, level)
 
 
-@compiled
-def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, at):
+@inlined
+def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
     """Take over the pairs ``changed``, then back up the points that wait, largest change first.
 
     :param values: float64, shape (n_points,), updated in place
     :param bounds: (min_value, max_value)
     :param max_backups: of those that wait; the rest waits for the next call
-    :param at: int64 scratch, shape (3, n_variables)
     :return: backups done
     """
     for c in range(len(changed)):
-        take_over(values, arrays, queue, changed[c], bounds)
-        point = changed[c] % len(values)
-        announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
+        take_over(values, arrays, queue, changed[c], bounds, tolerance)
+        announce(values, arrays, queue, changed[c] % len(values), tolerance)
     backups = 0
     while backups < max_backups:
         point = pop(queue)
@@ -193,14 +204,26 @@ def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, 
             break
         if arrays.n_optimistic[point] > 0 and values[point] == bounds[1]:
             continue
-        back_up(values, arrays, queue, point, bounds)
+        back_up(values, arrays, queue, point, bounds, tolerance)
         backups += 1
-        announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
+        announce(values, arrays, queue, point, tolerance)
     return backups + len(changed)
 
 
 @compiled
-def sweep_all(values, arrays, queue, grid, bounds, tolerance, most_passes, at):
+def settle_and_sweep(values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch):
+    """``settle`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
+
+    :param pairs: at most MOST_PAIRS_AT_ONCE
+    :return: backups done; -1, and nothing swept, if a pool of the model must grow first
+    """
+    if settle(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
+        return -1
+    return sweep(values, arrays, queue, pairs, bounds, tolerance, max_backups)
+
+
+@compiled
+def sweep_all(values, arrays, queue, bounds, tolerance, most_passes):
     """Back up all points, one after the other, up and down the grid until little changes; what is left waits.
 
     Points in the order in which their rows lie in memory take a fourth of the time of points here and there: where
@@ -216,29 +239,17 @@ def sweep_all(values, arrays, queue, grid, bounds, tolerance, most_passes, at):
             point = step if n % 2 == 0 else n_points - 1 - step
             before = values[point]
             if arrays.n_optimistic[point] == 0 or before != bounds[1]:
-                back_up(values, arrays, queue, point, bounds)
+                queue.slack[point] = np.inf
+                back_up(values, arrays, queue, point, bounds, tolerance)
                 largest = max(largest, abs(values[point] - before))
                 backups += 1
         if largest <= tolerance:
-            forget(values, queue)
+            forget(values, queue, tolerance)
             return backups
     for point in range(n_points):
-        announce(values, arrays.n_optimistic, queue, point, arrays.reach, grid, tolerance, at)
+        announce(values, arrays, queue, point, tolerance)
+        queue.slack[point] = np.inf
     return backups
-
-
-@compiled
-def settle_and_sweep(
-    values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch, at
-):
-    """``settle`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
-
-    :param pairs: at most MOST_PAIRS_AT_ONCE
-    :return: backups done; -1, and nothing swept, if the rows' pool must grow first
-    """
-    if settle(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
-        return -1
-    return sweep(values, arrays, queue, pairs, grid, bounds, tolerance, max_backups, at)
 
 
 class Planner:
@@ -255,11 +266,9 @@ class Planner:
         self.tolerance = float(tolerance)
         self.bounds = (float(min_value), float(max_value))
         self.values = np.full(model.grid.n_points, float(max_value))
-        self.queue = SweepQueue.empty(self.values)
+        self.queue = SweepQueue.empty(self.values, model.n_actions, self.tolerance)
         self._settle_and_sweep = SameTypes(settle_and_sweep)
         self._sweep_all = SameTypes(sweep_all)
-        self._sweep = SameTypes(sweep)
-        self._at = np.empty((3, model.grid.n_variables), dtype=np.int64)
         self._exploitation: np.ndarray | None = None
 
     def update(self, pairs: np.ndarray, max_backups: int) -> int:
@@ -269,59 +278,40 @@ class Planner:
         :param max_backups: of the points that wait; the others wait for the next call
         :return: backups done
         """
+        self._exploitation = None
+        backups = 0
+        while len(pairs) > MOST_PAIRS_AT_ONCE:
+            backups += self._update_some(pairs[:MOST_PAIRS_AT_ONCE], 0)
+            pairs = pairs[MOST_PAIRS_AT_ONCE:]
+        return backups + self._update_some(pairs, max_backups)
+
+    def _update_some(self, pairs: np.ndarray, max_backups: int) -> int:
         model = self.model
-        if len(pairs) <= MOST_PAIRS_AT_ONCE:
-            self._exploitation = None
-            backups = self._settle_and_sweep(
+        supply = model.supply_for(pairs)
+        while True:
+            backups: int = self._settle_and_sweep(
                 self.values,
                 model.arrays,
                 model.instances,
                 self.queue,
                 pairs,
-                model.supply_for(pairs),
+                supply,
                 model.grid.arrays,
                 model.gamma,
                 self.bounds,
                 self.tolerance,
                 max_backups,
                 model.scratch,
-                self._at,
             )
             if backups >= 0:
                 return backups
-        model.settle(pairs)
-        return self.sweep(pairs, max_backups)
-
-    def sweep(self, pairs: np.ndarray, max_backups: int) -> int:
-        """Take over settled ``pairs``, then back up ``max_backups`` points of those that wait; backups done."""
-        self._exploitation = None
-        model = self.model
-        return self._sweep(
-            self.values,
-            model.arrays,
-            self.queue,
-            pairs,
-            model.grid.arrays,
-            self.bounds,
-            self.tolerance,
-            max_backups,
-            self._at,
-        )
+            model.make_room()
 
     def sweep_all(self, most_passes: int) -> int:
         """Back up all points up to ``most_passes`` times, where most of the model is new; backups done."""
         self._exploitation = None
-        model = self.model
-        return self._sweep_all(
-            self.values,
-            model.arrays,
-            self.queue,
-            model.grid.arrays,
-            self.bounds,
-            self.tolerance,
-            most_passes,
-            self._at,
-        )
+        arguments = (self.values, self.model.arrays, self.queue, self.bounds, self.tolerance, most_passes)
+        return int(self._sweep_all(*arguments))
 
     def exploitation_values(self) -> np.ndarray:
         """Values at the grid points without optimism, for evaluation; worked out once for each state of the model.
@@ -343,9 +333,10 @@ class Planner:
         """Take over saved values; every point with a row is backed up once more when there is time."""
         self._exploitation = None
         self.values[:] = np.clip(values, *self.bounds)
-        self.queue = SweepQueue.empty(self.values)
-        for point in np.flatnonzero(self.model.arrays.n_optimistic == 0):
-            push(self.queue, point, 0)
+        self.queue = SweepQueue.empty(self.values, self.model.n_actions, self.tolerance)
+        waiting = np.flatnonzero(self.model.arrays.n_optimistic == 0)
+        self.queue.ring[0, : len(waiting)], self.queue.size[0] = waiting, len(waiting)
+        self.queue.level[waiting], self.queue.queued[0, waiting] = 0, True
 
     @property
     def n_waiting(self) -> int:

@@ -21,7 +21,7 @@ from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays, find
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import Planner
-from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around, q_values
+from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
@@ -33,6 +33,7 @@ AT_EPISODE_END = 100
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 10
 NO_PAIRS = np.empty(0, dtype=np.int64)
+NOBODY = (-1, 0.0, 0)
 
 
 class FittedRMaxPolicy(BasePolicy):
@@ -180,22 +181,23 @@ class FittedRMaxPolicy(BasePolicy):
         :param values: at the grid points; by default the planner's, optimistic ones
         :return: shape (n_actions,)
         """
-        look_around(self.model.instances, state, self.kernel, self._query)
-        supply = self._no_supply if self.transfer is None else self.transfer.supply_at(state, self._query.total)
-        q_values(
-            self.model.instances,
-            state,
-            self.exploration_threshold,
-            self.gamma,
-            self.planner.values if values is None else values,
-            self.corrections,
-            self.model.grid.arrays,
-            self.planner.bounds,
-            supply,
-            self._query,
-            self._q,
-        )
+        exact = np.ascontiguousarray(state, dtype=np.float64)
+        self._choose_at(exact, self.planner.values if values is None else values, NOBODY)
         return self._q.copy()
+
+    def _choose_at(self, state: np.ndarray, values: np.ndarray, visitor: tuple[int, float, int]) -> int:
+        """Work out ``_q`` at a state, and note a visit there (see ``choose``); the best action, -1 if several are."""
+        instances = self.model.instances
+        rest = (self.exploration_threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
+        if self.transfer is None:
+            return int(
+                self._look_and_choose(
+                    instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor
+                )
+            )
+        self._look_around(instances, state, self.kernel, self._query)
+        supply = self.transfer.supply_at(state, self._query.total)
+        return int(self._choose(instances, state, *rest, supply, self._query, self._q, visitor))
 
     def explore(self, state: np.ndarray, episode: int) -> int:
         """
@@ -207,23 +209,7 @@ class FittedRMaxPolicy(BasePolicy):
         """
         if self.corrections.count[0] == len(self.corrections.key):
             self.corrections = self.corrections.with_room()
-        rest = (
-            self.exploration_threshold,
-            self.gamma,
-            self.planner.values,
-            self.corrections,
-            self.model.grid.arrays,
-            self.planner.bounds,
-        )
-        visitor = (episode, 5 * self.planner.tolerance, PATIENCE)
-        if self.transfer is None:
-            best = self._look_and_choose(
-                self.model.instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor
-            )
-        else:
-            self._look_around(self.model.instances, state, self.kernel, self._query)
-            supply = self.transfer.supply_at(state, self._query.total)
-            best = self._choose(self.model.instances, state, *rest, supply, self._query, self._q, visitor)
+        best = self._choose_at(state, self.planner.values, (episode, 5 * self.planner.tolerance, PATIENCE))
         if best >= 0:
             return best
         ties = np.flatnonzero(self._q == self._q.max())
@@ -282,7 +268,7 @@ class FittedRMaxPolicy(BasePolicy):
     def prepare(self) -> int:
         """Take up what transfer has to say before the first step, and plan until that is thought through."""
         backups = self._plan(0)
-        return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
+        return backups if self.transfer is None else backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
 
     def _plan(self, max_backups: int) -> int:
         """Plan, and note how long it took if that is wanted (``timed``); backups done."""
@@ -305,7 +291,7 @@ class FittedRMaxPolicy(BasePolicy):
                 passes = backups // self.model.grid.n_points
                 max_backups += backups if passes == 0 else 0
         if not self._unsettled:
-            return self.planner.sweep(NO_PAIRS, max_backups)
+            return self.planner.update(NO_PAIRS, max_backups)
         # Left on the list until all is done: an interrupt in between loses no change.
         pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
         backups = self.planner.update(pairs, max_backups)

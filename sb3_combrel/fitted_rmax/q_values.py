@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inner
 from sb3_combrel.common.kernels import near_instances
 from sb3_combrel.fitted_rmax.corrections import corrected_value, visit
 
@@ -64,7 +64,7 @@ def look_around(instances, state, kernel, query):
         )
 
 
-@compiled
+@inner
 def add_successor(p, state, effect, values, corrections, grid, query):
     """(undiscounted value, probability to stay) that one instance adds to a backup at ``state``."""
     moved = 0.0
@@ -79,7 +79,7 @@ def add_successor(p, state, effect, values, corrections, grid, query):
     return p * corrected_value(values, corrections, query.position, grid, query), 0.0
 
 
-@compiled
+@inner
 def q_values(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q):
     """Q of every action at ``state``, from the lists in ``query`` and the supply for it.
 
@@ -137,9 +137,9 @@ def look_and_choose(instances, state, kernel, threshold, gamma, values, correcti
 
 @compiled
 def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
-    """Action values at a visited state, from the lists in ``query``.
+    """Action values at a state, from the lists in ``query``, and what is to be remembered of the visit.
 
-    :param visitor: see ``corrections.visit``
+    :param visitor: see ``corrections.visit``; an episode of -1: nobody is there, nothing is remembered
     :return: the best action, -1 if several are
     """
     q_values(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q)
@@ -151,5 +151,6 @@ def choose(instances, state, threshold, gamma, values, corrections, grid, bounds
             ties = 0
         elif q[action] == q[best]:
             ties += 1
-    visit(values, corrections, state, q[best], visitor, grid, query)
+    if visitor[0] >= 0:
+        visit(values, corrections, state, q[best], visitor, grid, query)
     return -1 if ties > 0 else best

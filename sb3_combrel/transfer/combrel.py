@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite
-from sb3_combrel.common.compiled import SameTypes, compiled
+from sb3_combrel.common.compiled import compiled, inner, SameTypes
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.compliance import ComplianceScratch, standstill_compliance, transition_compliance
@@ -285,7 +285,7 @@ def note_neighbor(i, state, sample_states, near, distance, changed):
     return n_changed
 
 
-@compiled
+@inner
 def best_candidate(near, tables, least, ways, action):
     """The candidate of ``action`` with the highest mean compliance with the transitions ``near``; -1 if none has enough.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inner
 
 
 @compiled
@@ -50,7 +50,7 @@ def relevance(states, effects, rewards, source, action, index, sign, bandwidths,
         merit[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
 
 
-@compiled
+@inner
 def _mean_distance(weight, total, mu, bandwidth):
     """d_j of Eq. 4: mean distance of the heaviest transitions that together make up ``mu`` of the weight.
 

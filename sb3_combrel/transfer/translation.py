@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inner
 
 
 class CandidateArrays(NamedTuple):
@@ -39,7 +39,7 @@ class TransferRules(NamedTuple):
     by_merit: bool
 
 
-@compiled
+@inner
 def consider(j, candidate, w, merit, own, kept, rules, best):
     """Enter an instance into the list of the best, heaviest (or worthiest) first, and cut what is not needed any more.
 
@@ -72,7 +72,7 @@ def consider(j, candidate, w, merit, own, kept, rules, best):
     return min(kept + 1, most), best.weight[most - 1] if kept + 1 >= most else 0.0
 
 
-@compiled
+@inner
 def gather(state, source, row, action, mappings, rules, merit, own, kept, best, candidate):
     """Enter the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` into ``best``.
 
@@ -104,7 +104,7 @@ def gather(state, source, row, action, mappings, rules, merit, own, kept, best, 
     return kept
 
 
-@compiled
+@inner
 def write_row(s, own, kept, source, ways, mappings, rules, best, supply):
     """Write the best instances to row ``s`` of ``supply``, if they and ``own`` reach the threshold."""
     total = own
