@@ -11,7 +11,8 @@ from numba.core import event
 _options: dict[str, Any] = dict(cache=True, _nrt=False, error_model="numpy", no_cfunc_wrapper=True)
 compiled = njit(**_options)
 
-# The same for functions that only compiled code calls. Each array that may come in from Python costs time to compile.
+# The same for functions that only compiled code calls: each array that may come in from Python costs time to compile.
+# Calling one from Python would crash; a test compiles its ``py_func`` anew.
 inner = njit(**_options, no_cpython_wrapper=True)
 
 # The same for functions called in the innermost loops: handing over a handful of arrays costs more than such a function.

@@ -47,7 +47,7 @@ class FittedRMax(BaseAlgorithm):
     - Successors are cut at the edge of the grid, one cell beyond the box for up to two state variables and the box
       itself for more: far fewer states, and no worse learning.
     - A pair that was known once stays known (the original falls back when a nearer instance shortens its list).
-    - Planning is bounded by ``max_backups`` a step, the largest changes first; the rest is done as time comes, at an
+    - Planning is bounded by ``max_backups`` a step, first come, first served; the rest is done as time comes, at an
       episode's end at the latest. Staying in a grid point is summed in closed form.
     - Where the agent comes back to the same place again and again, a wrong promise of the interpolated value is
       corrected (see ``sb3_combrel.fitted_rmax.corrections``): a plain implementation can stick there for ever.
@@ -108,7 +108,7 @@ class FittedRMax(BaseAlgorithm):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 50,
+        max_backups: int = 30,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,

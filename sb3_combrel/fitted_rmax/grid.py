@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.kernels import interpolate
 
 
@@ -25,6 +26,12 @@ class GridArrays(NamedTuple):
     strides: np.ndarray
     cells: np.ndarray
     margin: np.ndarray
+
+
+@compiled
+def interpolate_once(values, position, shape, strides, corner_index, corner_weight):
+    """:func:`interpolate` for callers from Python."""
+    return interpolate(values, position, shape, strides, corner_index, corner_weight)
 
 
 class StateGrid:
@@ -64,7 +71,9 @@ class StateGrid:
         :param state: unit coordinates, shape (n_variables,); outside the grid the nearest point of it counts
         """
         position = state * self.arrays.cells + self.margin
-        return interpolate(values, position, self.arrays.shape, self.arrays.strides, self._corner_index, self._corner_weight)
+        return interpolate_once(
+            values, position, self.arrays.shape, self.arrays.strides, self._corner_index, self._corner_weight
+        )
 
 
 def default_resolution(n_variables: int, reach: float) -> int:

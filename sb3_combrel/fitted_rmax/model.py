@@ -15,7 +15,6 @@ from sb3_combrel.fitted_rmax.model_kernels import (
     Scratch,
     enter_all,
     leave_lists,
-    points_in_reach,
     put_and_enter,
     settle,
     worth_settling,
@@ -165,10 +164,8 @@ class KernelModel:
     def _leave(self, action: int, slot: int) -> np.ndarray:
         if self.arrays.members[action, slot] == 0:
             return np.empty(0, dtype=np.int64)
-        state = self.instances.state[action, slot]
-        anywhere = np.zeros(self.grid.n_points)
-        found = points_in_reach(state, self.model_breadth, self.min_weight, self.grid.arrays, anywhere, self.scratch)
-        changed = leave_lists(self.arrays, action, slot, found, self.min_fraction, self.scratch)
+        rest = (self._kernel, action, slot, np.zeros(self.grid.n_points), self.scratch)
+        changed = leave_lists(self.instances, self.arrays, self.grid.arrays, *rest)
         return self.scratch.point[:changed] + action * self.grid.n_points
 
     def worth_settling(self, pairs: np.ndarray) -> np.ndarray:

@@ -90,7 +90,7 @@ class Scratch(NamedTuple):
         )
 
 
-@compiled
+@inner
 def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
     """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
 
@@ -204,12 +204,15 @@ def put_and_enter(
 
 
 @compiled
-def leave_lists(arrays, action, slot, n_found, min_fraction, scratch):
+def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch):
     """Take an instance out of the lists in which it stands.
 
-    :param n_found: number of pairs in its reach, from :func:`points_in_reach`
+    :param kernel: (breadth, min_weight, min_fraction)
+    :param anywhere: zeros, shape (n_points,)
     :return: how many lists changed; their points are moved to the front of ``scratch.point``
     """
+    breadth, min_weight, min_fraction = kernel
+    n_found = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, anywhere, scratch)
     first_pair = action * len(arrays.n_optimistic)
     lists = arrays.lists
     changed = 0
@@ -400,6 +403,12 @@ def worth_settling(arrays, pairs, news):
 
 @compiled
 def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
+    """:func:`settle_pairs` for a caller who plans later."""
+    return settle_pairs(arrays, instances, grid, gamma, pairs, done, supply, scratch)
+
+
+@inner
+def settle_pairs(arrays, instances, grid, gamma, pairs, done, supply, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
 
     :return: how many of them are done; fewer than all if a pool must grow first

@@ -1,4 +1,4 @@
-"""Dynamic programming on the grid: prioritized sweeping with a bound on the work of each step."""
+"""Dynamic programming on the grid: changes are passed on to predecessors, with a bound on the work of each step."""
 
 from typing import NamedTuple
 
@@ -7,53 +7,44 @@ import numpy as np
 from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
 from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel
-from sb3_combrel.fitted_rmax.model_kernels import settle
+from sb3_combrel.fitted_rmax.model_kernels import settle_pairs
 
-N_LEVELS = 24
 EXPLOITATION_SWEEPS = 300
 
 
 class SweepQueue(NamedTuple):
-    """Grid points that wait for a backup, in a ring for each power of two of what the backup may change.
+    """Grid points that wait for a backup, in a ring, and what is known of each point's actions without one.
 
-    :param ring: int32, shape (N_LEVELS, n_points)
-    :param head: int64, shape (N_LEVELS,); ``size``: int64, same shape
-    :param level: int8, shape (n_points,): where a point waits, -1 if nowhere
-    :param queued: bool, shape (N_LEVELS, n_points): the point stands in that ring, waiting or passed over
+    :param ring: int32, shape (n_points,)
+    :param ends: int64, shape (2,): where in the ring the first waits, and how many wait
+    :param waiting: bool, shape (n_points,)
     :param announced: float64, shape (n_points,): the value that the point's predecessors were last told
     :param pending: float64, shape (n_points,): what has been announced to the point since its last backup, each change
         times its probability: a bound on the change that a backup would make
-    :param limit: float64, shape (n_points,): a larger ``pending`` moves the point to a higher level
     :param greedy: int16, shape (n_points,): the action that gave the point its value, -1 if none did
     :param q: float64, shape (n_points, n_actions): Q of each pair when it was last worked out
     :param slack: float64, same shape: how far Q may have moved since, besides ``pending``; inf: by any amount
     """
 
     ring: np.ndarray
-    head: np.ndarray
-    size: np.ndarray
-    level: np.ndarray
-    queued: np.ndarray
+    ends: np.ndarray
+    waiting: np.ndarray
     announced: np.ndarray
     pending: np.ndarray
-    limit: np.ndarray
     greedy: np.ndarray
     q: np.ndarray
     slack: np.ndarray
 
     @classmethod
-    def empty(cls, values: np.ndarray, n_actions: int, tolerance: float) -> "SweepQueue":
+    def empty(cls, values: np.ndarray, n_actions: int) -> "SweepQueue":
         """Nothing waits, and everybody knows ``values``."""
         n_points = len(values)
         return cls(
-            ring=np.empty((N_LEVELS, n_points), dtype=np.int32),
-            head=np.zeros(N_LEVELS, dtype=np.int64),
-            size=np.zeros(N_LEVELS, dtype=np.int64),
-            level=np.full(n_points, -1, dtype=np.int8),
-            queued=np.zeros((N_LEVELS, n_points), dtype=np.bool_),
+            ring=np.empty(n_points, dtype=np.int32),
+            ends=np.zeros(2, dtype=np.int64),
+            waiting=np.zeros(n_points, dtype=np.bool_),
             announced=values.copy(),
             pending=np.zeros(n_points),
-            limit=np.full(n_points, tolerance),
             greedy=np.full(n_points, -1, dtype=np.int16),
             q=np.zeros((n_points, n_actions)),
             slack=np.full((n_points, n_actions), np.inf),
@@ -61,48 +52,24 @@ class SweepQueue(NamedTuple):
 
 
 @inlined
-def push(queue, point, level):
-    """Let ``point`` wait for a backup; points of higher levels come first."""
-    queue.level[point] = level
-    if not queue.queued[level, point]:
-        n_points = queue.ring.shape[1]
-        end = queue.head[level] + queue.size[level]
-        queue.ring[level, end - n_points if end >= n_points else end] = point
-        queue.size[level] += 1
-        queue.queued[level, point] = True
+def push(queue, point):
+    """Let ``point`` wait for a backup."""
+    end = queue.ends[0] + queue.ends[1]
+    queue.ring[end - len(queue.ring) if end >= len(queue.ring) else end] = point
+    queue.ends[1] += 1
+    queue.waiting[point] = True
 
 
 @inlined
 def pop(queue):
-    """The point to back up next, -1 if none waits."""
-    n_points = queue.ring.shape[1]
-    level = N_LEVELS - 1
-    while level >= 0:
-        if queue.size[level] == 0:
-            level -= 1
-            continue
-        point = queue.ring[level, queue.head[level]]
-        queue.head[level] = queue.head[level] + 1 if queue.head[level] + 1 < n_points else 0
-        queue.size[level] -= 1
-        queue.queued[level, point] = False
-        if queue.level[point] == level:
-            queue.level[point] = -1
-            return point
-    return -1
-
-
-@inlined
-def forget(values, queue, tolerance):
-    """Nothing waits any more, and everybody knows ``values``."""
-    for point in range(len(values)):
-        queue.announced[point] = values[point]
-        queue.pending[point] = 0.0
-        queue.limit[point] = tolerance
-        queue.level[point] = -1
-        for level in range(N_LEVELS):
-            queue.queued[level, point] = False
-    for level in range(N_LEVELS):
-        queue.size[level] = 0
+    """The point that has waited longest, -1 if none waits."""
+    if queue.ends[1] == 0:
+        return np.int32(-1)
+    point = queue.ring[queue.ends[0]]
+    queue.ends[0] = queue.ends[0] + 1 if queue.ends[0] + 1 < len(queue.ring) else 0
+    queue.ends[1] -= 1
+    queue.waiting[point] = False
+    return point
 
 
 @inlined
@@ -128,7 +95,6 @@ def back_up(values, arrays, queue, point, bounds, tolerance):
     pending = queue.pending[point]
     greedy = queue.greedy[point]
     queue.pending[point] = 0.0
-    queue.limit[point] = tolerance
     queue.greedy[point] = -1
     if arrays.n_optimistic[point] > 0:
         values[point] = bounds[1]
@@ -177,17 +143,17 @@ def announce(values, arrays, queue, point, tolerance):
     start = arrays.predecessors.start[point]
     for k in range(start, start + arrays.predecessors.length[point]):
         before = arrays.predecessors.index[k]
-        pending = queue.pending[before] + change * arrays.predecessors.weight[k]
-        queue.pending[before] = pending
-        if pending > queue.limit[before] and arrays.n_optimistic[before] == 0:
-            level = min(N_LEVELS - 1, int(np.log2(pending / tolerance)))
-            queue.limit[before] = tolerance * 2.0 ** (level + 1)
-            push(queue, before, level)
+        queue.pending[before] += change * arrays.predecessors.weight[k]
+        if queue.pending[before] > tolerance and not queue.waiting[before] and arrays.n_optimistic[before] == 0:
+            push(queue, before)
 
 
 @inlined
 def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
-    """Take over the pairs ``changed``, then back up the points that wait, largest change first.
+    """Take over the pairs ``changed``, then back up the points that wait, in the order of their coming.
+
+    With the largest change first, states from which no known way leads on would be backed up again and again, their
+    values falling by a step's reward each time, before any other.
 
     :param values: float64, shape (n_points,), updated in place
     :param bounds: (min_value, max_value)
@@ -212,12 +178,12 @@ def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
 
 @compiled
 def settle_and_sweep(values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch):
-    """``settle`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
+    """``settle_pairs`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
 
     :param pairs: at most MOST_PAIRS_AT_ONCE
     :return: backups done; -1, and nothing swept, if a pool of the model must grow first
     """
-    if settle(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
+    if settle_pairs(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
         return -1
     return sweep(values, arrays, queue, pairs, bounds, tolerance, max_backups)
 
@@ -244,7 +210,11 @@ def sweep_all(values, arrays, queue, bounds, tolerance, most_passes):
                 largest = max(largest, abs(values[point] - before))
                 backups += 1
         if largest <= tolerance:
-            forget(values, queue, tolerance)
+            for point in range(n_points):
+                queue.announced[point] = values[point]
+                queue.pending[point] = 0.0
+                queue.waiting[point] = False
+            queue.ends[1] = 0
             return backups
     for point in range(n_points):
         announce(values, arrays, queue, point, tolerance)
@@ -266,13 +236,13 @@ class Planner:
         self.tolerance = float(tolerance)
         self.bounds = (float(min_value), float(max_value))
         self.values = np.full(model.grid.n_points, float(max_value))
-        self.queue = SweepQueue.empty(self.values, model.n_actions, self.tolerance)
+        self.queue = SweepQueue.empty(self.values, model.n_actions)
         self._settle_and_sweep = SameTypes(settle_and_sweep)
         self._sweep_all = SameTypes(sweep_all)
         self._exploitation: np.ndarray | None = None
 
     def update(self, pairs: np.ndarray, max_backups: int) -> int:
-        """Bring the rows of ``pairs`` up to date, then back up these points and what waits, largest change first.
+        """Bring the rows of ``pairs`` up to date, then back up these points and what waits.
 
         :param pairs: pairs whose model changed
         :param max_backups: of the points that wait; the others wait for the next call
@@ -333,12 +303,11 @@ class Planner:
         """Take over saved values; every point with a row is backed up once more when there is time."""
         self._exploitation = None
         self.values[:] = np.clip(values, *self.bounds)
-        self.queue = SweepQueue.empty(self.values, self.model.n_actions, self.tolerance)
+        self.queue = SweepQueue.empty(self.values, self.model.n_actions)
         waiting = np.flatnonzero(self.model.arrays.n_optimistic == 0)
-        self.queue.ring[0, : len(waiting)], self.queue.size[0] = waiting, len(waiting)
-        self.queue.level[waiting], self.queue.queued[0, waiting] = 0, True
+        self.queue.ring[: len(waiting)], self.queue.ends[1], self.queue.waiting[waiting] = waiting, len(waiting), True
 
     @property
     def n_waiting(self) -> int:
         """Grid points that wait for a backup."""
-        return int((self.queue.level >= 0).sum())
+        return int(self.queue.ends[1])

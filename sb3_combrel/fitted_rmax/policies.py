@@ -29,7 +29,7 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 LONGEST_PLAN = 10_000
 
 # Backups in multiples of max_backups, passes over the grid, and backups for each pair that transfer has changed.
-AT_EPISODE_END = 100
+AT_EPISODE_END = 150
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 10
 NO_PAIRS = np.empty(0, dtype=np.int64)
@@ -64,7 +64,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 50,
+        max_backups: int = 30,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | None = None,

@@ -43,8 +43,8 @@ class QueryScratch(NamedTuple):
         )
 
 
-@compiled
-def look_around(instances, state, kernel, query):
+@inner
+def find_near(instances, state, kernel, query):
     """Fill ``query`` with the instances that the kernel keeps at ``state``, for every action.
 
     :param kernel: (breadth, min_weight, min_fraction)
@@ -128,15 +128,8 @@ def q_values(instances, state, threshold, gamma, values, corrections, grid, boun
         q[action] = min(max(value, bounds[0]), bounds[1])
 
 
-@compiled
-def look_and_choose(instances, state, kernel, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
-    """:func:`look_around` and :func:`choose` in one call: handing over arrays takes as long as the work."""
-    look_around(instances, state, kernel, query)
-    return choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)
-
-
-@compiled
-def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
+@inner
+def find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
     """Action values at a state, from the lists in ``query``, and what is to be remembered of the visit.
 
     :param visitor: see ``corrections.visit``; an episode of -1: nobody is there, nothing is remembered
@@ -154,3 +147,22 @@ def choose(instances, state, threshold, gamma, values, corrections, grid, bounds
     if visitor[0] >= 0:
         visit(values, corrections, state, q[best], visitor, grid, query)
     return -1 if ties > 0 else best
+
+
+@compiled
+def look_and_choose(instances, state, kernel, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
+    """:func:`find_near` and :func:`find_best` in one call: handing over arrays takes as long as the work."""
+    find_near(instances, state, kernel, query)
+    return find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)
+
+
+@compiled
+def look_around(instances, state, kernel, query):
+    """:func:`find_near`, for a caller that has a supply to make from it before the next call."""
+    find_near(instances, state, kernel, query)
+
+
+@compiled
+def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
+    """:func:`find_best`, for the same caller."""
+    return find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)

@@ -6,6 +6,7 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_combrel.fitted_rmax.policies as policies
@@ -96,6 +97,10 @@ def test_it_never_gets_stuck_whatever_the_step_length(step):
 GRID = StateGrid(2, 3, 0)
 
 
+# Compiled again, to be called from here: as it is, only compiled code can call them.
+visit, corrected_value = njit(c.visit.py_func), njit(c.corrected_value.py_func)
+
+
 def scratch():
     return QueryScratch.empty(1, 2, 4)
 
@@ -104,12 +109,12 @@ def visit_often(values, memory, state, best_q, episode=0, times=1, tolerance=0.0
     for _ in range(times):
         memory = memory.with_room()
         visitor = (episode, tolerance, c.PATIENCE)
-        c.visit(values, memory, np.asarray(state, dtype=float), best_q, visitor, GRID.arrays, scratch())
+        visit(values, memory, np.asarray(state, dtype=float), best_q, visitor, GRID.arrays, scratch())
     return memory
 
 
 def value_at(values, memory, state):
-    return c.corrected_value(values, memory, np.asarray(state, dtype=float) * 8, GRID.arrays, scratch())
+    return corrected_value(values, memory, np.asarray(state, dtype=float) * 8, GRID.arrays, scratch())
 
 
 @settings(deadline=None, derandomize=True, max_examples=30)
