@@ -27,6 +27,8 @@ from combrel_envs import icub_model  # noqa: E402
 
 _CONTROL_TIMESTEP = 0.1  # (Seconds).
 _DEFAULT_TIME_LIMIT = icub_tasks.MAX_EPISODE_STEPS * _CONTROL_TIMESTEP
+#: Degrees in a radian, MuJoCo's unit.
+_DEGREES = math.degrees(1.0)
 #: How deep the hand may press into table or ball at the start, in metres: contacts are soft.
 _START_OVERLAP = 0.0005
 SUITE = containers.TaggedTasks()
@@ -106,23 +108,50 @@ class Physics(mujoco.Physics):
         self._angles = self.data.qpos[:n]
         self._ball = self.data.qpos[n : n + 2]
         self._ball_start = self.model.qpos0[n : n + 2].tolist()
+        self._targets = self.data.ctrl
+        self._limits = self.model.jnt_range[:n].tolist()
+        self._warnings_since_reset = self.data.warning.number
         self._hand = [self.model.name2id(name, "geom") for name in icub_model.HAND]
 
     def encoders(self) -> np.ndarray:
         """Returns the angles of the task's joints in degrees."""
-        return np.rad2deg(self._angles)
+        return self._angles * _DEGREES
 
     def targets(self) -> np.ndarray:
         """Returns the angles in degrees to which the joints are being moved."""
-        return np.rad2deg(self.data.ctrl)
+        return self._targets * _DEGREES
 
     def set_joints(self, degrees: Any) -> None:
         """Puts the task's joints at angles and keeps them there. As always, a call of `forward` must follow."""
-        self._angles[:] = self.data.ctrl[:] = np.deg2rad(degrees)
+        self._angles[:] = self._targets[:] = np.deg2rad(degrees)
 
-    def set_targets(self, degrees: Any) -> None:
-        """Sets the angles to which the joints are moved from now on."""
-        self.data.ctrl[:] = np.deg2rad(degrees)
+    def move_joint(self, joint: int, step: float, leash: float) -> None:
+        """Moves the target of one joint of the task.
+
+        Args:
+          joint: Its number.
+          step: Degrees by which to move the target.
+          leash: Degrees by which a joint's target may be away from the joint beforehand: one that is blocked must not
+            gather force.
+        """
+        leash /= _DEGREES
+        # Single numbers: for a handful of them NumPy takes several times as long.
+        near = zip(self._targets.tolist(), self._angles.tolist(), strict=True)
+        targets = [min(max(target, angle - leash), angle + leash) for target, angle in near]
+        low, high = self._limits[joint]
+        targets[joint] = min(max(targets[joint] + step / _DEGREES, low), high)
+        self._targets[:] = targets
+
+    def step(self, nstep: int = 1) -> None:
+        """Advances the physics by `nstep` steps; as dm_control's own, but for a cheaper check of the outcome."""
+        if self.legacy_step:
+            super().step(nstep)
+            return
+        mujoco_bindings.mj_step(self.model.ptr, self.data.ptr, nstep)
+        if self._warnings_since_reset.any():
+            warnings = np.array(list(mujoco_bindings.mjtWarning.__members__))[: len(self._warnings_since_reset)]
+            found = ", ".join(warnings[self._warnings_since_reset > 0])
+            raise control.PhysicsError(f"the simulation became unstable ({found}); a smaller extent may help")
 
     def ball_displacement(self) -> float:
         """Returns the horizontal distance in metres from the ball to where it lay."""
@@ -167,7 +196,6 @@ class Strike(base.Task):
         """
         self._strike, self._action_names = strike, strike.action_names
         self._low, self._high = np.array(strike.low), np.array(strike.high)
-        self._limits = list(zip(strike.low, strike.high, strict=True))
         self._start = np.array(icub_tasks.check_start(start, strike))
         self._extent = icub_tasks.check_amount("extent", extent, zero=False)
         self._motor_noise = icub_tasks.check_amount("motor_noise", motor_noise, zero=True)
@@ -217,13 +245,9 @@ class Strike(base.Task):
     def before_step(self, action: Any, physics: Physics) -> None:
         """Moves the target of one joint by the extent."""
         number = icub_tasks.check_action(action, self._action_names)
-        # A joint that is blocked must not gather force: its target stays within an extent of where it is.
-        near = zip(physics.targets().tolist(), physics.encoders().tolist(), strict=True)
-        targets = [_clip(target, angle - self._extent, angle + self._extent) for target, angle in near]
         joint, forward = divmod(number, 2)
         step = self._extent * (1.0 + self.random.normal(0.0, self._motor_noise)) if self._motor_noise else self._extent
-        targets[joint] = _clip(targets[joint] + (step if forward else -step), *self._limits[joint])
-        physics.set_targets(targets)
+        physics.move_joint(joint, step if forward else -step, leash=self._extent)
 
     def after_step(self, physics: Physics) -> None:
         """Notes whether the ball has been moved."""
@@ -256,8 +280,3 @@ class StrikeEnvironment(control.Environment):
         if time_step.last() and self.task.get_termination(self.physics) is not None:
             return time_step._replace(discount=0.0)
         return time_step
-
-
-def _clip(value: float, low: float, high: float) -> float:
-    """Returns the value within limits; for single numbers NumPy takes ten times as long."""
-    return min(max(value, low), high)

@@ -87,7 +87,7 @@ class Strike(NamedTuple):
 
 
 #: The left arm and the head only look natural there: neither can reach the ball.
-_REST = {"l_shoulder_pitch": -10.0, "l_shoulder_roll": 15.0, "l_elbow": 30.0, "neck_pitch": -20.0}
+_REST = {"l_shoulder_pitch": -10.0, "l_shoulder_roll": 25.0, "l_elbow": 95.0, "neck_pitch": -15.0}
 
 #: "S" for the source task of the paper, "T" for its target task (Table 4, Figure 7).
 TASKS: dict[str, Strike] = {
