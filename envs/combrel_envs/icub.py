@@ -84,6 +84,7 @@ def make_environment(
       environment_kwargs: Arguments of `control.Environment`.
     """
     icub_tasks.check_look(look)
+    icub_tasks.check_time_limit(time_limit)
     strike = Strike(icub_tasks.TASKS[task], start, extent, motor_noise, encoder_noise, random)
     physics = make_physics(icub_tasks.TASKS[task], look)
     strike.check_free(physics)

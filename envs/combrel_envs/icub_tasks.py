@@ -115,6 +115,15 @@ def check_look(look: Any) -> str:
     return look
 
 
+def check_time_limit(seconds: Any) -> None:
+    """
+    :param seconds: the time limit of a dm_control environment; infinity is none
+    :raises ValueError: when it isn't a number above 0
+    """
+    if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not seconds > 0:
+        raise ValueError(f"time_limit must be a number of seconds above 0, got {seconds!r}")
+
+
 def check_amount(name: str, value: Any, zero: bool) -> float:
     """
     :param name: name of an argument
