@@ -123,8 +123,8 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
 
     ## Starting State
 
-    Always the same: upright and turned to the right, at (0, 40) degrees, the arm stretched forward. The ball lies at x = 0.45, y = -0.02 m from the waist (forward,
-    left), on a table 0.62 m high.
+    Always the same: upright and turned to the right, at (0, 40) degrees, the arm stretched forward. The ball lies 0.45 m
+    before the waist and 0.02 m to the right of it, on a table 0.62 m high.
 
     ## Episode End
 
@@ -221,8 +221,8 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
 
     ## Starting State
 
-    Always the same: at (-40, 40, -10, 60) degrees, the torso bent forward by 15. The ball lies at x = 0.45, y = -0.02 m from the waist (forward,
-    left), on a table 0.62 m high.
+    Always the same: at (-40, 40, -10, 60) degrees, the torso bent forward by 15. The ball lies 0.45 m before the waist and
+    0.02 m to the right of it, on a table 0.62 m high.
 
     ## Episode End
 

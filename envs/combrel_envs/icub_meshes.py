@@ -67,9 +67,9 @@ def _read_urdf(urdf: Path) -> dict[str, list[_Visual]]:
     package = urdf.parents[2]
     visuals = {link.attrib["name"]: list(_visuals_of(link, package)) for link in robot.iterfind("link")}
     for joint in robot.iterfind("joint[@type='fixed']"):
-        parent, child = (joint.find(end).attrib["link"] for end in ("parent", "child"))
+        links = {end.tag: end.attrib["link"] for end in joint if end.tag in ("parent", "child")}
         pos, quat = _pose(joint)
-        visuals[parent] += [_moved(visual, pos, quat) for visual in visuals[child]]
+        visuals[links["parent"]] += [_moved(visual, pos, quat) for visual in visuals[links["child"]]]
     return visuals
 
 

@@ -120,7 +120,7 @@ def check_time_limit(seconds: Any) -> None:
     :param seconds: the time limit of a dm_control environment; infinity is none
     :raises ValueError: when it isn't a number above 0
     """
-    if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not seconds > 0:
+    if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not float(seconds) > 0:
         raise ValueError(f"time_limit must be a number of seconds above 0, got {seconds!r}")
 
 
@@ -133,11 +133,10 @@ def check_amount(name: str, value: Any, zero: bool) -> float:
     :raises ValueError: when it isn't a finite number, is negative, or is 0 and may not be
     """
     right = f"a finite number {'of at least' if zero else 'above'} 0"
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+    number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
+    if not math.isfinite(number) or number < 0 or (number == 0 and not zero):
         raise ValueError(f"{name} must be {right}, got {value!r}")
-    if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
-        raise ValueError(f"{name} must be {right}, got {value!r}")
-    return float(value)
+    return number
 
 
 def check_start(start: Any, strike: Strike) -> tuple[float, ...]:
