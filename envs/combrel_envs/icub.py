@@ -20,7 +20,6 @@ import mujoco as mujoco_bindings  # noqa: E402
 from dm_control import mujoco  # noqa: E402
 from dm_control.mujoco import wrapper  # noqa: E402
 from dm_control.rl import control  # noqa: E402
-from dm_control.suite import base  # noqa: E402
 from dm_control.utils import containers  # noqa: E402
 
 from combrel_envs import icub_model  # noqa: E402
@@ -91,7 +90,8 @@ def make_environment(
     kwargs = {"legacy_step": False} | (environment_kwargs or {})
     if "n_sub_steps" not in kwargs:
         kwargs.setdefault("control_timestep", _CONTROL_TIMESTEP)
-    return StrikeEnvironment(physics, strike, time_limit=time_limit, **kwargs)
+    # 3 * 0.1 is a little more than 0.3: without rounding that would be a fourth step.
+    return StrikeEnvironment(physics, strike, time_limit=round(time_limit, 6), **kwargs)
 
 
 def make_physics(strike: icub_tasks.Strike, look: str) -> "Physics":
@@ -172,7 +172,7 @@ class Physics(mujoco.Physics):
         return super().render(*args, **kwargs)
 
 
-class Strike(base.Task):
+class Strike(control.Task):
     """An iCub `Task`: move the ball, even slightly. Each command costs 1, the hit brings 100."""
 
     def __init__(
@@ -202,7 +202,13 @@ class Strike(base.Task):
         self._motor_noise = icub_tasks.check_amount("motor_noise", motor_noise, zero=True)
         self._encoder_noise = icub_tasks.check_amount("encoder_noise", encoder_noise, zero=True)
         self._hit = self._new_hit = False
-        super().__init__(random=random)
+        # As in dm_control's suite, whose own base class would load all of its domains.
+        self._random = random if isinstance(random, np.random.RandomState) else np.random.RandomState(random)
+
+    @property
+    def random(self) -> np.random.RandomState:
+        """The source of the noise."""
+        return self._random
 
     @property
     def start(self) -> np.ndarray:
@@ -232,7 +238,6 @@ class Strike(base.Task):
         """Puts the robot at the start; the ball lies where it always does."""
         physics.set_joints(self._start)
         self._hit = self._new_hit = False
-        super().initialize_episode(physics)
 
     def action_spec(self, physics: Physics) -> dm_env.specs.DiscreteArray:
         """Returns the spec of the discrete action; `icub_tasks.Strike.action_names` says what each number does."""

@@ -31,9 +31,9 @@ def random_actions(env_id, n, seed=0):
 def hits_of_random_actions(env_id, n_episodes):
     """Share of the episodes in which random actions hit the ball."""
     env, hits = gymnasium.make(env_id), 0
-    for episode in range(n_episodes):
+    for actions in np.array(random_actions(env_id, 400 * n_episodes)).reshape(n_episodes, 400).tolist():
         env.reset()
-        hits += any(env.step(action)[2] for action in random_actions(env_id, 400, seed=episode))
+        hits += any(env.step(action)[2] for action in actions)
     return hits / n_episodes
 
 
@@ -267,6 +267,12 @@ class TestDmControlFace:
         steps = [environment.step(0) for _ in range(400)]
         assert [step.last() for step in steps] == [False] * 399 + [True]
         assert steps[-1].discount == 1.0
+
+    @pytest.mark.parametrize("n_steps", [1, 3, 6, 29])
+    def test_the_time_limit_can_be_set(self, n_steps):
+        environment = combrel_envs.load("icub", "arm_strike", {"time_limit": n_steps * 0.1})
+        environment.reset()
+        assert [environment.step(0).last() for _ in range(n_steps)] == [False] * (n_steps - 1) + [True]
 
     def test_a_hit_on_the_last_step_of_the_time_limit_is_an_end(self):
         environment = combrel_envs.load("icub", "torso_strike", {"time_limit": 2.6})
