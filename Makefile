@@ -1,6 +1,7 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
 # make test    all tests, the slow ones too
 # make bench   speed and memory                make lint, type, format, commit-checks    as in Stable-Baselines3
+# make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
 # Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
@@ -11,6 +12,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST_WORKERS ?= 2
 DEMO_ARGS ?=
+ICUB_ARGS ?=
 LINTED := sb3_combrel envs tests
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
@@ -20,7 +22,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard test pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -35,6 +37,10 @@ dashboard: $(VENV)/.installed-demo
 	mkdir -p docs/figures
 	cp dashboard/custom_scalars.png docs/figures/tensorboard_custom_scalars.png
 	cp dashboard/images.png docs/figures/tensorboard_images.png
+
+# ICUB_ARGS="--task arm --look primitives", for instance.
+icub-video: $(VENV)/.installed-all gl
+	$(BIN)/python -m sb3_combrel.experiments.icub $(ICUB_ARGS)
 
 test: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up

@@ -15,7 +15,7 @@ import sb3_combrel
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 WHERE = {"sb3_combrel": ROOT / "sb3_combrel", "combrel_envs": ROOT / "envs" / "combrel_envs"}
-DATA = {"py.typed", "version.txt", "*.xml", "*.yml", "*.png"}
+DATA = {"py.typed", "version.txt", "*.xml", "*.yml", "*.png", "*.LICENSE.md"}
 
 
 def files_on_disk(package):
@@ -72,6 +72,7 @@ def test_the_wheel_holds_both_packages_with_their_data(wheel):
     assert names == files_on_disk("sb3_combrel") | files_on_disk("combrel_envs")
     assert {"sb3_combrel/py.typed", "combrel_envs/py.typed", "sb3_combrel/version.txt"} <= names
     assert "combrel_envs/assets/mountain_car_4d.xml" in names
+    assert {"combrel_envs/assets/icub_upper.xml", "combrel_envs/assets/icub_upper.LICENSE.md"} <= names
 
 
 def test_the_wheel_works_where_it_is_unpacked(wheel, tmp_path):
@@ -83,6 +84,7 @@ def test_the_wheel_works_where_it_is_unpacked(wheel, tmp_path):
         assert combrel_envs.__file__.startswith({str(tmp_path)!r}), combrel_envs.__file__
         gymnasium.make("combrel/MountainCar4D-v0").reset(seed=0)
         combrel_envs.load("mountain_car", "climb_4d").reset()
+        combrel_envs.load("icub", "arm_strike").reset()
         print(sb3_combrel.__version__)
     """
     assert run_python("\n".join(line.strip() for line in code.splitlines())).strip() == sb3_combrel.__version__

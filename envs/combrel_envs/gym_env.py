@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
+from combrel_envs import icub_tasks
 from combrel_envs.mountain_car_dynamics import MAX_EPISODE_STEPS
 
 if TYPE_CHECKING:
@@ -27,6 +28,20 @@ _SPECS: tuple[dict[str, Any], ...] = (
         "max_episode_steps": MAX_EPISODE_STEPS,
         "disable_env_checker": True,
     },
+    *(
+        {
+            "id": f"combrel/ICub{part}Strike{variant}-v0",
+            "entry_point": f"combrel_envs.icub_gym:ICub{part}StrikeEnv",
+            "max_episode_steps": icub_tasks.MAX_EPISODE_STEPS,
+            "disable_env_checker": True,
+            "kwargs": kwargs,
+        }
+        for part in ("Torso", "Arm")
+        for variant, kwargs in (
+            ("", {}),
+            ("Noisy", {"motor_noise": icub_tasks.NOISY_MOTORS, "encoder_noise": icub_tasks.NOISY_ENCODERS}),
+        )
+    ),
 )
 
 

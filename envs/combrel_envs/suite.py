@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 #: Module of each domain; it is imported, and dm_control with it, when a task of the domain is asked for.
 _DOMAINS = {
     "mountain_car": "combrel_envs.mountain_car",
+    "icub": "combrel_envs.icub",
 }
 
 

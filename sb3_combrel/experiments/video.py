@@ -52,15 +52,16 @@ def film(
     write_video(frames, path)
 
 
-def write_video(frames: list[Any], path: Path) -> None:
+def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> None:
     """
     Write frames as an MP4 file that appears complete or not at all.
 
     :param frames: arrays of shape (height, width, 3), uint8
     :param path: file to write
+    :param fps: frames a second
     """
     from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
 
     unfinished = path.with_suffix(".part.mp4")
-    ImageSequenceClip(frames, fps=FRAMES_A_SECOND).write_videofile(str(unfinished), logger=None)
+    ImageSequenceClip(frames, fps=fps).write_videofile(str(unfinished), logger=None)
     unfinished.replace(path)

@@ -1,0 +1,288 @@
+"""The iCub strikes a ball: a dm_control domain with the tasks of Section 4.2 of the COMBREL paper.
+
+``torso_strike`` moves two joints of the torso (the paper's source task), ``arm_strike`` four of the right arm (its target
+task); the ``_noisy`` variants add the noise that makes them stochastic. The robot is blind: it observes the encoders of the
+joints that it moves, in degrees. A command moves one joint by a fixed extent and takes 0.1 s of simulated time.
+"""
+
+import collections
+import math
+from typing import Any
+
+import numpy as np
+
+from combrel_envs import icub_tasks, rendering
+
+rendering.import_dm_control()
+
+import dm_env  # noqa: E402
+import mujoco as mujoco_bindings  # noqa: E402
+from dm_control import mujoco  # noqa: E402
+from dm_control.mujoco import wrapper  # noqa: E402
+from dm_control.rl import control  # noqa: E402
+from dm_control.utils import containers  # noqa: E402
+
+from combrel_envs import icub_model  # noqa: E402
+
+_CONTROL_TIMESTEP = 0.1  # (Seconds).
+_DEFAULT_TIME_LIMIT = icub_tasks.MAX_EPISODE_STEPS * _CONTROL_TIMESTEP
+#: Degrees in a radian, MuJoCo's unit.
+_DEGREES = math.degrees(1.0)
+#: How deep the hand may press into table or ball at the start, in metres: contacts are soft.
+_START_OVERLAP = 0.0005
+SUITE = containers.TaggedTasks()
+
+
+@SUITE.add("benchmarking")
+def torso_strike(**kwargs: Any) -> control.Environment:
+    """Returns the task of striking the ball by turning and bending the torso; see `make_environment`."""
+    return make_environment("torso_strike", **kwargs)
+
+
+@SUITE.add("benchmarking")
+def arm_strike(**kwargs: Any) -> control.Environment:
+    """Returns the task of striking the ball with the arm; see `make_environment`."""
+    return make_environment("arm_strike", **kwargs)
+
+
+@SUITE.add("noisy")
+def torso_strike_noisy(**kwargs: Any) -> control.Environment:
+    """Returns `torso_strike` with noisy motors and encoders."""
+    return make_environment("torso_strike", **_noise() | kwargs)
+
+
+@SUITE.add("noisy")
+def arm_strike_noisy(**kwargs: Any) -> control.Environment:
+    """Returns `arm_strike` with noisy motors and encoders."""
+    return make_environment("arm_strike", **_noise() | kwargs)
+
+
+def _noise() -> dict[str, float]:
+    return {"motor_noise": icub_tasks.NOISY_MOTORS, "encoder_noise": icub_tasks.NOISY_ENCODERS}
+
+
+def make_environment(
+    task: str,
+    time_limit: float = _DEFAULT_TIME_LIMIT,
+    random: np.random.RandomState | int | None = None,
+    look: str = "primitives",
+    start: Any = None,
+    extent: float = icub_tasks.EXTENT,
+    motor_noise: float = 0.0,
+    encoder_noise: float = 0.0,
+    environment_kwargs: dict[str, Any] | None = None,
+) -> control.Environment:
+    """Returns a ball-striking environment.
+
+    Args:
+      task: "torso_strike" or "arm_strike".
+      time_limit: Seconds until an episode is cut off; a command takes 0.1 s.
+      random: Optional, either a `numpy.random.RandomState` instance, an integer seed, or None to select a seed.
+      look: "primitives" or "meshes".
+      start, extent, motor_noise, encoder_noise: See `Strike`.
+      environment_kwargs: Arguments of `control.Environment`.
+    """
+    icub_tasks.check_look(look)
+    icub_tasks.check_time_limit(time_limit)
+    strike = Strike(icub_tasks.TASKS[task], start, extent, motor_noise, encoder_noise, random)
+    physics = make_physics(icub_tasks.TASKS[task], look)
+    strike.check_free(physics)
+    kwargs = {"legacy_step": False} | (environment_kwargs or {})
+    if "n_sub_steps" not in kwargs:
+        kwargs.setdefault("control_timestep", _CONTROL_TIMESTEP)
+    # 3 * 0.1 is a little more than 0.3: without rounding that would be a fourth step.
+    return StrikeEnvironment(physics, strike, time_limit=round(time_limit, 6), **kwargs)
+
+
+def make_physics(strike: icub_tasks.Strike, look: str) -> "Physics":
+    """Returns the `Physics` of a task."""
+    return Physics.from_model(wrapper.MjModel(icub_model.make_model(strike, look)))
+
+
+class Physics(mujoco.Physics):
+    """The robot, the table and the ball. The joints of the task come first in MuJoCo's arrays, then the ball's."""
+
+    def _reload_from_data(self, data: wrapper.MjData) -> None:
+        super()._reload_from_data(data)
+        n = self.model.nu
+        # Views of the state, taken once: they are read at every step.
+        self._angles = self.data.qpos[:n]
+        self._ball = self.data.qpos[n : n + 2]
+        self._ball_start = self.model.qpos0[n : n + 2].tolist()
+        self._targets = self.data.ctrl
+        self._limits = self.model.jnt_range[:n].tolist()
+        self._warnings_since_reset = self.data.warning.number
+        self._hand = [self.model.name2id(name, "geom") for name in icub_model.HAND]
+
+    def encoders(self) -> np.ndarray:
+        """Returns the angles of the task's joints in degrees."""
+        return self._angles * _DEGREES
+
+    def targets(self) -> np.ndarray:
+        """Returns the angles in degrees to which the joints are being moved."""
+        return self._targets * _DEGREES
+
+    def set_joints(self, degrees: Any) -> None:
+        """Puts the task's joints at angles and keeps them there. As always, a call of `forward` must follow."""
+        self._angles[:] = self._targets[:] = np.deg2rad(degrees)
+
+    def move_joint(self, joint: int, step: float, leash: float) -> None:
+        """Moves the target of one joint of the task.
+
+        Args:
+          joint: Its number.
+          step: Degrees by which to move the target.
+          leash: Degrees by which a joint's target may be away from the joint beforehand: one that is blocked must not
+            gather force.
+        """
+        leash /= _DEGREES
+        # Single numbers: for a handful of them NumPy takes several times as long.
+        near = zip(self._targets.tolist(), self._angles.tolist(), strict=True)
+        targets = [min(max(target, angle - leash), angle + leash) for target, angle in near]
+        low, high = self._limits[joint]
+        targets[joint] = min(max(targets[joint] + step / _DEGREES, low), high)
+        self._targets[:] = targets
+
+    def step(self, nstep: int = 1) -> None:
+        """Advances the physics by `nstep` steps; as dm_control's own, but for a cheaper check of the outcome."""
+        if self.legacy_step:
+            super().step(nstep)
+            return
+        mujoco_bindings.mj_step(self.model.ptr, self.data.ptr, nstep)
+        if self._warnings_since_reset.any():
+            warnings = np.array(list(mujoco_bindings.mjtWarning.__members__))[: len(self._warnings_since_reset)]
+            found = ", ".join(warnings[self._warnings_since_reset > 0])
+            raise control.PhysicsError(f"the simulation became unstable ({found}); a smaller extent may help")
+
+    def ball_displacement(self) -> float:
+        """Returns the horizontal distance in metres from the ball to where it lay."""
+        return math.dist(self._ball.tolist(), self._ball_start)
+
+    def hand_distance(self, geom: str) -> float:
+        """Returns the distance in metres from the hand to a geom; negative if they overlap."""
+        other, model, data = self.model.name2id(geom, "geom"), self.model.ptr, self.data.ptr
+        return min(mujoco_bindings.mj_geomDistance(model, data, hand, other, 1.0, None) for hand in self._hand)
+
+    def render(self, *args: Any, **kwargs: Any) -> np.ndarray:
+        """Returns a camera view, see `mujoco.Physics.render`; raises `RenderingError` when there is no OpenGL."""
+        rendering.open_gl(self)
+        # A step leaves the places of the bodies a substep behind the state; none of this is part of the state.
+        mujoco_bindings.mj_kinematics(self.model.ptr, self.data.ptr)
+        mujoco_bindings.mj_camlight(self.model.ptr, self.data.ptr)
+        return super().render(*args, **kwargs)
+
+
+class Strike(control.Task):
+    """An iCub `Task`: move the ball, even slightly. Each command costs 1, the hit brings 100."""
+
+    def __init__(
+        self,
+        strike: icub_tasks.Strike,
+        start: Any = None,
+        extent: float = icub_tasks.EXTENT,
+        motor_noise: float = 0.0,
+        encoder_noise: float = 0.0,
+        random: np.random.RandomState | int | None = None,
+    ):
+        """Initializes an instance of `Strike`.
+
+        Args:
+          strike: Which joints move.
+          start: Angles of the joints, in degrees, at which an episode begins; None for those of the task.
+          extent: Degrees by which a command moves a joint.
+          motor_noise: Standard deviation of the extent, as a share of it.
+          encoder_noise: Standard deviation of an observed angle, in degrees.
+          random: Optional, either a `numpy.random.RandomState` instance, an integer seed for creating a new `RandomState`,
+            or None to select a seed automatically (default).
+        """
+        self._strike, self._action_names = strike, strike.action_names
+        self._low, self._high = np.array(strike.low), np.array(strike.high)
+        self._start = np.array(icub_tasks.check_start(start, strike))
+        self._extent = icub_tasks.check_amount("extent", extent, zero=False)
+        self._motor_noise = icub_tasks.check_amount("motor_noise", motor_noise, zero=True)
+        self._encoder_noise = icub_tasks.check_amount("encoder_noise", encoder_noise, zero=True)
+        self._hit = self._new_hit = False
+        # As in dm_control's suite, whose own base class would load all of its domains.
+        self._random = random if isinstance(random, np.random.RandomState) else np.random.RandomState(random)
+
+    @property
+    def random(self) -> np.random.RandomState:
+        """The source of the noise."""
+        return self._random
+
+    @property
+    def start(self) -> np.ndarray:
+        """The angles in degrees at which the next episode begins."""
+        return self._start.copy()
+
+    def set_start(self, start: Any, physics: Physics) -> None:
+        """Begins the next episodes at other angles; raises `ValueError` if they aren't possible."""
+        previous, self._start = self._start, np.array(icub_tasks.check_start(start, self._strike))
+        try:
+            self.check_free(physics)
+        except ValueError:
+            self._start = previous
+            raise
+
+    def check_free(self, physics: Physics) -> None:
+        """Raises `ValueError` if at the start the hand touches the ball or is in the table; resets the physics."""
+        with physics.reset_context():
+            physics.set_joints(self._start)
+        angles = f"({', '.join(f'{angle:g}' for angle in self._start)}) degrees of ({', '.join(self._strike.state_names)})"
+        if physics.hand_distance("ball") <= 0:
+            raise ValueError(f"start must leave the ball untouched; at {angles} the hand touches it already")
+        if physics.hand_distance("table") < -_START_OVERLAP:
+            raise ValueError(f"start must keep the hand above the table or beside it; at {angles} it is in the table")
+
+    def initialize_episode(self, physics: Physics) -> None:
+        """Puts the robot at the start; the ball lies where it always does."""
+        physics.set_joints(self._start)
+        self._hit = self._new_hit = False
+
+    def action_spec(self, physics: Physics) -> dm_env.specs.DiscreteArray:
+        """Returns the spec of the discrete action; `icub_tasks.Strike.action_names` says what each number does."""
+        return dm_env.specs.DiscreteArray(len(self._strike.action_names), dtype=np.int64, name="action")
+
+    def observation_spec(self, physics: Physics) -> "collections.OrderedDict[str, dm_env.specs.BoundedArray]":
+        """Returns the spec of the observation: the limits of the joints, in degrees."""
+        spec = dm_env.specs.BoundedArray(self._low.shape, np.float64, self._low, self._high, name="encoders")
+        return collections.OrderedDict(encoders=spec)
+
+    def before_step(self, action: Any, physics: Physics) -> None:
+        """Moves the target of one joint by the extent."""
+        number = icub_tasks.check_action(action, self._action_names)
+        joint, forward = divmod(number, 2)
+        step = self._extent * (1.0 + self.random.normal(0.0, self._motor_noise)) if self._motor_noise else self._extent
+        physics.move_joint(joint, step if forward else -step, leash=self._extent)
+
+    def after_step(self, physics: Physics) -> None:
+        """Notes whether the ball has been moved."""
+        moved = physics.ball_displacement() > icub_tasks.HIT_DISTANCE
+        self._new_hit = moved and not self._hit
+        self._hit = self._hit or moved
+
+    def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
+        """Returns what the encoders say, in degrees."""
+        angles = physics.encoders()
+        if self._encoder_noise:
+            angles += self.random.normal(0.0, self._encoder_noise, angles.shape)
+        return collections.OrderedDict(encoders=np.minimum(np.maximum(angles, self._low), self._high))
+
+    def get_reward(self, physics: Physics) -> float:
+        """Returns the cost of a command, and what a hit brings."""
+        return icub_tasks.STEP_REWARD + (icub_tasks.HIT_REWARD if self._new_hit else 0.0)
+
+    def get_termination(self, physics: Physics) -> float | None:
+        """Returns a discount of 0 when the ball has been moved."""
+        return 0.0 if self._hit else None
+
+
+class StrikeEnvironment(control.Environment):
+    """An `Environment` that asks the task on the last step of the time limit too, when a hit ends the episode for good."""
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        """Updates the environment using the action and returns a `TimeStep`."""
+        time_step = super().step(action)
+        if time_step.last() and self.task.get_termination(self.physics) is not None:
+            return time_step._replace(discount=0.0)
+        return time_step
