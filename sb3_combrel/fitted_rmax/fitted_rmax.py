@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
@@ -23,8 +25,9 @@ from sb3_combrel.callbacks import with_dashboard
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.fitted_rmax.saving import check_model, write_model
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.registry import make_transfer
+from sb3_combrel.transfer.registry import describe_transfer, make_transfer, restore_transfer
 
 SelfFittedRMax = TypeVar("SelfFittedRMax", bound="FittedRMax")
 
@@ -150,6 +153,7 @@ class FittedRMax(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
+        self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             _refuse_normalized_observations(self.env)
         if self.seed is None:
@@ -339,6 +343,59 @@ class FittedRMax(BaseAlgorithm):
         super().set_env(env, force_reset)
         assert self.env is not None
         self._vec_normalize_env = unwrap_vec_normalize(self.env)
+
+    def save(
+        self,
+        path: str | Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file, which appears complete or not at all.
+
+        A transfer method is saved as plain data, with its source instances.
+
+        :param path: path to the file where the rl agent should be saved
+        :param exclude: name of parameters that should be excluded in addition to the default ones
+        :param include: name of parameters that might be excluded but should be included anyway
+        """
+        given, content = self.transfer, io.BytesIO()
+        try:
+            self.transfer = describe_transfer(self.policy.transfer)
+            super().save(content, exclude, include)
+        finally:
+            self.transfer = given
+        write_model(path, content.getvalue())
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfFittedRMax],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfFittedRMax:
+        """
+        Load the model from a zip-file.
+
+        :param path: path to the file (or a file-like) where to load the agent from
+        :param env: the new environment to run the loaded model on (if registered in Gymnasium, can be a str; can be None
+            if you only need prediction from a trained model)
+        :param device: device on which the tensors of the policy go
+        :param custom_objects: objects that replace those of the file
+        :param print_system_info: whether to print system info from the saved model and the current system info
+        :param force_reset: force a call to ``reset()`` before training
+        :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved
+        :return: new model instance with loaded parameters
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if the file is damaged or was not saved by this class
+        """
+        check_model(path, must_have=("exploration_threshold", "model_breadth", "min_fraction"))
+        environment = maybe_make_env(env, verbose=0) if isinstance(env, str) else env
+        return super().load(path, environment, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_tags", "_last_states"]

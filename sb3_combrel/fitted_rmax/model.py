@@ -14,6 +14,7 @@ from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
     enter,
+    enter_all,
     leave_lists,
     points_in_reach,
     put_and_enter,
@@ -209,15 +210,28 @@ class KernelModel:
             return self._no_supply
         return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
 
-    def restore(self, known: np.ndarray) -> None:
+    def restore(self, known: np.ndarray, kept: np.ndarray) -> None:
         """Rebuild lists and rows after instances were written to :attr:`instances` directly.
 
+        :param kept: the instances that stood in any list, bool, shape (n_instances,), by action
         :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
         """
         self.arrays = self.arrays._replace(**self._of_instances())
-        for action in range(self.n_actions):
-            for slot in range(self.instances.count[action]):
-                self._progress[:] = -1, 0
-                self._enter(action, slot)
+        in_lists = np.zeros(self.instances.reward.shape, dtype=np.bool_)
+        in_lists[np.arange(self.instances.capacity) < self.instances.count[:, None]] = kept
+        at = np.zeros(2, dtype=np.int64)
+        self._progress[:] = -1, 0
+        while not enter_all(
+            self.instances,
+            self.arrays,
+            self.grid.arrays,
+            self._kernel,
+            self.exploration_threshold,
+            in_lists,
+            at,
+            self.scratch,
+            self._progress,
+        ):
+            self.arrays = self.arrays._replace(lists=self.arrays.lists.grown())
         self.arrays.known[:] |= known & (self.arrays.lists.length > 0)
         self.settle(np.arange(len(known)))

@@ -14,15 +14,16 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.compiled import SameTypes
-from sb3_combrel.common.instances import InstanceArrays, put_instance
+from sb3_combrel.common.instances import InstanceArrays
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 from sb3_combrel.common.supply import Supply
-from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays, find_cell
+from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around, q_values
 from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
@@ -45,7 +46,7 @@ class FittedRMaxPolicy(BasePolicy):
     :param observation_space: a one-dimensional Box
     :param action_space: Discrete
     :param lr_schedule: not used; SB3 passes one to every policy
-    :param transfer: a transfer method of the policy's own, bound here
+    :param transfer: a transfer method of the policy's own, bound here; or what a file has of one
     :param rng: source of all chance (ties, transfer)
     """
 
@@ -66,7 +67,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_backups: int = 50,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
-        transfer: Transfer | None = None,
+        transfer: Transfer | dict[str, Any] | None = None,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         rng: np.random.Generator | None = None,
@@ -76,7 +77,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.exploration_threshold = float(exploration_threshold)
         self.gamma = float(gamma)
         self.max_backups = max_backups
-        self.transfer = transfer
+        self.transfer = transfer = restore_transfer(transfer)
         self.rng = np.random.default_rng() if rng is None else rng
         self.scaling = StateScaling.from_space(observation_space, bounds)
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
@@ -143,7 +144,7 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
-        return {**spaces_of_both, **self._constructor_parameters}
+        return {**spaces_of_both, **self._constructor_parameters, "transfer": describe_transfer(self.transfer)}
 
     # ------------------------------------------------------------------ acting
 
@@ -351,6 +352,7 @@ class FittedRMaxPolicy(BasePolicy):
                 instances.effect[action, :count],
                 instances.reward[action, :count, None],
                 instances.terminated[action, :count, None],
+                self.model.arrays.members[action, :count, None] > 0,
             ]
             by_action.append(np.hstack(columns))
         n = int(self.corrections.count[0])
@@ -382,6 +384,8 @@ class FittedRMaxPolicy(BasePolicy):
                 missing_keys.append(prefix + name)
         ours = set(self._saved_arrays())
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in ours)
+        if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
+            error_msgs.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
         if len(saved) == len(ours):
             problem = self._misfit(saved)
             if problem:
@@ -399,12 +403,17 @@ class FittedRMaxPolicy(BasePolicy):
     def _misfit(self, saved: dict[str, np.ndarray]) -> str:
         """What is wrong with saved arrays; empty if nothing."""
         d, n_points = self.scaling.n_variables, self.model.grid.n_points
-        for name, n_columns in (("instances", 2 * d + 3), ("corrections", d + 2)):
+        for name, n_columns in (("instances", 2 * d + 4), ("corrections", d + 2)):
             if saved[name].ndim != 2 or saved[name].shape[1] != n_columns:
                 return f"{name} must have {n_columns} columns, got shape {saved[name].shape}"
         for name, n in (("values", n_points), ("known", n_points * self.n_actions), ("lowest_value", 1)):
             if saved[name].shape != (n,):
                 return f"{name} must have shape ({n},) for this grid, got {saved[name].shape}"
+        for name, own in ({} if self.transfer is None else self.transfer.saved_arrays()).items():
+            array = saved[f"transfer_{name}"]
+            # Rows are as many as were learned; a single row of numbers has its length for good.
+            if array.ndim != own.ndim or (array.shape[1:] if own.ndim > 1 else array.shape) != own.shape[own.ndim > 1 :]:
+                return f"transfer_{name} has shape {array.shape}, which does not fit one of {own.shape}"
         for name, array in saved.items():
             if not np.isfinite(array).all():
                 return f"{name} must hold finite numbers only"
@@ -414,6 +423,8 @@ class FittedRMaxPolicy(BasePolicy):
         model, d = self.model, self.scaling.n_variables
         rows = saved["instances"]
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
+        order = np.argsort(actions, kind="stable")
+        rows, actions = rows[order], actions[order]
         fresh = KernelModel(
             model.grid,
             self.n_actions,
@@ -426,22 +437,12 @@ class FittedRMaxPolicy(BasePolicy):
             max_instances=model.max_instances,
         )
         self._restore_transfer(saved)
-        instances = InstanceArrays.empty(self.n_actions, d)
-        for action, row in zip(actions, rows, strict=True):
-            instances = instances.with_room(action)
-            state, effect = row[1 : 1 + d], row[1 + d : 1 + 2 * d]
-            slot = instances.count[action]
-            put_instance(instances, action, slot, state, state + effect, row[-2], bool(row[-1] > 0.5))
-            instances.effect[action, slot] = effect
-        fresh.instances = instances
-        fresh.restore(saved["known"] > 0.5)
+        fresh.instances = InstanceArrays.of_rows(
+            actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5, self.n_actions
+        )
+        fresh.restore(saved["known"] > 0.5, rows[:, -1] > 0.5)
         self.model = self.planner.model = fresh
         self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])
         self.planner.restore(saved["values"])
-        self.corrections = CorrectionArrays.empty(d)
-        for key, value, *state in saved["corrections"]:
-            self.corrections = self.corrections.with_room()
-            n = int(self.corrections.count[0])
-            self.corrections.table[find_cell(self.corrections, int(key))] = n
-            self.corrections.key[n], self.corrections.value[n], self.corrections.state[n] = int(key), value, state
-            self.corrections.count[0] = n + 1
+        corrections = saved["corrections"]
+        self.corrections = CorrectionArrays.of_rows(corrections[:, 0].astype(np.int64), corrections[:, 1], corrections[:, 2:])

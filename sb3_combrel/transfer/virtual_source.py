@@ -290,6 +290,12 @@ class VirtualSourceTransfer(Transfer):
 
     # --------------------------------------------------------------- saving
 
+    def arguments(self) -> dict[str, Any]:
+        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        if self.target is None:
+            return super().arguments()
+        return {**super().arguments(), "source": self._sources if len(self._sources) > 1 else self._sources[0]}
+
     def saved_arrays(self) -> dict[str, np.ndarray]:
         seen = self._seen
         n = seen.n
