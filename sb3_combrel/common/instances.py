@@ -57,7 +57,13 @@ class InstanceArrays(NamedTuple):
 
     @classmethod
     def of_rows(
-        cls, action: np.ndarray, state: np.ndarray, effect: np.ndarray, reward: np.ndarray, terminated: np.ndarray, n_actions: int
+        cls,
+        n_actions: int,
+        action: np.ndarray,
+        state: np.ndarray,
+        effect: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
     ) -> "InstanceArrays":
         """Instances given one a row, in their order.
 

@@ -14,13 +14,13 @@ from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
     enter,
-    enter_all,
     leave_lists,
     points_in_reach,
     put_and_enter,
     settle,
     worth_settling,
 )
+from sb3_combrel.fitted_rmax.restoring import in_neighbourhoods, note_effects, refill_lists
 from sb3_combrel.transfer.base import Transfer
 
 MOST_PAIRS_AT_ONCE = 4096
@@ -210,28 +210,34 @@ class KernelModel:
             return self._no_supply
         return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
 
-    def restore(self, known: np.ndarray, kept: np.ndarray) -> None:
+    def restore(self, listed: np.ndarray, known: np.ndarray, total: np.ndarray, reach: np.ndarray) -> None:
         """Rebuild lists and rows after instances were written to :attr:`instances` directly.
 
-        :param kept: the instances that stood in any list, bool, shape (n_instances,), by action
+        :param listed: the instances that stood in any list, bool, shape (n_instances,), by action
         :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
+        :param total: the sums of their weights, shape (n_pairs,); used where they differ from the new ones by rounding only
+        :param reach: ``ModelArrays.reach`` then, float64, shape (2, n_variables); transferred instances count in it, too
         """
         self.arrays = self.arrays._replace(**self._of_instances())
-        in_lists = np.zeros(self.instances.reward.shape, dtype=np.bool_)
-        in_lists[np.arange(self.instances.capacity) < self.instances.count[:, None]] = kept
-        at = np.zeros(2, dtype=np.int64)
-        self._progress[:] = -1, 0
-        while not enter_all(
-            self.instances,
-            self.arrays,
+        note_effects(self.instances, self.arrays, self.grid.arrays)
+        scratch = np.empty(self.grid.n_variables), np.empty(self.list_room, np.int32), np.empty(self.list_room)
+        search = (
+            *in_neighbourhoods(self.instances, listed),
             self.grid.arrays,
             self._kernel,
             self.exploration_threshold,
-            in_lists,
-            at,
-            self.scratch,
-            self._progress,
-        ):
+            *scratch,
+        )
+        pair = 0
+        while (pair := refill_lists(self.arrays, *search, pair)) < len(known):
             self.arrays = self.arrays._replace(lists=self.arrays.lists.grown())
-        self.arrays.known[:] |= known & (self.arrays.lists.length > 0)
+        arrays, farthest = self.arrays, self.grid.arrays.shape
+        same = np.abs(total - arrays.total) <= 1e-9 * arrays.total
+        arrays.total[same] = total[same]
+        listed = np.flatnonzero(arrays.lists.length > 0)
+        last = arrays.lists.weight[arrays.lists.start[listed] + arrays.lists.length[listed] - 1]
+        arrays.entry[listed] = np.minimum(last, self.min_fraction * arrays.total[listed])
+        arrays.known[listed] |= known[listed]
+        arrays.reach[0] = np.minimum(arrays.reach[0], np.maximum(reach[0], -farthest))
+        arrays.reach[1] = np.maximum(arrays.reach[1], np.minimum(reach[1], farthest))
         self.settle(np.arange(len(known)))

@@ -186,27 +186,6 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
 
 
 @compiled
-def enter_all(instances, arrays, grid, kernel, threshold, kept, at, scratch, progress):
-    """Put instances into lists, those of one action after those of another; returns as :func:`enter` does.
-
-    :param kept: bool, shape (n_actions, capacity): the instances that belong into lists, the others are passed over
-    :param at: int64, shape (2,): action and slot to go on with, {0, 0} at first
-    """
-    while at[0] < len(instances.count):
-        while at[1] < instances.count[at[0]]:
-            if not kept[at[0], at[1]]:
-                extend_reach(instances.effect[at[0], at[1]], grid.cells, arrays.reach)
-            elif not enter(instances, arrays, grid, kernel, threshold, at[0], at[1], scratch, progress):
-                return False
-            progress[0] = -1
-            progress[1] = 0
-            at[1] += 1
-        at[0] += 1
-        at[1] = 0
-    return True
-
-
-@compiled
 def put_and_enter(
     instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress
 ):

@@ -22,6 +22,7 @@ from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around, q_values
+from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 
@@ -77,7 +78,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.exploration_threshold = float(exploration_threshold)
         self.gamma = float(gamma)
         self.max_backups = max_backups
-        self.transfer = transfer = restore_transfer(transfer)
+        self.transfer: Transfer | None = restore_transfer(transfer)
         self.rng = np.random.default_rng() if rng is None else rng
         self.scaling = StateScaling.from_space(observation_space, bounds)
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
@@ -102,9 +103,9 @@ class FittedRMaxPolicy(BasePolicy):
         grid = fitting_grid(self.scaling.n_variables, self.n_actions, resolution, model_breadth, min_weight)
         self.state_names = tuple(state_names or (f"s{k}" for k in range(grid.n_variables)))
         self.action_names = tuple(action_names or (f"a{k}" for k in range(self.n_actions)))
-        if transfer is not None:
+        if self.transfer is not None:
             self._task = self._target_task(grid)
-            transfer.bind(self._task, self.rng)
+            self.transfer.bind(self._task, self.rng)
         self.model = KernelModel(
             grid,
             self.n_actions,
@@ -113,14 +114,14 @@ class FittedRMaxPolicy(BasePolicy):
             min_fraction=min_fraction,
             exploration_threshold=exploration_threshold,
             gamma=gamma,
-            transfer=transfer,
+            transfer=self.transfer,
             max_instances=max_instances,
         )
         self.planner = Planner(
             self.model, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=planning_tolerance
         )
-        if transfer is not None:
-            self._widen(transfer.lowest_reward())
+        if self.transfer is not None:
+            self._widen(self.transfer.lowest_reward())
         self.corrections = CorrectionArrays.empty(grid.n_variables)
         self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
         self._no_supply = Supply.none(self.n_actions, grid.n_variables)
@@ -282,6 +283,8 @@ class FittedRMaxPolicy(BasePolicy):
 
     def prepare(self) -> int:
         """Take up what transfer has to say before the first step, and plan until that is thought through."""
+        # Episodes are numbered anew.
+        self.corrections.visits.fill(0)
         backups = self._plan(0)
         return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
 
@@ -340,7 +343,8 @@ class FittedRMaxPolicy(BasePolicy):
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         for name, array in self._saved_arrays().items():
-            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64), device=self.device)
+            # Column by column: a file of it becomes a tenth smaller.
+            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
 
     def _saved_arrays(self) -> dict[str, np.ndarray]:
         instances = self.model.instances
@@ -362,6 +366,8 @@ class FittedRMaxPolicy(BasePolicy):
             "instances": np.vstack(by_action),
             "values": self.planner.values,
             "known": self.model.arrays.known,
+            "total": self.model.arrays.total,
+            "reach": self.model.arrays.reach,
             "lowest_value": np.array([self.planner.bounds[0]]),
             "corrections": np.column_stack([self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]),
         }
@@ -377,17 +383,17 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         saved = {}
-        for name in self._saved_arrays():
+        ours = self._saved_shapes().keys()
+        for name in ours:
             if prefix + name in state_dict:
                 saved[name] = state_dict[prefix + name].detach().cpu().numpy().astype(np.float64)
             else:
                 missing_keys.append(prefix + name)
-        ours = set(self._saved_arrays())
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in ours)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
             error_msgs.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
         if len(saved) == len(ours):
-            problem = self._misfit(saved)
+            problem = misfit(saved, self._saved_shapes())
             if problem:
                 error_msgs.append(problem)
             else:
@@ -400,24 +406,21 @@ class FittedRMaxPolicy(BasePolicy):
             prefix = "transfer_"
             self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
 
-    def _misfit(self, saved: dict[str, np.ndarray]) -> str:
-        """What is wrong with saved arrays; empty if nothing."""
+    def _saved_shapes(self) -> dict[str, tuple[int | None, ...]]:
+        """Shapes that saved arrays must have; None for any number of rows."""
         d, n_points = self.scaling.n_variables, self.model.grid.n_points
-        for name, n_columns in (("instances", 2 * d + 4), ("corrections", d + 2)):
-            if saved[name].ndim != 2 or saved[name].shape[1] != n_columns:
-                return f"{name} must have {n_columns} columns, got shape {saved[name].shape}"
-        for name, n in (("values", n_points), ("known", n_points * self.n_actions), ("lowest_value", 1)):
-            if saved[name].shape != (n,):
-                return f"{name} must have shape ({n},) for this grid, got {saved[name].shape}"
-        for name, own in ({} if self.transfer is None else self.transfer.saved_arrays()).items():
-            array = saved[f"transfer_{name}"]
-            # Rows are as many as were learned; a single row of numbers has its length for good.
-            if array.ndim != own.ndim or (array.shape[1:] if own.ndim > 1 else array.shape) != own.shape[own.ndim > 1 :]:
-                return f"transfer_{name} has shape {array.shape}, which does not fit one of {own.shape}"
-        for name, array in saved.items():
-            if not np.isfinite(array).all():
-                return f"{name} must hold finite numbers only"
-        return ""
+        n_pairs = n_points * self.n_actions
+        of_transfer = {} if self.transfer is None else self.transfer.saved_arrays()
+        return {
+            **{f"transfer_{k}": (None, *a.shape[1:]) if a.ndim > 1 else a.shape for k, a in of_transfer.items()},
+            "instances": (None, 2 * d + 4),
+            "corrections": (None, d + 2),
+            "values": (n_points,),
+            "known": (n_pairs,),
+            "total": (n_pairs,),
+            "reach": (2, d),
+            "lowest_value": (1,),
+        }
 
     def _restore(self, saved: dict[str, np.ndarray]) -> None:
         model, d = self.model, self.scaling.n_variables
@@ -438,9 +441,9 @@ class FittedRMaxPolicy(BasePolicy):
         )
         self._restore_transfer(saved)
         fresh.instances = InstanceArrays.of_rows(
-            actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5, self.n_actions
+            self.n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5
         )
-        fresh.restore(saved["known"] > 0.5, rows[:, -1] > 0.5)
+        fresh.restore(rows[:, -1] > 0.5, saved["known"] > 0.5, saved["total"], saved["reach"])
         self.model = self.planner.model = fresh
         self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])
         self.planner.restore(saved["values"])

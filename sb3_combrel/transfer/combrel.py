@@ -183,7 +183,8 @@ class COMBREL(VirtualSourceTransfer):
         self._renewed.append(points[:changed] + action * n_points)
 
     def saved_arrays(self) -> dict[str, np.ndarray]:
-        return {**super().saved_arrays(), "first_episode": np.array([float(self._first_episode)])}
+        own = {"first_episode": np.array([float(self._first_episode)]), "switches": np.array([float(self._switches)])}
+        return {**super().saved_arrays(), **own}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         assert self.target is not None
@@ -194,6 +195,7 @@ class COMBREL(VirtualSourceTransfer):
             for action in range(self.target.n_actions):
                 self._vote_at(np.arange(len(self.target.sample_states)), action)
             self._renewed = []
+        self._switches = int(saved["switches"][0])
         if self.relevance and self._seen.n:
             self._renew_relevance()
 

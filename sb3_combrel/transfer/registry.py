@@ -97,5 +97,5 @@ def _name(method: type) -> str:
     return f"{method.__module__}.{method.__qualname__}"
 
 
-def _subclasses(method: type[Transfer]) -> list[type[Transfer]]:
+def _subclasses(method: Any) -> list[type[Transfer]]:
     return [each for child in method.__subclasses__() for each in (child, *_subclasses(child))]
