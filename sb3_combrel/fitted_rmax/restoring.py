@@ -55,7 +55,7 @@ def refill_lists(arrays, instances, slots, grid, kernel, threshold, at, index, w
 
 
 def in_neighbourhoods(instances: InstanceArrays, listed: np.ndarray) -> tuple[InstanceArrays, np.ndarray]:
-    """Those instances that stand in any list, along a curve that fills the space (Morton's), so that a search finds most blocks out of reach.
+    """Those instances that stand in any list, along a curve that fills the space (Morton's): a search passes over most blocks.
 
     :param listed: whether each instance does, bool, those of one action after those of another
     :return: they, and the place that each had, int64, shape (n_actions, most instances of an action)
