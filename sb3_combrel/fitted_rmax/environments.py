@@ -29,8 +29,8 @@ def refuse_normalized_observations(env: VecEnv) -> None:
     normalizer = unwrap_vec_normalize(env)
     if normalizer is not None and normalizer.norm_obs:
         raise ValueError(
-            "FittedRMax cannot work with VecNormalize(norm_obs=True): its statistics drift, and the model's grid is fixed. "
-            "Use VecNormalize(norm_obs=False); FittedRMax scales observations by their bounds itself"
+            "FittedRMax needs VecNormalize(norm_obs=False), for it scales observations by their bounds itself: the statistics "
+            "of norm_obs=True drift, and the model's grid is fixed"
         )
 
 

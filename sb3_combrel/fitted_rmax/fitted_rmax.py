@@ -372,7 +372,12 @@ class FittedRMax(BaseAlgorithm):
         """
         Save all the attributes of the object and the model parameters in a zip-file, which appears complete or not at all.
 
-        A transfer method is saved as plain data, with its source instances.
+        A transfer method is saved as plain data, with its source instances; one of your own by what ``Transfer.arguments``
+        says. What cannot be written so is left out, with a warning, and must be passed to :meth:`load`.
+
+        Saved at the end of an episode, a loaded model learns to the last bit what this one would learn on. In the middle of
+        an episode it has the rest of the planning done sooner. Always renewed are ``TIMBREL``'s random draws, the order of
+        ``relevance``, and lists that an instance had cut short which ``max_instances`` has since displaced.
 
         :param path: path to the file where the rl agent should be saved
         :param exclude: name of parameters that should be excluded in addition to the default ones

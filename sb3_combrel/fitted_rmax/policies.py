@@ -399,13 +399,6 @@ class FittedRMaxPolicy(BasePolicy):
             else:
                 self._restore(saved)
 
-    def _restore_transfer(self, saved: dict[str, np.ndarray]) -> None:
-        """Bind the transfer method anew and give it back what it had learned."""
-        if self.transfer is not None:
-            self.transfer.bind(self._task, self.rng)
-            prefix = "transfer_"
-            self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
-
     def _saved_shapes(self) -> dict[str, tuple[int | None, ...]]:
         """Shapes that saved arrays must have; None for any number of rows."""
         d, n_points = self.scaling.n_variables, self.model.grid.n_points
@@ -439,7 +432,10 @@ class FittedRMaxPolicy(BasePolicy):
             transfer=model.transfer,
             max_instances=model.max_instances,
         )
-        self._restore_transfer(saved)
+        if self.transfer is not None:
+            self.transfer.bind(self._task, self.rng)
+            prefix = "transfer_"
+            self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
         fresh.instances = InstanceArrays.of_rows(
             self.n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5
         )

@@ -97,7 +97,7 @@ class Transfer(ABC):
         """The constructor's arguments that make this object anew, unbound; a saved model is rebuilt from them.
 
         By default the attributes that bear the arguments' names. They may be numbers, text, arrays, source instances,
-        mappings, sets of mappings, and sequences and dicts of these.
+        mappings, sets of mappings, and sequences and dicts of these; arrays and tuples come back as lists.
 
         :raises AttributeError: if an argument has no such attribute
         """

@@ -1,7 +1,7 @@
 """Seeds: the same run to the last bit."""
 
 import numpy as np
-from walk import same_parameters
+from walk import same_parameters, small
 
 
 def test_the_same_seed_gives_the_same_run_to_the_last_bit(make):
@@ -27,8 +27,6 @@ def test_without_a_seed_numpys_decides(make):
 
 
 def test_without_a_seed_runs_differ():
-    from walk import small
-
     runs = []
     for seed in (1, 2, 3, 4, 5):
         np.random.seed(seed)

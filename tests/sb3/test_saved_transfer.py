@@ -6,6 +6,7 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from walk import METHODS, STRIDE, Walk, same_parameters, small, stored, walk_source
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
+from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import Transfer
 
 MAPPING = InterTaskMapping([0, 1], [0, 1])
@@ -134,8 +135,6 @@ class Pushy(Transfer):
         return news
 
     def _push_all(self, needed):
-        from sb3_combrel.common.supply import Supply
-
         n = len(needed)
         effect = np.zeros((n, 1, self.target.n_variables))
         effect[:, :, 0] = self.push
