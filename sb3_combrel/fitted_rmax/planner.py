@@ -59,6 +59,13 @@ def push(queue, point, level):
         queue.queued[level, point] = True
 
 
+@compiled
+def push_all(queue, points):
+    """Let ``points`` wait for a backup, after all others."""
+    for p in range(len(points)):
+        push(queue, points[p], 0)
+
+
 @inlined
 def pop(queue):
     """The point to back up next, -1 if none waits."""
@@ -344,8 +351,7 @@ class Planner:
         self._exploitation = None
         self.values[:] = np.clip(values, *self.bounds)
         self.queue = SweepQueue.empty(self.values)
-        for point in np.flatnonzero(self.model.arrays.n_optimistic == 0):
-            push(self.queue, point, 0)
+        push_all(self.queue, np.flatnonzero(self.model.arrays.n_optimistic == 0))
 
     @property
     def n_waiting(self) -> int:

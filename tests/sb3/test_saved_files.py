@@ -238,12 +238,12 @@ class Untouched(Env):
 
 
 def long_walks(d, n_actions, n):
-    """What 50,000 steps bring: trajectories, all digits in use."""
+    """What 50,000 steps bring: trajectories, all digits in use; of Mountain Car's instances a third stand in lists."""
     rng = np.random.default_rng(0)
     effect = 0.02 * rng.normal(size=(n, d))
     state = np.abs((np.cumsum(effect, axis=0) + 0.5) % 2.0 - 1.0)
     action = np.sort(rng.integers(n_actions, size=n))
-    return np.column_stack([action, state, effect, np.full(n, -1.0), np.zeros(n), np.ones(n)])
+    return np.column_stack([action, state, effect, np.full(n, -1.0), np.zeros(n), rng.random(n) < 0.4])
 
 
 def save_and_load(model, path):
