@@ -39,7 +39,7 @@ def refill_lists(arrays, instances, slots, grid, kernel, threshold, at, index, w
         length = np.int64(0)
         total = 0.0
         for f in range(found):
-            w = kernel_weight(instances.state[action, index[f]], at, breadth, grid)
+            w = kernel_weight(instances.state[action, index[f]], at, breadth)
             if w >= min_weight:
                 length, total = insert_by_weight(
                     lists.index, lists.weight, lists.start[pair], length, total, slots[action, index[f]], w, min_fraction
@@ -92,7 +92,7 @@ def coordinates_of(point, grid, at):
 
 
 @compiled
-def kernel_weight(state, at, breadth, grid):
+def kernel_weight(state, at, breadth):
     """The weight of an instance at a grid point, to the last bit what ``points_in_reach`` says."""
     weight = 1.0
     for k in range(len(at)):
