@@ -8,18 +8,19 @@ from numba.core import event
 
 # The loops allocate nothing, so they run without numba's reference counting: its atomic increments at every call with
 # an array cost more than the loops themselves, and so does wrapping every array that comes in from Python.
+_njit: Any = njit
 _options: dict[str, Any] = dict(cache=True, _nrt=False, error_model="numpy", no_cfunc_wrapper=True)
-compiled = njit(**_options)
+compiled = _njit(**_options)
 
 # The same for functions that only compiled code calls: each array that may come in from Python costs time to compile.
 # Calling one from Python would crash; a test compiles its ``py_func`` anew.
-inner = njit(**_options, no_cpython_wrapper=True)
+inner = _njit(**_options, no_cpython_wrapper=True)
 
 # The same for functions called in the innermost loops: handing over a handful of arrays costs more than such a function.
-inlined = njit(**_options, no_cpython_wrapper=True, forceinline=True)
+inlined = _njit(**_options, no_cpython_wrapper=True, forceinline=True)
 
 # The same for loops whose sums may be taken in any order, as vector registers do.
-compiled_fast = njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
+compiled_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).

@@ -55,6 +55,38 @@ class InstanceArrays(NamedTuple):
             searches=np.zeros(1, dtype=np.int64),
         )
 
+    @classmethod
+    def of_rows(
+        cls,
+        n_actions: int,
+        action: np.ndarray,
+        state: np.ndarray,
+        effect: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+    ) -> "InstanceArrays":
+        """Instances given one a row, in their order.
+
+        :param action: int64, shape (n,)
+        :param state: shape (n, n_variables); ``effect``: the same
+        :param reward: shape (n,); ``terminated``: bool, same shape
+        """
+        counts = np.bincount(action, minlength=n_actions)
+        capacity = 8 * BLOCK
+        while capacity < counts.max():
+            capacity *= 2
+        held = cls.empty(n_actions, state.shape[1], capacity)
+        held.count[:] = counts
+        for a, n in enumerate(counts):
+            rows = np.flatnonzero(action == a)
+            held.state[a, :n], held.effect[a, :n] = state[rows], effect[rows]
+            held.reward[a, :n], held.terminated[a, :n] = reward[rows], terminated[rows]
+            first = np.arange(0, n, BLOCK)
+            if n > 0:
+                held.block_low[a, :, : len(first)] = np.minimum.reduceat(state[rows], first).T
+                held.block_high[a, :, : len(first)] = np.maximum.reduceat(state[rows], first).T
+        return held
+
     @property
     def capacity(self) -> int:
         """Instances of one action for which there is room."""

@@ -58,6 +58,19 @@ class CorrectionArrays(NamedTuple):
             visits=np.zeros(VISIT_TABLE_SIZE, dtype=np.int32),
         )
 
+    @classmethod
+    def of_rows(cls, key: np.ndarray, value: np.ndarray, state: np.ndarray) -> "CorrectionArrays":
+        """Those given one a row; of rows with the same key the last one is found."""
+        n = len(key)
+        capacity = 256
+        while capacity < n:
+            capacity *= 2
+        held = cls.empty(state.shape[1], capacity)
+        held.key[:n], held.value[:n], held.state[:n] = key, value, state
+        held.count[0] = n
+        note_all(held)
+        return held
+
     def with_room(self) -> "CorrectionArrays":
         """Itself, or a copy of twice the size if one more state would not fit."""
         capacity = len(self.key)
@@ -68,8 +81,7 @@ class CorrectionArrays(NamedTuple):
         larger.key[:n], larger.state[:n], larger.value[:n] = self.key, self.state, self.value
         larger.count[0] = n
         larger = larger._replace(visit_key=self.visit_key, visits=self.visits)
-        for m in range(n):
-            larger.table[find_cell(larger, larger.key[m])] = m
+        note_all(larger)
         return larger
 
 
@@ -92,6 +104,13 @@ def find_cell(corrections, key):
     while corrections.table[at] >= 0 and corrections.key[corrections.table[at]] != key:
         at = (at + 1) & mask
     return at
+
+
+@compiled
+def note_all(corrections):
+    """Enter all remembered states in the table."""
+    for m in range(corrections.count[0]):
+        corrections.table[find_cell(corrections, corrections.key[m])] = m
 
 
 @inner

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import io
 import math
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
@@ -22,13 +25,29 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_combrel.callbacks import with_dashboard
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.environments import names_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.fitted_rmax.saving import read_model, write_model
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.registry import make_transfer
+from sb3_combrel.transfer.plain import to_plain
+from sb3_combrel.transfer.registry import describe_transfer, make_transfer, restore_transfer
 
 SelfFittedRMax = TypeVar("SelfFittedRMax", bound="FittedRMax")
 
 DEFAULT_TIMESTEPS = 20_000
+# The constructor's arguments that only this algorithm has.
+_ARGUMENTS = (
+    "model_breadth",
+    "min_fraction",
+    "min_weight",
+    "exploration_threshold",
+    "resolution",
+    "max_value",
+    "planning_tolerance",
+    "max_backups",
+    "max_instances",
+    "bounds",
+)
 
 
 class FittedRMax(BaseAlgorithm):
@@ -145,18 +164,22 @@ class FittedRMax(BaseAlgorithm):
         self.max_instances = max_instances
         self.bounds = bounds
         self._warned_of_max_value = False
+        self._chance: dict[str, Any] | None = None
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
         self._check_arguments()
+        self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
-            _refuse_normalized_observations(self.env)
+            refuse_normalized_observations(self.env)
         if self.seed is None:
             # A script that seeds numpy is then reproducible, as with the other algorithms.
             self._rng = np.random.default_rng(np.random.randint(2**31))
         self.set_random_seed(self.seed)
-        names = _names(self.env)
+        if self._chance is not None:
+            self._rng.bit_generator.state, self._chance = self._chance, None
+        names = names_of(self.env)
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
@@ -260,7 +283,7 @@ class FittedRMax(BaseAlgorithm):
         self.num_timesteps += self.env.num_envs
         self._update_info_buffer(infos, dones)
         raw_rewards = self._raw_rewards(rewards)
-        next_obs, terminated = _true_outcomes(new_obs, dones, infos)
+        next_obs, terminated = true_outcomes(new_obs, dones, infos)
         next_states = self.policy.to_unit(next_obs)
         for e, choice in enumerate(choices):
             self._backups += self.policy.learn_from(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]))
@@ -335,10 +358,75 @@ class FittedRMax(BaseAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         if isinstance(env, VecEnv):
-            _refuse_normalized_observations(env)
+            refuse_normalized_observations(env)
         super().set_env(env, force_reset)
         assert self.env is not None
         self._vec_normalize_env = unwrap_vec_normalize(self.env)
+
+    def save(
+        self,
+        path: str | Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file, which appears complete or not at all.
+
+        A transfer method is saved as plain data, with its source instances; one of your own by what ``Transfer.arguments``
+        says. What cannot be written so is left out, with a warning, and must be passed to :meth:`load`.
+
+        Saved at the end of an episode, a loaded model learns to the last bit what this one would learn on. In the middle of
+        an episode it has the rest of the planning done sooner. Always renewed are ``TIMBREL``'s random draws, the order of
+        ``relevance``, and lists that an instance had cut short which ``max_instances`` has since displaced.
+
+        :param path: path to the file where the rl agent should be saved
+        :param exclude: name of parameters that should be excluded in addition to the default ones
+        :param include: name of parameters that might be excluded but should be included anyway
+        """
+        written, content = copy.copy(self), io.BytesIO()
+        for name in (*_ARGUMENTS, "gamma", "seed"):
+            setattr(written, name, to_plain(getattr(self, name)))
+        written.transfer = describe_transfer(self.policy.transfer)
+        written._chance = dict(self._rng.bit_generator.state)
+        super(FittedRMax, written).save(content, exclude, include)
+        write_model(path, content)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfFittedRMax],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfFittedRMax:
+        """
+        Load the model from a zip-file.
+
+        :param path: path to the file (or a file-like) where to load the agent from
+        :param env: the new environment to run the loaded model on (if registered in Gymnasium, can be a str; can be None
+            if you only need prediction from a trained model)
+        :param device: device on which the tensors of the policy go
+        :param custom_objects: objects that replace those of the file
+        :param print_system_info: whether to print system info from the saved model and the current system info
+        :param force_reset: force a call to ``reset()`` before training
+        :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved.
+            Without ``seed=`` the generator goes on where it was.
+        :return: new model instance with loaded parameters
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if the file is damaged or was not saved by this class
+        """
+        content = read_model(path, names=_ARGUMENTS)
+        environment = maybe_make_env(env, verbose=0) if isinstance(env, str) else env
+        if "seed" in kwargs:
+            kwargs["_chance"] = None
+        try:
+            return super().load(content, environment, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (RuntimeError, KeyError) as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(f"{path} cannot be loaded as a model of FittedRMax: {reason}") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_tags", "_last_states"]
@@ -358,39 +446,3 @@ def _is_policy(thing: Any) -> bool:
     if isinstance(thing, str):
         return thing in FittedRMax.policy_aliases or (thing.endswith("Policy") and thing.isidentifier())
     return isinstance(thing, type) and issubclass(thing, BasePolicy)
-
-
-def _names(env: VecEnv | None) -> dict[str, Any]:
-    """Names of state variables and actions, where the environment has them."""
-    if env is None:
-        return {}
-    found = {}
-    for name in ("state_names", "action_names"):
-        # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
-        if not env.has_attr(name):
-            continue
-        value = env.get_attr(name, 0)[0]
-        if isinstance(value, Sequence) and not isinstance(value, str):
-            found[name] = value
-    return found
-
-
-def _refuse_normalized_observations(env: VecEnv) -> None:
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is not None and normalizer.norm_obs:
-        raise ValueError(
-            "FittedRMax cannot work with VecNormalize(norm_obs=True): its statistics drift, and the model's grid is fixed. "
-            "Use VecNormalize(norm_obs=False); FittedRMax scales observations by their bounds itself"
-        )
-
-
-def _true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each step led, before an environment reset itself, and whether that was a terminal state."""
-    if not dones.any():
-        return np.asarray(new_obs), dones
-    next_obs = np.array(new_obs)
-    terminated = np.array(dones, dtype=bool)
-    for e in np.flatnonzero(dones):
-        next_obs[e] = infos[e]["terminal_observation"]
-        terminated[e] = not infos[e].get("TimeLimit.truncated", False)
-    return next_obs, terminated

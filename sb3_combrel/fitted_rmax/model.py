@@ -13,12 +13,13 @@ from sb3_combrel.fitted_rmax.grid import StateGrid
 from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
-    enter_all,
     leave_lists,
     put_and_enter,
+    renew_predecessors,
     settle,
     worth_settling,
 )
+from sb3_combrel.fitted_rmax.restoring import in_neighbourhoods, note_effects, refill_lists
 from sb3_combrel.transfer.base import Transfer
 
 MOST_PAIRS_AT_ONCE = 4096
@@ -203,16 +204,36 @@ class KernelModel:
             return self._no_supply
         return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
 
-    def restore(self, known: np.ndarray) -> None:
+    def renew_predecessors(self) -> None:
+        """Forget predecessors that no row needs any more."""
+        while not renew_predecessors(self.arrays):
+            self.make_room()
+
+    def restore(self, listed: np.ndarray, known: np.ndarray, total: np.ndarray) -> None:
         """Rebuild lists and rows after instances were written to :attr:`instances` directly.
 
+        :param listed: the instances that stood in any list, bool, shape (n_instances,), by action
         :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
+        :param total: the sums of their weights, shape (n_pairs,); used where they differ from the new ones by rounding only
         """
         self.arrays = self.arrays._replace(**self._of_instances())
-        at = np.zeros(2, dtype=np.int64)
-        self._progress[:] = -1, 0
-        rules = (self._kernel, self.exploration_threshold)
-        while not enter_all(self.instances, self.arrays, self.grid.arrays, *rules, at, self.scratch, self._progress):
+        note_effects(self.instances, self.arrays, self.grid.arrays)
+        scratch = np.empty(self.grid.n_variables), np.empty(self.list_room, np.int32), np.empty(self.list_room)
+        search = (
+            *in_neighbourhoods(self.instances, listed),
+            self.grid.arrays,
+            self._kernel,
+            self.exploration_threshold,
+            *scratch,
+        )
+        pair = 0
+        while (pair := refill_lists(self.arrays, *search, pair)) < len(known):
             self.make_room()
-        self.arrays.known[:] |= known & (self.arrays.lists.length > 0)
+        arrays = self.arrays
+        same = np.abs(total - arrays.total) <= 1e-9 * arrays.total
+        arrays.total[same] = total[same]
+        listed = np.flatnonzero(arrays.lists.length > 0)
+        last = arrays.lists.weight[arrays.lists.start[listed] + arrays.lists.length[listed] - 1]
+        arrays.entry[listed] = np.minimum(last, self.min_fraction * arrays.total[listed])
+        arrays.known[listed] |= known[listed]
         self.settle(np.arange(len(known)))

@@ -176,24 +176,6 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
 
 
 @compiled
-def enter_all(instances, arrays, grid, kernel, threshold, at, scratch, progress):
-    """:func:`enter` all instances, one after the other; returns as that does.
-
-    :param at: int64, shape (2,): action and slot to go on with, {0, 0} at first
-    """
-    while at[0] < len(instances.count):
-        while at[1] < instances.count[at[0]]:
-            if not enter(instances, arrays, grid, kernel, threshold, at[0], at[1], scratch, progress):
-                return False
-            progress[0] = -1
-            progress[1] = 0
-            at[1] += 1
-        at[0] += 1
-        at[1] = 0
-    return True
-
-
-@compiled
 def put_and_enter(
     instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress
 ):
@@ -425,3 +407,18 @@ def settle_pairs(arrays, instances, grid, gamma, pairs, done, supply, scratch):
             arrays.n_optimistic[pair % n_points] += -1 if has_row else 1
         done += 1
     return done
+
+
+@compiled
+def renew_predecessors(arrays):
+    """Forget predecessors that no row needs any more; False if their pool must grow before another call."""
+    arrays.predecessors.length[:] = np.int32(0)
+    n_points = len(arrays.n_optimistic)
+    for pair in range(len(arrays.reward)):
+        if arrays.settled[pair]:
+            start = arrays.rows.start[pair]
+            for k in range(start, start + arrays.rows.length[pair]):
+                point = pair % n_points
+                if not note_predecessor(arrays.predecessors, arrays.rows.index[k], point, arrays.rows.weight[k]):
+                    return False
+    return True

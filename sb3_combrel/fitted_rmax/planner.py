@@ -60,6 +60,13 @@ def push(queue, point):
     queue.waiting[point] = True
 
 
+@compiled
+def push_all(queue, points):
+    """Let ``points`` wait for a backup, after all others."""
+    for p in range(len(points)):
+        push(queue, points[p])
+
+
 @inlined
 def pop(queue):
     """The point that has waited longest, -1 if none waits."""
@@ -304,8 +311,12 @@ class Planner:
         self._exploitation = None
         self.values[:] = np.clip(values, *self.bounds)
         self.queue = SweepQueue.empty(self.values, self.model.n_actions)
-        waiting = np.flatnonzero(self.model.arrays.n_optimistic == 0)
-        self.queue.ring[: len(waiting)], self.queue.ends[1], self.queue.waiting[waiting] = waiting, len(waiting), True
+        push_all(self.queue, np.flatnonzero(self.model.arrays.n_optimistic == 0))
+
+    def start_anew(self) -> None:
+        """Forget how the values came about, as if they and the model had been restored."""
+        self.model.renew_predecessors()
+        self.restore(self.values)
 
     @property
     def n_waiting(self) -> int:

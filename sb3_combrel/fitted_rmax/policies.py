@@ -14,15 +14,17 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.compiled import SameTypes
-from sb3_combrel.common.instances import InstanceArrays, put_instance
+from sb3_combrel.common.instances import InstanceArrays
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 from sb3_combrel.common.supply import Supply
-from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays, find_cell
+from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around
+from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
@@ -46,7 +48,7 @@ class FittedRMaxPolicy(BasePolicy):
     :param observation_space: a one-dimensional Box
     :param action_space: Discrete
     :param lr_schedule: not used; SB3 passes one to every policy
-    :param transfer: a transfer method of the policy's own, bound here
+    :param transfer: a transfer method of the policy's own, bound here; or what a file has of one
     :param rng: source of all chance (ties, transfer)
     """
 
@@ -67,7 +69,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_backups: int = 30,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
-        transfer: Transfer | None = None,
+        transfer: Transfer | dict[str, Any] | None = None,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         rng: np.random.Generator | None = None,
@@ -77,7 +79,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.exploration_threshold = float(exploration_threshold)
         self.gamma = float(gamma)
         self.max_backups = max_backups
-        self.transfer = transfer
+        self.transfer: Transfer | None = restore_transfer(transfer)
         self.rng = np.random.default_rng() if rng is None else rng
         self.scaling = StateScaling.from_space(observation_space, bounds)
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
@@ -102,9 +104,9 @@ class FittedRMaxPolicy(BasePolicy):
         grid = fitting_grid(self.scaling.n_variables, self.n_actions, resolution, model_breadth, min_weight)
         self.state_names = tuple(state_names or (f"s{k}" for k in range(grid.n_variables)))
         self.action_names = tuple(action_names or (f"a{k}" for k in range(self.n_actions)))
-        if transfer is not None:
+        if self.transfer is not None:
             self._task = self._target_task(grid)
-            transfer.bind(self._task, self.rng)
+            self.transfer.bind(self._task, self.rng)
         self.model = KernelModel(
             grid,
             self.n_actions,
@@ -113,14 +115,14 @@ class FittedRMaxPolicy(BasePolicy):
             min_fraction=min_fraction,
             exploration_threshold=exploration_threshold,
             gamma=gamma,
-            transfer=transfer,
+            transfer=self.transfer,
             max_instances=max_instances,
         )
         self.planner = Planner(
             self.model, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=planning_tolerance
         )
-        if transfer is not None:
-            self._widen(transfer.lowest_reward())
+        if self.transfer is not None:
+            self._widen(self.transfer.lowest_reward())
         self.corrections = CorrectionArrays.empty(grid.n_variables)
         self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
         self._no_supply = Supply.none(self.n_actions, grid.n_variables)
@@ -144,7 +146,7 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
-        return {**spaces_of_both, **self._constructor_parameters}
+        return {**spaces_of_both, **self._constructor_parameters, "transfer": describe_transfer(self.transfer)}
 
     # ------------------------------------------------------------------ acting
 
@@ -191,9 +193,7 @@ class FittedRMaxPolicy(BasePolicy):
         rest = (self.exploration_threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
         if self.transfer is None:
             return int(
-                self._look_and_choose(
-                    instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor
-                )
+                self._look_and_choose(instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor)
             )
         self._look_around(instances, state, self.kernel, self._query)
         supply = self.transfer.supply_at(state, self._query.total)
@@ -267,8 +267,13 @@ class FittedRMaxPolicy(BasePolicy):
 
     def prepare(self) -> int:
         """Take up what transfer has to say before the first step, and plan until that is thought through."""
+        # Episodes are numbered anew.
+        self.corrections.visits.fill(0)
         backups = self._plan(0)
-        return backups if self.transfer is None else backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
+        if self.transfer is None and self.model.n_instances == 0:
+            return backups
+        self.planner.start_anew()
+        return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
 
     def _plan(self, max_backups: int) -> int:
         """Plan, and note how long it took if that is wanted (``timed``); backups done."""
@@ -325,7 +330,8 @@ class FittedRMaxPolicy(BasePolicy):
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         for name, array in self._saved_arrays().items():
-            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64), device=self.device)
+            # Column by column: a file of it becomes a tenth smaller.
+            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
 
     def _saved_arrays(self) -> dict[str, np.ndarray]:
         instances = self.model.instances
@@ -337,6 +343,7 @@ class FittedRMaxPolicy(BasePolicy):
                 instances.effect[action, :count],
                 instances.reward[action, :count, None],
                 instances.terminated[action, :count, None],
+                self.model.arrays.members[action, :count, None] > 0,
             ]
             by_action.append(np.hstack(columns))
         n = int(self.corrections.count[0])
@@ -346,6 +353,7 @@ class FittedRMaxPolicy(BasePolicy):
             "instances": np.vstack(by_action),
             "values": self.planner.values,
             "known": self.model.arrays.known,
+            "total": self.model.arrays.total,
             "lowest_value": np.array([self.planner.bounds[0]]),
             "corrections": np.column_stack([self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]),
         }
@@ -361,45 +369,43 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         saved = {}
-        for name in self._saved_arrays():
+        ours = self._saved_shapes().keys()
+        for name in ours:
             if prefix + name in state_dict:
                 saved[name] = state_dict[prefix + name].detach().cpu().numpy().astype(np.float64)
             else:
                 missing_keys.append(prefix + name)
-        ours = set(self._saved_arrays())
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in ours)
+        if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
+            error_msgs.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
         if len(saved) == len(ours):
-            problem = self._misfit(saved)
+            problem = misfit(saved, self._saved_shapes())
             if problem:
                 error_msgs.append(problem)
             else:
                 self._restore(saved)
 
-    def _restore_transfer(self, saved: dict[str, np.ndarray]) -> None:
-        """Bind the transfer method anew and give it back what it had learned."""
-        if self.transfer is not None:
-            self.transfer.bind(self._task, self.rng)
-            prefix = "transfer_"
-            self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
-
-    def _misfit(self, saved: dict[str, np.ndarray]) -> str:
-        """What is wrong with saved arrays; empty if nothing."""
+    def _saved_shapes(self) -> dict[str, tuple[int | None, ...]]:
+        """Shapes that saved arrays must have; None for any number of rows."""
         d, n_points = self.scaling.n_variables, self.model.grid.n_points
-        for name, n_columns in (("instances", 2 * d + 3), ("corrections", d + 2)):
-            if saved[name].ndim != 2 or saved[name].shape[1] != n_columns:
-                return f"{name} must have {n_columns} columns, got shape {saved[name].shape}"
-        for name, n in (("values", n_points), ("known", n_points * self.n_actions), ("lowest_value", 1)):
-            if saved[name].shape != (n,):
-                return f"{name} must have shape ({n},) for this grid, got {saved[name].shape}"
-        for name, array in saved.items():
-            if not np.isfinite(array).all():
-                return f"{name} must hold finite numbers only"
-        return ""
+        n_pairs = n_points * self.n_actions
+        of_transfer = {} if self.transfer is None else self.transfer.saved_arrays()
+        return {
+            **{f"transfer_{k}": (None, *a.shape[1:]) if a.ndim > 1 else a.shape for k, a in of_transfer.items()},
+            "instances": (None, 2 * d + 4),
+            "corrections": (None, d + 2),
+            "values": (n_points,),
+            "known": (n_pairs,),
+            "total": (n_pairs,),
+            "lowest_value": (1,),
+        }
 
     def _restore(self, saved: dict[str, np.ndarray]) -> None:
         model, d = self.model, self.scaling.n_variables
         rows = saved["instances"]
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
+        order = np.argsort(actions, kind="stable")
+        rows, actions = rows[order], actions[order]
         fresh = KernelModel(
             model.grid,
             self.n_actions,
@@ -411,23 +417,16 @@ class FittedRMaxPolicy(BasePolicy):
             transfer=model.transfer,
             max_instances=model.max_instances,
         )
-        self._restore_transfer(saved)
-        instances = InstanceArrays.empty(self.n_actions, d)
-        for action, row in zip(actions, rows, strict=True):
-            instances = instances.with_room(action)
-            state, effect = row[1 : 1 + d], row[1 + d : 1 + 2 * d]
-            slot = instances.count[action]
-            put_instance(instances, action, slot, state, state + effect, row[-2], bool(row[-1] > 0.5))
-            instances.effect[action, slot] = effect
-        fresh.instances = instances
-        fresh.restore(saved["known"] > 0.5)
+        if self.transfer is not None:
+            self.transfer.bind(self._task, self.rng)
+            prefix = "transfer_"
+            self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
+        fresh.instances = InstanceArrays.of_rows(
+            self.n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5
+        )
+        fresh.restore(rows[:, -1] > 0.5, saved["known"] > 0.5, saved["total"])
         self.model = self.planner.model = fresh
         self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])
         self.planner.restore(saved["values"])
-        self.corrections = CorrectionArrays.empty(d)
-        for key, value, *state in saved["corrections"]:
-            self.corrections = self.corrections.with_room()
-            n = int(self.corrections.count[0])
-            self.corrections.table[find_cell(self.corrections, int(key))] = n
-            self.corrections.key[n], self.corrections.value[n], self.corrections.state[n] = int(key), value, state
-            self.corrections.count[0] = n + 1
+        corrections = saved["corrections"]
+        self.corrections = CorrectionArrays.of_rows(corrections[:, 0].astype(np.int64), corrections[:, 1], corrections[:, 2:])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -92,8 +93,22 @@ class Transfer(ABC):
         :param own_weight: shape (n_actions,); actions that reach the threshold need nothing
         """
 
+    def arguments(self) -> dict[str, Any]:
+        """The constructor's arguments that make this object anew, unbound; a saved model is rebuilt from them.
+
+        By default the attributes that bear the arguments' names. They may be numbers, text, arrays, source instances,
+        mappings, sets of mappings, and sequences and dicts of these; arrays and tuples come back as lists.
+
+        :raises AttributeError: if an argument has no such attribute
+        """
+        # A constructor that takes *args or **kwargs fails here as well, unless it keeps them by these names.
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
     def saved_arrays(self) -> dict[str, np.ndarray]:
-        """What was learned since it was bound, float64, to be saved with a model."""
+        """What was learned since it was bound, float64, to be saved with a model.
+
+        Names and shapes stay the same, but for the number of rows of arrays with several axes.
+        """
         return {}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:  # noqa: B027 - nothing saved, nothing to restore

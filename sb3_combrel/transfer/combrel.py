@@ -133,6 +133,10 @@ class COMBREL(VirtualSourceTransfer):
 
     def _measure(self, i: int) -> None:
         """Compliance of transition ``i`` with every mapping, and the votes that it changes (lines 9-13 and 17-20)."""
+        self._vote_at(self._electorate(i), int(self._seen.actions[i]))
+
+    def _electorate(self, i: int) -> np.ndarray:
+        """Compliance of transition ``i`` with every mapping; the sample states that now have it among their nearest."""
         assert self.target is not None
         if i == len(self._tables):
             self._tables = np.concatenate([self._tables, np.empty_like(self._tables)])
@@ -160,9 +164,14 @@ class COMBREL(VirtualSourceTransfer):
             self._distance[action],
             self._changed_points,
         )
+        return self._changed_points[:n]
+
+    def _vote_at(self, points: np.ndarray, action: int) -> None:
+        """Renew the choices of an action at some sample states (``points`` is overwritten)."""
+        assert self.target is not None
         n_points = len(self.target.sample_states)
         changed = self._vote(
-            self._changed_points[:n],
+            points,
             self._near[action],
             self._tables,
             self._least,
@@ -171,21 +180,34 @@ class COMBREL(VirtualSourceTransfer):
             self._choice[action * n_points : (action + 1) * n_points],
         )
         self._switches += changed
-        self._renewed.append(self._changed_points[:changed] + action * n_points)
+        self._renewed.append(points[:changed] + action * n_points)
 
     def saved_arrays(self) -> dict[str, np.ndarray]:
-        return {**super().saved_arrays(), "first_episode": np.array([float(self._first_episode)])}
+        own = {"first_episode": np.array([float(self._first_episode)]), "switches": np.array([float(self._switches)])}
+        return {**super().saved_arrays(), **own}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
+        assert self.target is not None
         self._first_episode = bool(saved["first_episode"][0] > 0.5)
         super().restore(saved)
+        if self._measures:
+            # Once for all: only the last vote counts.
+            for action in range(self.target.n_actions):
+                self._vote_at(np.arange(len(self.target.sample_states)), action)
+            self._renewed = []
+        self._switches = int(saved["switches"][0])
         if self.relevance and self._seen.n:
             self._renew_relevance()
 
     def _note(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> None:
         super()._note(state, action, reward, effect)
-        if self.measured == "online" or not self._first_episode:
-            self._measure(self._seen.n - 1)
+        if self._measures:
+            self._electorate(self._seen.n - 1)
+
+    @property
+    def _measures(self) -> bool:
+        """Whether the transitions seen so far are measured."""
+        return self.measured == "online" or not self._first_episode
 
     # ---------------------------------------------------------------- supplying
 
@@ -202,7 +224,7 @@ class COMBREL(VirtualSourceTransfer):
         missing = own_weight < self._rules.threshold
         if self._seen.n == 0 or not missing.any():
             return self._nothing_for(len(own_weight))
-        n_measured = self._seen.n if self.measured == "online" or not self._first_episode else 0
+        n_measured = self._seen.n if self._measures else 0
         self._choose_at(
             state,
             missing,

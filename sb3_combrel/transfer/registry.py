@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import copy
 import importlib
+import warnings
 from typing import Any
 
 from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.plain import KIND, from_plain, to_plain
+
+SAVED = "transfer"
 
 
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
@@ -41,3 +45,57 @@ def _method(name: str) -> Any:
         raise ValueError(
             f"transfer names {name!r}, which does not exist; known are sb3_combrel.COMBREL and sb3_combrel.TIMBREL"
         ) from error
+
+
+def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
+    """
+    A transfer object as plain data, for a file; :func:`restore_transfer` makes it anew.
+
+    Of an object that plain data cannot describe only the name is kept, with a warning.
+
+    :param transfer: the object, as it was before it was bound or later
+    """
+    if transfer is None:
+        return None
+    name = _name(type(transfer))
+    arguments = None
+    try:
+        arguments = to_plain(transfer.arguments())
+    except (AttributeError, TypeError) as error:
+        warnings.warn(
+            f"{name} is not saved with the model ({error}): give it the method arguments(), or pass it again when the "
+            f"model is loaded, load(..., transfer={type(transfer).__name__}(...))",
+            stacklevel=3,
+        )
+    return {KIND: SAVED, "method": name, "arguments": arguments}
+
+
+def restore_transfer(transfer: Any) -> Any:
+    """
+    The transfer object that :func:`describe_transfer` described; anything else is returned as it is.
+
+    A file may come from anyone: nothing is imported, only classes that are defined already are considered.
+
+    :raises ValueError: if the method is not known or was not saved, or if the description is damaged
+    """
+    if not isinstance(transfer, dict) or transfer.get(KIND) != SAVED:
+        return transfer
+    name, arguments = transfer.get("method"), transfer.get("arguments")
+    found = [method for method in _subclasses(Transfer) if _name(method) == name]
+    if not found or arguments is None:
+        missing = "is not defined here: import it first, or" if not found else "could not be saved with it:"
+        raise ValueError(
+            f"the model was saved with the transfer method {name}, which {missing} pass it again, load(..., transfer=...)"
+        )
+    try:
+        return found[-1](**from_plain(arguments))
+    except TypeError as error:
+        raise ValueError(f"what was saved of the transfer method {name} does not fit it ({error})") from error
+
+
+def _name(method: type) -> str:
+    return f"{method.__module__}.{method.__qualname__}"
+
+
+def _subclasses(method: Any) -> list[type[Transfer]]:
+    return [each for child in method.__subclasses__() for each in (child, *_subclasses(child))]

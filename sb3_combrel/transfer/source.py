@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.transfer.selection import covering_rows, random_rows
-from sb3_combrel.transfer.source_file import ARRAY_NAMES, read_source, write_source
+from sb3_combrel.transfer.source_file import ARRAY_NAMES, DAMAGE, read_source, source_from_bytes, source_to_bytes, write_source
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -254,13 +254,20 @@ class SourceInstances:
         :return: the path written to
         :raises OSError: if the file cannot be written
         """
+        return write_source(path, *self._content())
+
+    def to_bytes(self) -> bytes:
+        """The content of the file that :meth:`save` writes."""
+        return source_to_bytes(*self._content())
+
+    def _content(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         header = {
             "n_actions": self.n_actions,
             "state_names": self.state_names,
             "action_names": self.action_names,
             "origin": self.origin,
         }
-        return write_source(path, {name: getattr(self, name) for name in ARRAY_NAMES}, header)
+        return {name: getattr(self, name) for name in ARRAY_NAMES}, header
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SourceInstances:
@@ -271,15 +278,28 @@ class SourceInstances:
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if the file is damaged, of another kind or of another version of the format
         """
-        return read_source(
-            path,
-            lambda arrays, header: cls(
-                **arrays,
-                n_actions=header["n_actions"],
-                state_names=tuple(header["state_names"]),
-                action_names=tuple(header["action_names"]),
-                origin=header["origin"],
-            ),
+        return read_source(path, cls._of_content)
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> SourceInstances:
+        """
+        What :meth:`to_bytes` wrote.
+
+        :raises ValueError: if the bytes are damaged, of another kind or of another version of the format
+        """
+        try:
+            return source_from_bytes(content, cls._of_content)
+        except DAMAGE as error:
+            raise ValueError(f"the source instances are damaged ({error})") from error
+
+    @classmethod
+    def _of_content(cls, arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> SourceInstances:
+        return cls(
+            **arrays,
+            n_actions=header["n_actions"],
+            state_names=tuple(header["state_names"]),
+            action_names=tuple(header["action_names"]),
+            origin=header["origin"],
         )
 
     def _with_rows(self, rows: NDArray[np.int64], origin: Mapping[str, Any]) -> SourceInstances:

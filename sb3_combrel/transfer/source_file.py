@@ -6,7 +6,6 @@ import io
 import json
 import os
 import struct
-import tempfile
 import tokenize
 import zipfile
 import zlib
@@ -17,12 +16,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_combrel.common.files import write_whole
+
 FORMAT = "sb3_combrel.SourceInstances"
 FORMAT_VERSION = 1
 ARRAY_NAMES = ("states", "actions", "rewards", "next_states", "terminated", "low", "high")
 
 # What the zip, npy, JSON and instance layers raise for bytes that are not what they expect.
-_DAMAGE = (
+DAMAGE = (
     ArithmeticError,
     AttributeError,
     EOFError,
@@ -53,22 +54,16 @@ def write_source(path: str | os.PathLike[str], arrays: Mapping[str, NDArray[Any]
     :raises OSError: if the file cannot be written
     """
     target = _with_suffix(path)
-    text = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, **header})
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder, as a file can only be renamed within one file system.
-    temporary = tempfile.NamedTemporaryFile(prefix=target.name, suffix=".part", dir=target.parent, delete=False)
-    try:
-        with temporary as file:
-            np.savez_compressed(file, allow_pickle=False, header=np.array(text), **arrays)
-        # Temporary files are private; give this one the rights of any new file.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary.name, 0o666 & ~umask)
-        os.replace(temporary.name, target)
-    except BaseException:
-        Path(temporary.name).unlink(missing_ok=True)
-        raise
+    write_whole(target, source_to_bytes(arrays, header))
     return target
+
+
+def source_to_bytes(arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]) -> bytes:
+    """The content of such a file."""
+    text = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, **header})
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, header=np.array(text), **arrays)
+    return content.getvalue()
 
 
 def read_source(path: str | os.PathLike[str], build: Callable[[dict[str, NDArray[Any]], dict[str, Any]], Read]) -> Read:
@@ -83,22 +78,31 @@ def read_source(path: str | os.PathLike[str], build: Callable[[dict[str, NDArray
     file = Path(path) if Path(path).is_file() else _with_suffix(path)
     if not file.is_file():
         raise FileNotFoundError(f"there is no source file {file}; write one with SourceInstances.record(...).save(path)")
-    content = io.BytesIO(file.read_bytes())
     try:
-        # No pickle: a source file may come from anyone.
-        with np.load(content, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            if header["format"] != FORMAT:
-                raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
-            if header["version"] != FORMAT_VERSION:
-                raise ValueError(f"its format version is {header['version']!r}, this package reads {FORMAT_VERSION}")
-            arrays = {name: archive[name] for name in ARRAY_NAMES}
-        return build(arrays, header)
-    except _DAMAGE as error:
+        return source_from_bytes(file.read_bytes(), build)
+    except DAMAGE as error:
         raise ValueError(
             f"{file} is damaged or not a file of source instances ({error}); "
             "write it again with SourceInstances.record(...).save(path)"
         ) from error
+
+
+def source_from_bytes(content: bytes, build: Callable[[dict[str, NDArray[Any]], dict[str, Any]], Read]) -> Read:
+    """
+    What :func:`source_to_bytes` wrote.
+
+    :param build: makes the result of the arrays and the header
+    :raises Exception: of many kinds, if the bytes are damaged, of another kind or of another version of the format
+    """
+    # No pickle: a source file may come from anyone.
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        header = json.loads(str(archive["header"]))
+        if header["format"] != FORMAT:
+            raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
+        if header["version"] != FORMAT_VERSION:
+            raise ValueError(f"its format version is {header['version']!r}, this package reads {FORMAT_VERSION}")
+        arrays = {name: archive[name] for name in ARRAY_NAMES}
+    return build(arrays, header)
 
 
 def _with_suffix(path: str | os.PathLike[str]) -> Path:

@@ -290,11 +290,25 @@ class VirtualSourceTransfer(Transfer):
 
     # --------------------------------------------------------------- saving
 
+    def arguments(self) -> dict[str, Any]:
+        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        if self.target is None:
+            return super().arguments()
+        return {**super().arguments(), "source": self._sources if len(self._sources) > 1 else self._sources[0]}
+
     def saved_arrays(self) -> dict[str, np.ndarray]:
         seen = self._seen
         n = seen.n
         columns = [seen.states[:n], seen.effects[:n], seen.rewards[:n, None], seen.actions[:n, None]]
-        return {"transitions": np.hstack(columns), "breadth": np.array([self._rules.breadth])}
+        uses = np.zeros(len(self._origin))
+        uses[list(self._uses)] = list(self._uses.values())
+        return {
+            "transitions": np.hstack(columns),
+            "breadth": np.array([self._rules.breadth]),
+            "renewal_due": np.array([float(self._renewal_due)]),
+            "uses": uses,
+            "instances_used": np.array([float(self._instances_used)]),
+        }
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         assert self.target is not None
@@ -303,7 +317,12 @@ class VirtualSourceTransfer(Transfer):
         for row in saved["transitions"]:
             action = int(np.clip(row[-1], 0, self.target.n_actions - 1))
             self._note(row[:d], action, float(row[-2]), row[d : 2 * d])
-        self.renewed()
+        # What has changed is known: all pairs are settled anew with what is restored here.
+        self._renewed = []
+        self._renewal_due = float(saved["renewal_due"][0])
+        used = np.flatnonzero(saved["uses"] >= 1.0)
+        self._uses = Counter(dict(zip(used.tolist(), saved["uses"][used].astype(np.int64).tolist(), strict=True)))
+        self._instances_used = int(saved["instances_used"][0])
 
     def _note(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> None:
         """Take up a saved transition."""

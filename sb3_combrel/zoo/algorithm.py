@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
-from sb3_combrel.transfer.registry import make_transfer
+from sb3_combrel.transfer.registry import make_transfer, restore_transfer
 from sb3_combrel.zoo.sources import with_sources
 
 
@@ -39,7 +39,7 @@ class ZooFittedRMax(FittedRMax):
 
     def _setup_model(self) -> None:
         # Here and not in the constructor: when RL-Zoo resumes, load() brings the arguments in behind its back.
-        self.transfer = with_sources(self.transfer)
+        self.transfer = with_sources(restore_transfer(self.transfer))
         try:
             make_transfer(self.transfer)
         except TypeError as error:

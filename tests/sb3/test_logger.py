@@ -1,0 +1,59 @@
+"""Logs: groups and names as SB3 has them, to files, the screen and TensorBoard."""
+
+import csv
+
+from stable_baselines3.common.logger import configure
+
+
+def test_logs_have_the_groups_that_sb3_has(make, tmp_path):
+    model = make()
+    model.set_logger(configure(str(tmp_path), ["csv", "json"]))
+    model.learn(150, log_interval=2)
+    header = (tmp_path / "progress.csv").read_text().splitlines()
+    assert {"rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps", "time/episodes", "time/total_timesteps"} <= set(
+        header[0].split(",")
+    )
+    assert len(header) - 1 == model._episode_num // 2
+    model.dump_logs()
+    assert len((tmp_path / "progress.csv").read_text().splitlines()) == len(header) + 1
+
+
+def test_what_is_logged_is_what_happened(make, tmp_path):
+    model = make()
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(150, log_interval=1)
+    rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
+    assert [int(float(row["time/episodes"])) for row in rows] == list(range(1, model._episode_num + 1))
+    for row in rows:
+        # Every step costs 1.
+        assert float(row["rollout/ep_rew_mean"]) == -float(row["rollout/ep_len_mean"])
+        assert int(float(row["model/instances"])) == int(float(row["time/total_timesteps"]))
+        shares = [float(row[f"model/{name}"]) for name in ("known", "transferred", "optimistic")]
+        assert abs(sum(shares) - 1.0) < 1e-5
+
+
+def test_only_with_transfer_there_are_figures_of_it(make, method, tmp_path):
+    model = make()
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(60, log_interval=1)
+    header = (tmp_path / "progress.csv").read_text().splitlines()[0]
+    assert ("transfer/instances_used" in header) == (method != "none")
+
+
+def test_without_a_log_interval_nothing_is_logged(make, tmp_path):
+    model = make()
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(100, log_interval=None)
+    assert (tmp_path / "progress.csv").read_text() == ""
+
+
+def test_tensorboard_logs_are_named_after_the_algorithm(make, tmp_path):
+    model = make(tensorboard_log=str(tmp_path)).learn(60, log_interval=1)
+    assert len(list((tmp_path / "FittedRMax_1").glob("events.*"))) == 1
+    model.learn(60, tb_log_name="again")
+    assert (tmp_path / "again_1").is_dir()
+
+
+def test_logging_to_the_screen(make, capsys):
+    make(verbose=1).learn(60, log_interval=1)
+    assert "ep_rew_mean" in capsys.readouterr().out

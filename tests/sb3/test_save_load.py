@@ -1,0 +1,166 @@
+"""Saving and loading, as people who know SB3 type it."""
+
+import io
+import pathlib
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import DummyVecEnv
+from walk import METHODS, OBSERVATIONS, Walk, same_parameters, small, stored
+
+from sb3_combrel import FittedRMax
+from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+
+ARGUMENTS = ("min_fraction", "model_breadth", "resolution", "max_backups", "gamma", "max_value", "num_timesteps", "seed")
+
+
+def test_save_and_load_keep_everything(make, method, tmp_path):
+    model = make(max_backups=3).learn(10**6, callback=StopTrainingOnMaxEpisodes(8))
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert same_parameters(model, loaded)
+    assert type(loaded.policy) is FittedRMaxPolicy
+    assert type(loaded.policy.transfer) is type(model.policy.transfer)
+    for name in ARGUMENTS:
+        assert getattr(loaded, name) == getattr(model, name)
+    np.testing.assert_array_equal(
+        loaded.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0]
+    )
+    for observation in OBSERVATIONS:
+        unit = model.policy.to_unit(observation)
+        np.testing.assert_array_equal(loaded.policy.q_values(unit), model.policy.q_values(unit))
+    for array in ("entry", "total", "known", "settled", "reward", "n_optimistic", "heard"):
+        np.testing.assert_array_equal(
+            getattr(loaded.policy.model.arrays, array), getattr(model.policy.model.arrays, array), err_msg=array
+        )
+    for kind in ("lists", "rows"):
+        ours, theirs = getattr(loaded.policy.model.arrays, kind), getattr(model.policy.model.arrays, kind)
+        for pair in range(len(ours.start)):
+            for mine, other in zip(ours.entries(pair), theirs.entries(pair), strict=True):
+                np.testing.assert_array_equal(mine, other)
+    n = model.num_timesteps
+    loaded.learn(50, reset_num_timesteps=False)
+    assert loaded.num_timesteps == loaded.policy.model.n_instances == n + 50
+
+
+@pytest.mark.parametrize("kind", [str, pathlib.Path])
+@pytest.mark.parametrize("name", ["car", "car.zip", "folder/that/is/new/car", "car.v1"])
+def test_paths(kind, name, tmp_path):
+    model = small().learn(20)
+    model.save(kind(tmp_path / name))
+    written = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert [path.name for path in written] == [{"car": "car.zip"}.get(pathlib.Path(name).name, pathlib.Path(name).name)]
+    assert same_parameters(FittedRMax.load(kind(tmp_path / name)), model)
+    assert same_parameters(FittedRMax.load(written[0]), model)
+
+
+def test_open_files(make, tmp_path):
+    model, memory = make().learn(20), io.BytesIO()
+    model.save(memory)
+    memory.seek(0)
+    assert same_parameters(FittedRMax.load(memory), model)
+    with (tmp_path / "open.zip").open("wb") as file:
+        model.save(file)
+        assert not file.closed
+    with (tmp_path / "open.zip").open("rb") as file:
+        assert same_parameters(FittedRMax.load(file), model)
+        assert not file.closed
+        with pytest.raises(ValueError, match="writable"):
+            model.save(file)
+
+
+def test_the_environment_can_be_named_when_loading(tmp_path):
+    FittedRMax("MlpPolicy", "MountainCar-v0", resolution=3, seed=0).learn(30).save(tmp_path / "car")
+    loaded = FittedRMax.load(tmp_path / "car", env="MountainCar-v0")
+    assert loaded.get_env().get_attr("spec")[0].id == "MountainCar-v0"
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.policy.model.n_instances == 50
+    with pytest.raises(ValueError, match="spaces do not match"):
+        FittedRMax.load(tmp_path / "car", env="CartPole-v1")
+
+
+def test_system_info_is_printed(make, tmp_path, capsys):
+    make().learn(5).save(tmp_path / "model")
+    FittedRMax.load(tmp_path / "model", print_system_info=True)
+    shown = capsys.readouterr().out
+    assert "CURRENT SYSTEM INFO" in shown and "SAVED MODEL SYSTEM INFO" in shown
+    assert shown.count("Stable-Baselines3:") == 2
+
+
+def test_arguments_can_be_changed_when_loading(make, tmp_path):
+    make().learn(30).save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk(), max_backups=7, verbose=1, tensorboard_log=str(tmp_path / "logs"))
+    assert (loaded.max_backups, loaded.policy.max_backups, loaded.verbose) == (7, 7, 1)
+    loaded.learn(10)
+    assert list((tmp_path / "logs").rglob("events.*"))
+    with pytest.raises(ValueError, match="max_backups must be"):
+        FittedRMax.load(tmp_path / "model", max_backups=-7)
+
+
+def test_a_grid_of_another_size_is_refused_in_a_sentence(tmp_path):
+    small().learn(30).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="values must have shape") as error:
+        FittedRMax.load(tmp_path / "model", resolution=4)
+    assert "\n" not in str(error.value)
+
+
+def test_more_can_be_left_out_or_included(tmp_path):
+    model = small(verbose=1).learn(10)
+    model.save(tmp_path / "less", exclude=["verbose"])
+    assert "verbose" not in load_from_zip_file(tmp_path / "less")[0]
+    assert FittedRMax.load(tmp_path / "less").verbose == 0
+    model.save(tmp_path / "more", include=["_episode_tags"])
+    assert "_episode_tags" in load_from_zip_file(tmp_path / "more")[0]
+
+
+def test_saving_changes_nothing(make, tmp_path):
+    model, other = make().learn(60), make().learn(60)
+    before = dict(vars(model))
+    model.save(tmp_path / "model")
+    assert vars(model).keys() == before.keys()
+    assert all(vars(model)[name] is value for name, value in before.items())
+    assert same_parameters(model.learn(60), other.learn(60))
+
+
+def test_chance_goes_on_where_it_was_unless_a_seed_is_given(make, tmp_path):
+    model = make().learn(40)
+    model.save(tmp_path / "model")
+    assert FittedRMax.load(tmp_path / "model")._rng.bit_generator.state == model._rng.bit_generator.state
+    one, other = (FittedRMax.load(tmp_path / "model", seed=9) for _ in range(2))
+    assert one._rng.bit_generator.state == other._rng.bit_generator.state == np.random.default_rng(9).bit_generator.state
+    assert one.policy.rng is one._rng
+
+
+def test_pairs_that_are_known_by_history_alone_are_saved(tmp_path):
+    model = small(min_fraction=0.6, model_breadth=0.5, resolution=1)
+    for state, next_state in [(0.1, 0.2), (0.1, 0.2), (0.45, 0.95)]:
+        model.policy.learn_from(np.array([state, 0.5]), 0, -1.0, np.array([next_state, 0.5]), False)
+    arrays = model.policy.model.arrays
+    assert (arrays.known & (arrays.total < 1.0)).any(), "the case that this test is about"
+    model.save(tmp_path / "model")
+    np.testing.assert_array_equal(FittedRMax.load(tmp_path / "model").policy.model.arrays.known, arrays.known)
+
+
+def test_a_full_model_with_a_cap_on_instances_survives_saving(make, tmp_path):
+    model = make(max_instances=10).learn(100)
+    assert model.policy.model.n_instances <= 20
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    np.testing.assert_array_equal(stored(loaded), stored(model))
+    assert loaded.learn(100).policy.model.n_instances <= 20
+
+
+def test_a_saved_model_can_be_loaded_for_more_environments(make, tmp_path):
+    make().learn(50).save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=DummyVecEnv([Walk, Walk])).learn(20)
+    assert loaded.n_envs == 2
+    assert loaded.policy.model.n_instances == 70
+
+
+def test_a_model_without_transfer_cannot_take_one_up_when_loaded(tmp_path):
+    small().learn(20).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="transfer") as error:
+        FittedRMax.load(tmp_path / "model", transfer=METHODS["COMBREL"]())
+    assert "\n" not in str(error.value)

@@ -1,0 +1,191 @@
+"""A model with transfer, saved and loaded, goes on with the same mappings, compliance, source and chance."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from walk import METHODS, STRIDE, Walk, same_parameters, small, stored, walk_source
+
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
+from sb3_combrel.common.supply import Supply
+from sb3_combrel.transfer.base import Transfer
+
+MAPPING = InterTaskMapping([0, 1], [0, 1])
+VARIANTS = {
+    **METHODS,
+    "one mapping an action": lambda: TIMBREL(walk_source(), [MAPPING, InterTaskMapping([0, None], [1, 0])]),
+    "pool": lambda: TIMBREL(walk_source(), "pool", mappings="all"),
+    "two sources": lambda: COMBREL([walk_source(40), walk_source(60)]),
+    "first episode": lambda: COMBREL(walk_source(), measured="first_episode"),
+    "set": lambda: COMBREL(walk_source(), MappingSet.injective(2, 2, 2, 2), n_neighbors=2),
+    "list": lambda: COMBREL(walk_source(), [MAPPING, {"state": [0, None], "action": [1, 0]}], min_compliance=0.0),
+    "few transitions": lambda: COMBREL(walk_source(), max_transitions=25, bandwidths=(0.1, 0.1, np.float64(1.0))),
+}
+
+
+@pytest.fixture(params=VARIANTS)
+def variant(request):
+    return VARIANTS[request.param]
+
+
+def after_episodes(n, transfer, env=None, **kwargs):
+    return small(env, transfer=transfer, **kwargs).learn(10**6, callback=StopTrainingOnMaxEpisodes(n))
+
+
+def test_learning_goes_on_to_the_last_bit(variant, tmp_path):
+    """Saved at an episode's end, a loaded model learns what the model itself learns when it learns on."""
+    model = after_episodes(3, variant())
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    model.set_env(Walk())
+    # Loading has seeded the environment anew.
+    model.get_env().seed(model.seed)
+    for goes_on in (model, loaded):
+        goes_on.learn(150, reset_num_timesteps=False)
+    assert same_parameters(model, loaded)
+    assert model.policy.model.n_instances > 150
+    if model.policy.transfer is not None:
+        assert model.policy.transfer.mapping_counts() == loaded.policy.transfer.mapping_counts()
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_two_halves_make_the_run_that_was_not_interrupted(name, tmp_path):
+    """But for the planning that a call of ``learn`` begins with, which a small tolerance leaves nothing to do."""
+    exact = dict(planning_tolerance=1e-10, max_backups=100_000)
+    whole = after_episodes(8, METHODS[name](), Walk(start=-0.5), **exact)
+    half = after_episodes(3, METHODS[name](), Walk(start=-0.5), **exact)
+    half.save(tmp_path / "half")
+    halves = FittedRMax.load(tmp_path / "half", env=Walk(start=-0.5))
+    halves.learn(10**6, callback=StopTrainingOnMaxEpisodes(5), reset_num_timesteps=False)
+    assert halves.num_timesteps == whole.num_timesteps
+    np.testing.assert_array_equal(stored(halves), stored(whole))
+    np.testing.assert_allclose(halves.policy.planner.values, whole.policy.planner.values, atol=1e-8)
+    if name != "none":
+        np.testing.assert_array_equal(halves.policy.transfer.choices(), whole.policy.transfer.choices())
+
+
+@pytest.mark.parametrize("name", ["TIMBREL", "COMBREL", "two sources", "first episode"])
+@pytest.mark.parametrize("steps", [0, 13, 47])
+def test_choices_compliance_and_supply_are_the_same_at_once(name, steps, tmp_path):
+    model = small(transfer=VARIANTS[name]())
+    if steps:
+        model.learn(steps)
+    model.save(tmp_path / "model")
+    ours, theirs = model.policy.transfer, FittedRMax.load(tmp_path / "model").policy.transfer
+    pairs = np.arange(2 * model.policy.model.grid.n_points)
+    np.testing.assert_array_equal(ours.choices(), theirs.choices())
+    if isinstance(ours, COMBREL):
+        np.testing.assert_array_equal(ours.chosen_compliance(pairs), theirs.chosen_compliance(pairs))
+        assert (ours.choices() >= 0).any() == (steps == 47 or (steps > 0 and ours.measured == "online"))
+    own = np.zeros(len(pairs))
+    supplies = [method.supply(pairs, own, own > 0) for method in (ours, theirs)]
+    supplies += [method.supply_at(np.array([0.3, 0.5]), np.zeros(2)) for method in (ours, theirs)]
+    for one, other in (supplies[:2], supplies[2:]):
+        np.testing.assert_array_equal(one.count, other.count)
+        for row, n in enumerate(one.count):
+            for name_of in ("weight", "effect", "reward", "terminated"):
+                np.testing.assert_array_equal(getattr(one, name_of)[row, :n], getattr(other, name_of)[row, :n])
+    assert ours.statistics() == theirs.statistics()
+    for one, other in zip(ours._sources, theirs._sources, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.rewards, other.rewards)
+        assert (one.state_names, one.action_names, one.origin) == (other.state_names, other.action_names, other.origin)
+
+
+def test_the_source_travels_in_the_file(tmp_path):
+    path = walk_source().save(tmp_path / "source.npz")
+    model = small(transfer={"sb3_combrel.COMBREL": {"source": str(path), "n_neighbors": 2}}).learn(40)
+    model.save(tmp_path / "model")
+    path.unlink()
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert (type(loaded.policy.transfer), loaded.policy.transfer.n_neighbors) == (COMBREL, 2)
+    assert len(loaded.policy.transfer._sources[0]) == 60
+    loaded.learn(20)
+    loaded.save(tmp_path / "again")
+    assert FittedRMax.load(tmp_path / "again").policy.model.n_instances == 60
+
+
+def test_random_mappings_are_saved_too_and_drawn_anew(tmp_path):
+    """What differs after loading: pairs are settled anew, so TIMBREL("random") draws other mappings for them."""
+    model = small(transfer=TIMBREL(walk_source(), "random")).learn(60)
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert loaded.policy.transfer.mapping == "random"
+    np.testing.assert_array_equal(stored(loaded), stored(model))
+    assert loaded.learn(30).policy.model.n_instances == 90
+
+
+class Pushy(Transfer):
+    """A user's own method: whatever is not known moves to the right."""
+
+    def __init__(self, push, schedule=None):
+        self.push, self.schedule = push, schedule
+
+    def bind(self, target, rng):
+        self.target, self.n_observed = target, 0
+        self.news = np.arange(target.n_actions * len(target.sample_states))
+
+    def observe(self, state, action, reward, next_state, terminated):
+        self.n_observed += 1
+
+    def lowest_reward(self):
+        return -1.0
+
+    def renewed(self):
+        news, self.news = self.news, self.news[:0]
+        return news
+
+    def _push_all(self, needed):
+        n = len(needed)
+        effect = np.zeros((n, 1, self.target.n_variables))
+        effect[:, :, 0] = self.push
+        return Supply(
+            needed.astype(np.int64), np.ones((n, 1)), effect, np.full((n, 1), -1.0), np.zeros((n, 1), dtype=np.bool_)
+        )
+
+    def supply(self, pairs, own_weight, known):
+        return self._push_all(~known)
+
+    def supply_at(self, state, own_weight):
+        return self._push_all(own_weight < 1.0)
+
+    def saved_arrays(self):
+        return {"n_observed": np.array([float(self.n_observed)])}
+
+    def restore(self, saved):
+        self.n_observed = int(saved["n_observed"][0])
+
+
+def test_a_method_of_the_users_own_is_saved_by_its_arguments(tmp_path, recwarn):
+    model = small(transfer=Pushy(np.float64(STRIDE / 2))).learn(30)
+    model.save(tmp_path / "model")
+    assert not [warning for warning in recwarn if "transfer" in str(warning.message)]
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert type(loaded.policy.transfer) is Pushy
+    assert (loaded.policy.transfer.push, loaded.policy.transfer.n_observed) == (STRIDE / 2, 30)
+    loaded.learn(10)
+    assert loaded.policy.transfer.n_observed == 40
+
+
+def test_what_is_not_plain_data_is_not_saved_but_asked_for(tmp_path):
+    own = Pushy(STRIDE / 2, schedule=lambda n: n)
+    model = small(transfer=own).learn(30)
+    with pytest.warns(UserWarning, match=r"Pushy is not saved .*load\(\.\.\., transfer=Pushy\(\.\.\.\)\)"):
+        model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"Pushy, which could not be saved with it: .*load\(\.\.\., transfer=\.\.\.\)"):
+        FittedRMax.load(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk(), transfer=own)
+    assert loaded.policy.transfer.n_observed == 30
+    assert same_parameters(loaded, model)
+
+
+def test_a_subclass_that_says_too_little_is_not_taken_for_its_parent(tmp_path):
+    class Mine(COMBREL):
+        def __init__(self, source, secret):
+            super().__init__(source)
+
+    with pytest.warns(UserWarning, match=r"Mine is not saved .*secret"):
+        small(transfer=Mine(walk_source(), 3)).learn(10).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="Mine"):
+        FittedRMax.load(tmp_path / "model")
+    with pytest.raises(ValueError, match="transfer"):
+        FittedRMax.load(tmp_path / "model", transfer=None)

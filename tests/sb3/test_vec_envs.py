@@ -1,0 +1,114 @@
+"""Vectorised environments, VecNormalize, Monitor, set_env."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
+from walk import Recorder, Walk, stored
+
+from sb3_combrel import FittedRMax
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+def test_several_environments_feed_one_model(make, vec_env):
+    env = make_vec_env(Walk, n_envs=3, seed=0, vec_env_cls=vec_env)
+    recorder = Recorder()
+    try:
+        model = make(env).learn(61, callback=recorder)
+    finally:
+        env.close()
+    assert model.num_timesteps == 63
+    assert model.policy.model.n_instances == 63
+    assert recorder.shown[0]["new_obs"].shape == (3, 2)
+
+
+def test_environments_in_other_processes_make_the_same_run():
+    runs = []
+    for vec_env in (DummyVecEnv, SubprocVecEnv):
+        env = make_vec_env(Walk, n_envs=2, vec_env_cls=vec_env)
+        model = FittedRMax(env, model_breadth=0.15, resolution=3, seed=5).learn(60)
+        env.close()
+        runs.append(stored(model))
+    np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_the_true_last_observation_is_stored_and_a_time_limit_is_not_terminal(make, n_envs):
+    model = make(DummyVecEnv([lambda: Walk(limit=7)] * n_envs)).learn(300)
+    rows = stored(model)
+    # Every step moves by 0.15 or stays at the left end; the reset states that follow an episode are farther away.
+    moved = np.abs(rows[:, 2] - rows[:, 0])
+    assert ((np.abs(moved - 0.15) < 1e-6) | (np.abs(np.abs(rows[:, 2]) - 1.0) < 1e-6)).all()
+    np.testing.assert_array_equal(rows[:, 5] > 0, rows[:, 2] > 0.9 - 1e-6)
+    assert rows[:, 5].any(), "some episodes reached the goal"
+    assert model._episode_num > rows[:, 5].sum(), "and some ran into the limit"
+
+
+def test_monitor_files_see_every_episode(make, tmp_path):
+    model = make(Monitor(Walk(), str(tmp_path / "monitor"))).learn(100)
+    lines = (tmp_path / "monitor.monitor.csv").read_text().splitlines()
+    assert len(lines) - 2 == model._episode_num > 0
+    assert len(model.ep_info_buffer) == model._episode_num
+
+
+def test_what_monitor_says_is_what_the_model_stored(make, tmp_path):
+    model = make(Monitor(Walk(), str(tmp_path / "monitor"))).learn(100)
+    lengths = [int(line.split(",")[1]) for line in (tmp_path / "monitor.monitor.csv").read_text().splitlines()[2:]]
+    assert sum(lengths) <= 100 < sum(lengths) + 30
+    assert [info["l"] for info in model.ep_info_buffer] == lengths
+
+
+def test_normalized_observations_are_refused_by_constructor_set_env_and_load(make, tmp_path):
+    normalized = VecNormalize(DummyVecEnv([Walk]))
+    with pytest.raises(ValueError, match="norm_obs") as error:
+        make(normalized)
+    assert "VecNormalize(norm_obs=False)" in str(error.value)
+    model = make()
+    with pytest.raises(ValueError, match="norm_obs"):
+        model.set_env(normalized)
+    assert model.get_env() is not normalized, "refused before anything was changed"
+    model.learn(5)
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="norm_obs"):
+        FittedRMax.load(tmp_path / "model", env=normalized)
+
+
+def test_of_normalized_rewards_the_original_ones_are_stored(make, tmp_path):
+    env = VecNormalize(VecMonitor(DummyVecEnv([Walk])), norm_obs=False, norm_reward=True)
+    recorder = Recorder()
+    model = make(env).learn(50, callback=recorder)
+    assert (stored(model)[:, 4] == -1.0).all()
+    assert any(shown["rewards"][0] != -1.0 for shown in recorder.shown), "the environment did normalize"
+    model.save(tmp_path / "model")
+    goes_on = FittedRMax.load(tmp_path / "model", env=VecNormalize(DummyVecEnv([Walk]), norm_obs=False)).learn(20)
+    assert (stored(goes_on)[:, 4] == -1.0).all()
+    model = make()
+    model.set_env(VecNormalize(DummyVecEnv([Walk]), norm_obs=False))
+    assert (stored(model.learn(50))[:, 4] == -1.0).all()
+
+
+def test_the_normalizing_environment_can_be_asked_for(make, tmp_path):
+    env = VecNormalize(DummyVecEnv([Walk]), norm_obs=False)
+    model = make(env).learn(10)
+    assert model.get_vec_normalize_env() is env
+    model.save(tmp_path / "model")
+    env.save(str(tmp_path / "statistics.pkl"))
+    assert FittedRMax.load(tmp_path / "model").get_vec_normalize_env() is None
+    again = VecNormalize.load(str(tmp_path / "statistics.pkl"), DummyVecEnv([Walk]))
+    loaded = FittedRMax.load(tmp_path / "model", env=again)
+    assert loaded.get_vec_normalize_env() is again
+    assert again.ret_rms.count == env.ret_rms.count
+    model.set_env(DummyVecEnv([Walk]))
+    assert model.get_vec_normalize_env() is None
+
+
+def test_set_env_goes_on_with_what_was_learned(make):
+    model = make().learn(20)
+    other = DummyVecEnv([Walk])
+    model.set_env(other)
+    assert model.get_env() is other
+    model.learn(10)
+    assert model.policy.model.n_instances == 30
+    with pytest.raises(AssertionError):
+        model.set_env(DummyVecEnv([Walk, Walk]))
