@@ -20,7 +20,7 @@ from sb3_combrel.common.supply import Supply
 from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
-from sb3_combrel.fitted_rmax.planner import Planner
+from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around
 from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.transfer.base import TargetTask, Transfer
@@ -256,7 +256,7 @@ class FittedRMaxPolicy(BasePolicy):
         else:
             self._unsettled.append(self.model.worth_settling(changed))
             self.transfer.observe(state, action, reward, next_state, terminated)
-        return self._plan(self.max_backups)
+        return self._plan(self.max_backups, NOWHERE if terminated else next_state)
 
     def end_episode(self, truncated: bool) -> int:
         """Time to think: plan on while no action is due; backups done."""
@@ -275,16 +275,16 @@ class FittedRMaxPolicy(BasePolicy):
         self.planner.start_anew()
         return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
 
-    def _plan(self, max_backups: int) -> int:
+    def _plan(self, max_backups: int, around: np.ndarray = NOWHERE) -> int:
         """Plan, and note how long it took if that is wanted (``timed``); backups done."""
         if not self.timed:
-            return self._settle_and_plan(max_backups)
+            return self._settle_and_plan(max_backups, around)
         began = perf_counter()
-        backups = self._settle_and_plan(max_backups)
+        backups = self._settle_and_plan(max_backups, around)
         self.planning_seconds += perf_counter() - began
         return backups
 
-    def _settle_and_plan(self, max_backups: int) -> int:
+    def _settle_and_plan(self, max_backups: int, around: np.ndarray) -> int:
         """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
         passes = 0
         if self.transfer is not None:
@@ -296,10 +296,10 @@ class FittedRMaxPolicy(BasePolicy):
                 passes = backups // self.model.grid.n_points
                 max_backups += backups if passes == 0 else 0
         if not self._unsettled:
-            return self.planner.update(NO_PAIRS, max_backups)
+            return self.planner.update(NO_PAIRS, max_backups, around)
         # Left on the list until all is done: an interrupt in between loses no change.
         pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
-        backups = self.planner.update(pairs, max_backups)
+        backups = self.planner.update(pairs, max_backups, around)
         self._unsettled.clear()
         return backups + (self.planner.sweep_all(passes) if passes else 0)
 

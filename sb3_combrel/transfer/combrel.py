@@ -44,8 +44,8 @@ class COMBREL(VirtualSourceTransfer):
     :param breadth: kernel breadth of transferred instances, in unit coordinates; the paper names none
     :param fading: factor on ``breadth`` for each episode that runs into its time limit (the paper: none, 1). Whatever
         the source, pairs that it settled wrongly are explored in the end.
-    :param believe_terminal: whether a source instance that ended its episode ends the target's too; the paper does not
-        say
+    :param believe_terminal: whether a source instance that ended its episode ends the target's too. The paper does not
+        say. What is wrong with it the target's own transitions soon tell; without it nothing leads to an end at first.
     :param relevance: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful.
     :param relevance_fraction: mu of Eq. 4: the part of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
@@ -64,7 +64,7 @@ class COMBREL(VirtualSourceTransfer):
         min_compliance: float = 0.8,
         breadth: float = DEFAULT_BREADTH,
         fading: float = DEFAULT_FADING,
-        believe_terminal: bool = False,
+        believe_terminal: bool = True,
         relevance: bool = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
