@@ -66,8 +66,8 @@ class FittedRMax(BaseAlgorithm):
     - Successors are cut at the edge of the grid, one cell beyond the box for up to two state variables and the box
       itself for more: far fewer states, and no worse learning.
     - A pair that was known once stays known (the original falls back when a nearer instance shortens its list).
-    - Planning is bounded by ``max_backups`` a step, first come, first served; the rest is done as time comes, at an
-      episode's end at the latest. Staying in a grid point is summed in closed form.
+    - Planning is bounded by ``max_backups`` a step, what is around the agent first; the rest is done as time comes, most
+      of it at an episode's end. Staying in a grid point is summed in closed form.
     - Where the agent comes back to the same place again and again, a wrong promise of the interpolated value is
       corrected (see ``sb3_combrel.fitted_rmax.corrections``): a plain implementation can stick there for ever.
     - A time limit is not a terminal state.
@@ -77,7 +77,7 @@ class FittedRMax(BaseAlgorithm):
 
     Cost: a step's time grows with the instances near it and in a slow line with all instances (a look at one box for
     every 8 of them); memory is about 400 bytes an instance, and per state-action pair of the grid, once known, some
-    500 bytes. Both are bounded, by ``max_instances`` and by the grid.
+    800 bytes. Both are bounded, by ``max_instances`` and by the grid.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", for habit's sake); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
@@ -127,7 +127,7 @@ class FittedRMax(BaseAlgorithm):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 30,
+        max_backups: int = 25,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,

@@ -31,9 +31,9 @@ from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 LONGEST_PLAN = 10_000
 
 # Backups in multiples of max_backups, passes over the grid, and backups for each pair that transfer has changed.
-AT_EPISODE_END = 150
+AT_EPISODE_END = 100
 BEFORE_THE_FIRST_STEP = 300
-BACKUPS_PER_RENEWED_PAIR = 10
+BACKUPS_PER_RENEWED_PAIR = 2
 NO_PAIRS = np.empty(0, dtype=np.int64)
 NOBODY = (-1, 0.0, 0)
 
@@ -66,7 +66,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 30,
+        max_backups: int = 25,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | dict[str, Any] | None = None,
