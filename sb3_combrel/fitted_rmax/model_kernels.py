@@ -311,6 +311,38 @@ def note_predecessor(predecessors, to, point, weight):
 
 
 @inlined
+def store_row(arrays, pair, point, n_touched, discount, scratch):
+    """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and have predecessors noted.
+
+    :param discount: 0: the row is left empty
+    :return: False if the predecessors' pool must grow; the row is empty then
+    """
+    slot = arrays.rows.start[pair]
+    n_old = arrays.rows.length[pair]
+    for k in range(n_old):
+        to = arrays.rows.index[slot + k]
+        scratch.told[to] = arrays.rows.weight[slot + k]
+        scratch.touched[n_touched + k] = to
+    length = 0
+    room = True
+    for t in range(n_touched):
+        to = scratch.touched[t]
+        if to != point and discount > 0.0:
+            weight = scratch.dense[to] * discount
+            told = scratch.told[to]
+            if weight > told and (told == 0.0 or weight > next_power(told)):
+                room = room and note_predecessor(arrays.predecessors, to, point, weight)
+            arrays.rows.index[slot + length] = to
+            arrays.rows.weight[slot + length] = weight
+            length += 1
+        scratch.dense[to] = 0.0
+    for t in range(n_touched, n_touched + n_old):
+        scratch.told[scratch.touched[t]] = 0.0
+    arrays.rows.length[pair] = length if room else 0
+    return room
+
+
+@inlined
 def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
 
@@ -355,31 +387,8 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     leave = 1.0 - gamma * scratch.dense[point]
     stays_for_ever = leave < 1e-9
     discount = 0.0 if stays_for_ever else gamma / leave
-    slot = arrays.rows.start[pair]
-    n_old = arrays.rows.length[pair]
-    for k in range(n_old):
-        to = arrays.rows.index[slot + k]
-        scratch.told[to] = arrays.rows.weight[slot + k]
-        scratch.touched[n_touched + k] = to
-    length = 0
-    room = True
-    for t in range(n_touched):
-        to = scratch.touched[t]
-        if to != point and not stays_for_ever:
-            weight = scratch.dense[to] * discount
-            told = scratch.told[to]
-            if weight > told and (told == 0.0 or weight > next_power(told)):
-                room = room and note_predecessor(arrays.predecessors, to, point, weight)
-            arrays.rows.index[slot + length] = to
-            arrays.rows.weight[slot + length] = weight
-            length += 1
-        scratch.dense[to] = 0.0
-    for t in range(n_touched, n_touched + n_old):
-        scratch.told[scratch.touched[t]] = 0.0
-    if not room:
-        arrays.rows.length[pair] = 0
+    if not store_row(arrays, pair, point, n_touched, discount, scratch):
         return False
-    arrays.rows.length[pair] = length
     if stays_for_ever:
         arrays.reward[pair] = 0.0 if reward == 0.0 else np.inf * reward
     else:
