@@ -169,6 +169,13 @@ class KernelModel:
         changed = leave_lists(self.instances, self.arrays, self.grid.arrays, *rest)
         return self.scratch.point[:changed] + action * self.grid.n_points
 
+    def lower_threshold(self, threshold: float) -> np.ndarray:
+        """Be content with less weight from now on; the pairs that become known by that, to be settled anew."""
+        self.exploration_threshold = float(threshold)
+        newly_known = np.flatnonzero(~self.arrays.known & (self.arrays.total >= threshold))
+        self.arrays.known[newly_known] = True
+        return newly_known
+
     def worth_settling(self, pairs: np.ndarray) -> np.ndarray:
         """Those of ``pairs`` (which is overwritten) that have news; the others wait for :meth:`waiting`."""
         return pairs[: self._worth_settling(self.arrays, pairs, NEWS * self.exploration_threshold)]

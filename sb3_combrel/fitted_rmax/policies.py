@@ -34,6 +34,11 @@ LONGEST_PLAN = 10_000
 AT_EPISODE_END = 150
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 10
+
+# A time limit reached this often is taken as it comes; each further time the threshold shrinks by the factor.
+EPISODES_OF_PATIENCE = 10
+IMPATIENCE = 0.98
+
 NO_PAIRS = np.empty(0, dtype=np.int64)
 NOBODY = (-1, 0.0, 0)
 
@@ -76,8 +81,8 @@ class FittedRMaxPolicy(BasePolicy):
     ):
         super().__init__(observation_space, action_space, normalize_images=False)
         self.kernel = (float(model_breadth), float(min_weight), float(min_fraction))
-        self.exploration_threshold = float(exploration_threshold)
         self.gamma = float(gamma)
+        self.n_truncated = 0
         self.max_backups = max_backups
         self.transfer: Transfer | None = restore_transfer(transfer)
         self.rng = np.random.default_rng() if rng is None else rng
@@ -137,7 +142,7 @@ class FittedRMaxPolicy(BasePolicy):
             scaling=self.scaling,
             n_actions=self.n_actions,
             sample_states=grid.points(),
-            exploration_threshold=self.exploration_threshold,
+            exploration_threshold=float(self._constructor_parameters["exploration_threshold"]),
             min_weight=self.kernel[1],
             min_fraction=self.kernel[2],
             state_names=self.state_names,
@@ -190,7 +195,8 @@ class FittedRMaxPolicy(BasePolicy):
     def _choose_at(self, state: np.ndarray, values: np.ndarray, visitor: tuple[int, float, int]) -> int:
         """Work out ``_q`` at a state, and note a visit there (see ``choose``); the best action, -1 if several are."""
         instances = self.model.instances
-        rest = (self.exploration_threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
+        threshold = self.model.exploration_threshold
+        rest = (threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
         if self.transfer is None:
             return int(
                 self._look_and_choose(instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor)
@@ -259,11 +265,24 @@ class FittedRMaxPolicy(BasePolicy):
         return self._plan(self.max_backups)
 
     def end_episode(self, truncated: bool) -> int:
-        """Time to think: plan on while no action is due; backups done."""
+        """Time to think: plan on while no action is due; backups done.
+
+        An episode that ran into its time limit makes the agent content with less: where the kernel is so narrow that the
+        states within reach of the start cannot all be known, exploration would otherwise go on for ever.
+        """
+        if truncated:
+            self.n_truncated += 1
+            self._unsettled.append(self.model.lower_threshold(self._threshold()))
         if self.transfer is not None:
             self.transfer.end_episode(truncated)
             self._unsettled.append(self.model.waiting())
         return self._plan(AT_EPISODE_END * self.max_backups)
+
+    def _threshold(self) -> float:
+        """Weight that makes a pair known by now; never less than what an instance must weigh to count at all."""
+        full: float = self._constructor_parameters["exploration_threshold"]
+        lowered = full * IMPATIENCE ** max(0, self.n_truncated - EPISODES_OF_PATIENCE)
+        return max(lowered, min(full, self.kernel[1]))
 
     def prepare(self) -> int:
         """Take up what transfer has to say before the first step, and plan until that is thought through."""
@@ -320,6 +339,7 @@ class FittedRMaxPolicy(BasePolicy):
             "model/known": known,
             "model/transferred": settled - known,
             "model/optimistic": 1.0 - settled,
+            "model/threshold": self.model.exploration_threshold,
             "planner/waiting": self.planner.n_waiting,
             "planner/corrections": int(self.corrections.count[0]),
         }
@@ -355,6 +375,7 @@ class FittedRMaxPolicy(BasePolicy):
             "known": self.model.arrays.known,
             "total": self.model.arrays.total,
             "lowest_value": np.array([self.planner.bounds[0]]),
+            "n_truncated": np.array([float(self.n_truncated)]),
             "corrections": np.column_stack([self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]),
         }
 
@@ -398,10 +419,12 @@ class FittedRMaxPolicy(BasePolicy):
             "known": (n_pairs,),
             "total": (n_pairs,),
             "lowest_value": (1,),
+            "n_truncated": (1,),
         }
 
     def _restore(self, saved: dict[str, np.ndarray]) -> None:
         model, d = self.model, self.scaling.n_variables
+        self.n_truncated = int(saved["n_truncated"][0])
         rows = saved["instances"]
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
         order = np.argsort(actions, kind="stable")
@@ -412,7 +435,7 @@ class FittedRMaxPolicy(BasePolicy):
             model_breadth=model.model_breadth,
             min_weight=model.min_weight,
             min_fraction=model.min_fraction,
-            exploration_threshold=model.exploration_threshold,
+            exploration_threshold=self._threshold(),
             gamma=model.gamma,
             transfer=model.transfer,
             max_instances=model.max_instances,
