@@ -105,7 +105,7 @@ def most_frequent_of(runs: Sequence[Run], source: SourceInstances) -> InterTaskM
 
 
 def run_experiment(
-    output: Path, n_seeds: int, n_episodes: int, methods: Sequence[str], workers: int, console: Console
+    output: Path, n_seeds: int, n_episodes: int, methods: Sequence[str], workers: int, console: Console | None = None
 ) -> None:
     """
     Learn the arm's task with each method, and write table and figure; what is complete is not done again.
@@ -115,8 +115,9 @@ def run_experiment(
     :param n_episodes: episodes of each run
     :param methods: some of :data:`METHODS`
     :param workers: processes at a time
-    :param console: where to write
+    :param console: where to write; None for the standard output
     """
+    console = console or Console()
     prepare_folder(output, settings())
     source = _source(output / "source.npz", console)
     console.print(source, markup=False)
@@ -236,7 +237,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=None, help="processes at a time; one a core by default")
     arguments = parser.parse_args()
     workers = arguments.workers or cpu_count()
-    run_experiment(arguments.output, arguments.seeds, arguments.episodes, arguments.methods, workers, Console())
+    run_experiment(arguments.output, arguments.seeds, arguments.episodes, arguments.methods, workers)
 
 
 if __name__ == "__main__":

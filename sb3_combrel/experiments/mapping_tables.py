@@ -33,7 +33,8 @@ def uses_of(runs: Iterable[Run], method: str) -> Counter[Use]:
         if run.method == method:
             for words, count in run.mapping_counts().items():
                 actions, state_mapping = words.split(" with ")
-                uses[Use(*actions.split("<-", 1), state_mapping)] += count
+                target, source = actions.split("<-", 1)
+                uses[Use(target, source, state_mapping)] += count
     return uses
 
 

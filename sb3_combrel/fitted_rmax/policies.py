@@ -35,10 +35,6 @@ AT_EPISODE_END = 150
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 10
 
-# A time limit reached this often is taken as it comes; each further time the threshold shrinks by the factor.
-EPISODES_OF_PATIENCE = 10
-IMPATIENCE = 0.98
-
 NO_PAIRS = np.empty(0, dtype=np.int64)
 NOBODY = (-1, 0.0, 0)
 
@@ -110,7 +106,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.state_names = tuple(state_names or (f"s{k}" for k in range(grid.n_variables)))
         self.action_names = tuple(action_names or (f"a{k}" for k in range(self.n_actions)))
         if self.transfer is not None:
-            self._task = self._target_task(grid)
+            self._task = self._target_task(grid, exploration_threshold)
             self.transfer.bind(self._task, self.rng)
         self.model = KernelModel(
             grid,
@@ -137,12 +133,12 @@ class FittedRMaxPolicy(BasePolicy):
         self.timed, self.reporting = False, True
         self.planning_seconds = 0.0
 
-    def _target_task(self, grid: StateGrid) -> TargetTask:
+    def _target_task(self, grid: StateGrid, exploration_threshold: float) -> TargetTask:
         return TargetTask(
             scaling=self.scaling,
             n_actions=self.n_actions,
             sample_states=grid.points(),
-            exploration_threshold=float(self._constructor_parameters["exploration_threshold"]),
+            exploration_threshold=float(exploration_threshold),
             min_weight=self.kernel[1],
             min_fraction=self.kernel[2],
             state_names=self.state_names,
@@ -265,24 +261,14 @@ class FittedRMaxPolicy(BasePolicy):
         return self._plan(self.max_backups)
 
     def end_episode(self, truncated: bool) -> int:
-        """Time to think: plan on while no action is due; backups done.
-
-        An episode that ran into its time limit makes the agent content with less: where the kernel is so narrow that the
-        states within reach of the start cannot all be known, exploration would otherwise go on for ever.
-        """
+        """Time to think: plan on while no action is due; backups done."""
         if truncated:
             self.n_truncated += 1
-            self._unsettled.append(self.model.lower_threshold(self._threshold()))
+            self._unsettled.append(self.model.lower_threshold(self.n_truncated))
         if self.transfer is not None:
             self.transfer.end_episode(truncated)
             self._unsettled.append(self.model.waiting())
         return self._plan(AT_EPISODE_END * self.max_backups)
-
-    def _threshold(self) -> float:
-        """Weight that makes a pair known by now; never less than what an instance must weigh to count at all."""
-        full: float = self._constructor_parameters["exploration_threshold"]
-        lowered = full * IMPATIENCE ** max(0, self.n_truncated - EPISODES_OF_PATIENCE)
-        return max(lowered, min(full, self.kernel[1]))
 
     def prepare(self) -> int:
         """Take up what transfer has to say before the first step, and plan until that is thought through."""
@@ -435,7 +421,7 @@ class FittedRMaxPolicy(BasePolicy):
             model_breadth=model.model_breadth,
             min_weight=model.min_weight,
             min_fraction=model.min_fraction,
-            exploration_threshold=self._threshold(),
+            exploration_threshold=model.full_threshold,
             gamma=model.gamma,
             transfer=model.transfer,
             max_instances=model.max_instances,
@@ -447,6 +433,7 @@ class FittedRMaxPolicy(BasePolicy):
         fresh.instances = InstanceArrays.of_rows(
             self.n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5
         )
+        fresh.lower_threshold(self.n_truncated)
         fresh.restore(rows[:, -1] > 0.5, saved["known"] > 0.5, saved["total"])
         self.model = self.planner.model = fresh
         self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])
