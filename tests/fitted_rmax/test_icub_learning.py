@@ -7,6 +7,7 @@ from test_learning import SEEDS, lengths_of_episodes
 
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+from sb3_combrel.fitted_rmax.model import EPISODES_OF_PATIENCE
 
 TORSO, ARM = "combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0"
 
@@ -35,6 +36,29 @@ def test_exploration_ends_though_the_kernel_is_narrow():
     with pytest.warns(UserWarning, match="coarse"):
         steps = lengths(ARM, 150, 1, model_breadth=0.05)
     assert np.median(steps[-10:]) <= 45
+
+
+def test_time_limits_make_the_model_content_with_less():
+    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(400).policy.model
+    known = model.arrays.known.copy()
+    assert len(model.lower_threshold(EPISODES_OF_PATIENCE)) == 0, "patience must be at an end first"
+    weights = model.arrays.total[~known]
+    newly_known = model.lower_threshold(EPISODES_OF_PATIENCE + 40)
+    assert 0.0 < model.exploration_threshold < 0.5
+    assert len(newly_known) == (weights >= model.exploration_threshold).sum() > 0
+    assert not known[newly_known].any()
+    model.lower_threshold(10**6)
+    assert (model.arrays.known == (model.arrays.total >= model.min_weight)).all(), "any instance that counts will do"
+
+
+def test_the_lowered_threshold_is_saved(tmp_path):
+    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(50)
+    for _ in range(EPISODES_OF_PATIENCE + 3):
+        model.policy.end_episode(truncated=True)
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model")
+    assert loaded.policy.model.exploration_threshold == model.policy.model.exploration_threshold < 1.0
+    np.testing.assert_array_equal(loaded.policy.model.arrays.known, model.policy.model.arrays.known)
 
 
 def test_combrel_on_the_arm_runs():
