@@ -70,7 +70,8 @@ class FittedRMax(BaseAlgorithm):
       of it at an episode's end. Staying in a grid point is summed in closed form.
     - Where the agent comes back to the same place again and again, a wrong promise of the interpolated value is
       corrected (see ``sb3_combrel.fitted_rmax.corrections``): a plain implementation can stick there for ever.
-    - A time limit is not a terminal state.
+    - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%: with a narrow
+      kernel all that is within reach cannot become known, and exploration would not end.
 
     ``predict(obs, deterministic=True)`` takes the best action that has a model, ``deterministic=False`` the optimistic
     ones first, as in learning.
@@ -88,7 +89,7 @@ class FittedRMax(BaseAlgorithm):
     :param min_fraction: an instance counts while it has this part of the weight of the nearer ones; 0.1 keeps at most
         11 instances a pair, 0.01 (the original's) 101
     :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach
-    :param exploration_threshold: weight of instances that makes a state-action pair known
+    :param exploration_threshold: weight of instances that makes a state-action pair known, before it is lowered
     :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: at
         least 6 for one or two variables, 4 for three, 3 for more, and finer if the breadth needs it and memory allows.
     :param max_value: an upper bound on the return from any state, the value of what is unknown
