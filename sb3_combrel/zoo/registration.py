@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from sb3_combrel.zoo.algorithm import ZooFittedRMax
-from sb3_combrel.zoo.sampling import convert_fitted_rmax_params, sample_fitted_rmax_params
+from sb3_combrel.zoo.sampling import (
+    convert_fitted_rmax_params,
+    sample_combrel_params,
+    sample_fitted_rmax_params,
+    sample_timbrel_params,
+)
 
-ALGORITHMS = ("fitted_rmax", "timbrel", "combrel")
-"""Names for ``--algo``. All are Fitted R-Max; each has its own configuration file, log folder and column in tables."""
+ALGORITHMS = {
+    "fitted_rmax": sample_fitted_rmax_params,
+    "timbrel": sample_timbrel_params,
+    "combrel": sample_combrel_params,
+}
+"""What draws hyperparameters for each algorithm, by its name for ``--algo``. All are Fitted R-Max; each has its own configuration file, log folder and column in tables."""
 
 
 def register() -> None:
@@ -20,7 +29,7 @@ def register() -> None:
 
     import combrel_envs  # noqa: F401 - registers the environments: benchmark and record_video know no --gym-packages
 
-    for name in ALGORITHMS:
+    for name, sampler in ALGORITHMS.items():
         ALGOS[name] = ZooFittedRMax
-        HYPERPARAMS_SAMPLER[name] = sample_fitted_rmax_params
+        HYPERPARAMS_SAMPLER[name] = sampler
         HYPERPARAMS_CONVERTER[name] = convert_fitted_rmax_params

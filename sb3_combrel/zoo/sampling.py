@@ -7,19 +7,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from optuna import Trial
 
+OF_TRANSFER = "transfer_"
+"""What the names of a transfer method's arguments begin with in a study."""
+
 
 def sample_fitted_rmax_params(trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
     Draw hyperparameters; what is not drawn stays as the configuration file has it.
 
-    ``resolution``, ``max_value``, ``gamma`` and ``bounds`` belong to the task and are not drawn: a fine grid of many state
-    variables would not fit into memory, and an error in the constructor ends the whole study.
+    ``max_value``, ``gamma`` and ``bounds`` belong to the task and are not drawn. The grid is drawn relative to the one
+    that suits task and breadth: a number that is right for two variables would not fit into memory for six, and an
+    error in the constructor ends the whole study.
 
     :param trial: Optuna's trial
     :param n_actions: no use, actions are discrete
     :param n_envs: no use
     :param additional_args: no use
-    :return: arguments of :class:`~sb3_combrel.FittedRMax`
+    :return: arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`
     """
     return convert_fitted_rmax_params(
         {
@@ -28,8 +32,31 @@ def sample_fitted_rmax_params(trial: Trial, n_actions: int, n_envs: int, additio
             "exploration_threshold": trial.suggest_float("exploration_threshold", 0.3, 3.0, log=True),
             "planning_tolerance": trial.suggest_float("planning_tolerance", 1e-3, 0.1, log=True),
             "max_backups_power": trial.suggest_int("max_backups_power", 3, 10),
+            "resolution": trial.suggest_categorical("resolution", [None, "coarser", "finer"]),
         }
     )
+
+
+def sample_timbrel_params(trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """The same, and the breadth of transferred instances; see :func:`sample_fitted_rmax_params`."""
+    sampled = sample_fitted_rmax_params(trial, n_actions, n_envs, additional_args)
+    return {**sampled, "transfer_kwargs": {"breadth": _transfer_breadth(trial)}}
+
+
+def sample_combrel_params(trial: Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """The same, and how COMBREL chooses and transfers; see :func:`sample_fitted_rmax_params`."""
+    sampled = sample_fitted_rmax_params(trial, n_actions, n_envs, additional_args)
+    of_transfer = {
+        "breadth": _transfer_breadth(trial),
+        "n_neighbors": trial.suggest_int(f"{OF_TRANSFER}n_neighbors", 1, 10, log=True),
+        "min_compliance": trial.suggest_float(f"{OF_TRANSFER}min_compliance", 0.0, 1.5),
+        "relevance": trial.suggest_categorical(f"{OF_TRANSFER}relevance", [False, True]),
+    }
+    return {**sampled, "transfer_kwargs": of_transfer}
+
+
+def _transfer_breadth(trial: Trial) -> float:
+    return trial.suggest_float(f"{OF_TRANSFER}breadth", 0.05, 0.8, log=True)
 
 
 def convert_fitted_rmax_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -38,6 +65,9 @@ def convert_fitted_rmax_params(sampled_params: dict[str, Any]) -> dict[str, Any]
 
     :param sampled_params: the trial's parameters, by name
     """
-    converted = dict(sampled_params)
+    of_transfer = {name: value for name, value in sampled_params.items() if name.startswith(OF_TRANSFER)}
+    converted = {name: value for name, value in sampled_params.items() if name not in of_transfer}
     converted["max_backups"] = 2 ** converted.pop("max_backups_power")
+    if of_transfer:
+        converted["transfer_kwargs"] = {name.removeprefix(OF_TRANSFER): value for name, value in of_transfer.items()}
     return converted

@@ -40,6 +40,25 @@ def with_sources(transfer: Transfer | type[Transfer] | dict[str, Any] | str | No
     return {method: {**arguments, "source": found}}
 
 
+def with_arguments(transfer: Any, arguments: Mapping[str, Any] | None) -> Any:
+    """
+    The same transfer with other arguments.
+
+    :param transfer: as a configuration file gives it
+    :param arguments: take the place of those of the same names; None for none
+    :raises ValueError: if there are arguments, and no transfer method with a name that they could go to
+    """
+    if not arguments:
+        return transfer
+    if not isinstance(transfer, dict) or len(transfer) != 1:
+        raise ValueError(
+            f"transfer_kwargs={dict(arguments)!r} needs a transfer method in the configuration file, such as "
+            f"'transfer: {{sb3_combrel.COMBREL: {{source: file.npz}}}}'; transfer is {transfer!r}"
+        )
+    ((method, given),) = transfer.items()
+    return {method: {**(given or {}), **arguments}}
+
+
 def find_source(source: Any) -> SourceInstances:
     """
     Source instances, from a file or from a task.

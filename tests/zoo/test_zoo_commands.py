@@ -5,9 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from gymnasium import spaces
 
 pytest.importorskip("rl_zoo3")
 
@@ -18,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "zoo_configs"
 CAR = "combrel/MountainCar2D-v0"
 BIG_CAR = "combrel/MountainCar4D-v0"
+SHORT_CAR = "MountainCar-v0"
 RECIPE = {"env": CAR, "n_instances": 50, "total_timesteps": 200}
 
 
@@ -50,6 +53,17 @@ def run(module, *args, **variables):
 def write_config(path, **entry):
     path.write_text(yaml.dump({"default": {"n_timesteps": 300, **entry}}))
     return path
+
+
+class Box(gym.Env):
+    """Variables and nothing else."""
+
+    def __init__(self, n_variables):
+        self.observation_space = spaces.Box(0.0, 1.0, (n_variables,))
+        self.action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(self.observation_space.shape, dtype=np.float32), {}
 
 
 @pytest.fixture(scope="module")
@@ -130,9 +144,9 @@ class TestTransfer:
 
 
 class TestTuning:
-    def tune(self, folder, storage, *more):
-        tuning = ("-optimize", "--n-trials", 2, "--n-evaluations", 2, "--n-startup-trials", 1, "--no-optim-plots")
-        return train_args(folder, *tuning, "--storage", storage, "--study-name", "car", *more, n=300)
+    def tune(self, folder, storage, *more, n_trials=2, **changes):
+        tuning = ("-optimize", "--n-trials", n_trials, "--n-evaluations", 2, "--n-startup-trials", 1, "--no-optim-plots")
+        return train_args(folder, *tuning, "--storage", storage, "--study-name", "car", *more, n=300, env=SHORT_CAR, **changes)
 
     def test_it_runs_with_pruning_and_journal_storage(self, tmp_path):
         pytest.importorskip("pandas")
@@ -145,7 +159,45 @@ class TestTuning:
         assert set(study.trials[0].params) >= {"model_breadth", "min_fraction", "max_backups_power"}
         # A trial's settings can be trained with: they pass the converter.
         options = ("--storage", file, "--study-name", "car", "--trial-id", 1)
-        assert call("train", *train_args(tmp_path, *options, n=100)) == 0
+        assert call("train", *train_args(tmp_path, *options, env=SHORT_CAR, n=100)) == 0
+
+    def test_the_arguments_of_transfer_are_tuned_with_the_rest(self, tmp_path):
+        pytest.importorskip("pandas")
+        optuna = pytest.importorskip("optuna")
+        url = f"sqlite:///{tmp_path / 'study.db'}"
+        transfer = {"sb3_combrel.COMBREL": {"source": RECIPE, "n_neighbors": 99}}
+        conf = write_config(tmp_path / "combrel.yml", policy="FittedRMaxPolicy", transfer=transfer)
+        options = ("--pruner", "median")
+        assert call("train", *self.tune(tmp_path, url, *options, n_trials=3, algo="combrel", conf=conf)) == 0
+        study = optuna.load_study(storage=url, study_name="car")
+        assert {trial.state.name for trial in study.trials} <= {"COMPLETE", "PRUNED"}
+        drawn = study.trials[1].params
+        assert {name for name in drawn if name.startswith("transfer_")} == {
+            "transfer_breadth",
+            "transfer_n_neighbors",
+            "transfer_min_compliance",
+            "transfer_relevance",
+        }
+        # They take the place of those in the configuration; what was not drawn stays.
+        options = ("--storage", url, "--study-name", "car", "--trial-id", 1, "--eval-freq", -1)
+        assert call("train", *train_args(tmp_path, *options, algo="combrel", env=SHORT_CAR, conf=conf, n=60)) == 0
+        (model_file,) = tmp_path.glob("combrel/*/MountainCar-v0.zip")
+        transfer = FittedRMax.load(model_file).policy.transfer
+        assert transfer.n_neighbors == drawn["transfer_n_neighbors"] and transfer.breadth == drawn["transfer_breadth"]
+        assert len(transfer.source) == 50
+
+    @pytest.mark.parametrize(("drawn", "expected"), [(None, 4), ("coarser", 3), ("finer", 5)])
+    def test_a_drawn_grid_is_relative_to_the_one_that_suits_the_task(self, drawn, expected):
+        from sb3_combrel.zoo.algorithm import ZooFittedRMax
+
+        model = ZooFittedRMax("FittedRMaxPolicy", Box(3), model_breadth=0.2, resolution=drawn)
+        assert model.policy.model.grid.resolution == (expected,) * 3
+
+    def test_a_finer_grid_of_many_variables_stays_within_memory(self):
+        from sb3_combrel.zoo.algorithm import ZooFittedRMax
+
+        suited, finer = (ZooFittedRMax("FittedRMaxPolicy", Box(5), resolution=drawn) for drawn in (None, "finer"))
+        assert finer.policy.model.grid.resolution == suited.policy.model.grid.resolution
 
     @pytest.mark.slow
     def test_processes_share_a_study_in_a_database(self, tmp_path):
@@ -199,6 +251,9 @@ class TestBadInput:
             ({"normalize": True}, "VecNormalize"),
             ({"policy": None}, '"policy"'),
             ({"breadth": 0.1}, "breadth"),
+            ({"resolution": "fine"}, "resolution"),
+            ({"transfer_kwargs": {"n_neighbors": 5}}, "needs a transfer method"),
+            ({"transfer": {"sb3_combrel.COMBREL": {"source": RECIPE}}, "transfer_kwargs": {"k": 5}}, "'k'"),
         ],
     )
     def test_what_is_wrong_in_a_configuration_is_said_in_a_sentence(self, tmp_path, capsys, entry, words):
