@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 # Half a second a set: a few per cent of the time where a step takes a third of a millisecond.
 DEFAULT_PICTURE_FREQ = 50_000
+# Of one that nobody asked for. With the first set matplotlib is loaded, so it is expected to take as long as that.
+DEFAULT_PICTURE_SHARE = 0.05
+FIRST_PICTURES_SECONDS = 0.5
 
 
 class DashboardCallback(BaseCallback):
@@ -32,8 +35,9 @@ class DashboardCallback(BaseCallback):
     Shows in TensorBoard what Fitted R-Max knows and what transfer does for it.
 
     ``FittedRMax.learn`` adds one by itself where there is a TensorBoard log (``tensorboard_log``, or a logger of the
-    user's with that format) and none was given. Give one to choose what is shown. Without such a log it does nothing;
-    what is learned is the same in any case.
+    user's with that format) and none was given. Its pictures are left out where they would take more than a twentieth of
+    the time, so runs of a few seconds have none. Give one to choose what is shown. Without such a log it does nothing; what
+    is learned is the same in any case.
 
     - Scalars, with every log of the algorithm (``log_interval``): ``rollout/``, ``time/``, ``model/``, ``planner/`` and
       ``transfer/``, and a page of custom scalars on which runs with and without transfer can be compared.
@@ -49,9 +53,10 @@ class DashboardCallback(BaseCallback):
         middle of the state space
     :param scalar_share: part of the time that scalars may take. A log that would exceed it has ``rollout/`` and ``time/``
         only; 1 for all of them in every log.
+    :param picture_share: the same for pictures, each set of them whole or not at all; 1 for all that ``picture_freq`` says
     :param verbose: verbosity level, as in any callback
-    :raises ValueError: if ``picture_freq`` is below 1 or ``scalar_share`` not in (0, 1]; when learning starts, if variables
-        or state do not fit the task
+    :raises ValueError: if ``picture_freq`` is below 1 or a share not in (0, 1]; when learning starts, if variables or state
+        do not fit the task
     :raises ModuleNotFoundError: when learning starts, if pictures are wanted and matplotlib is not installed
     """
 
@@ -61,15 +66,18 @@ class DashboardCallback(BaseCallback):
         variables: Sequence[VariablePair] | None = None,
         at: ArrayLike | None = None,
         scalar_share: float = 0.01,
+        picture_share: float = 1.0,
         verbose: int = 0,
     ):
         super().__init__(verbose)
         check_count("picture_freq", picture_freq, none_allowed=True)
         check_positive("scalar_share", scalar_share, largest=1.0)
+        check_positive("picture_share", picture_share, largest=1.0)
         self.picture_freq = picture_freq
         self.variables = variables
         self.at = at
         self.scalar_share = scalar_share
+        self.picture_share = picture_share
         self._writer: SummaryWriter | None = None
 
     @property
@@ -92,6 +100,7 @@ class DashboardCallback(BaseCallback):
         self._started = time.perf_counter()
         self._log_began: float | None = None
         self._spent = self._last_log = 0.0
+        self._spent_on_pictures, self._last_pictures = 0.0, FIRST_PICTURES_SECONDS
         self._write_settings()
 
     def _check_pictures(self) -> None:
@@ -201,8 +210,15 @@ class DashboardCallback(BaseCallback):
         self._next_pictures = self._following_pictures()
         if self._transfer is not None:
             self._write_table(self._transfer)
-        if self.picture_freq is not None:
+        if self.picture_freq is not None and self._can_afford_pictures():
+            began = time.perf_counter()
             self._write_pictures()
+            self._last_pictures = time.perf_counter() - began
+            self._spent_on_pictures += self._last_pictures
+
+    def _can_afford_pictures(self) -> bool:
+        affordable = self.picture_share * (time.perf_counter() - self._started)
+        return self.picture_share == 1.0 or self._spent_on_pictures + self._last_pictures <= affordable
 
     def _write_table(self, transfer: VirtualSourceTransfer) -> None:
         from sb3_combrel.tensorboard.mapping_table import mapping_table
@@ -248,7 +264,8 @@ def with_dashboard(callback: MaybeCallback, logger: Logger) -> MaybeCallback:
     """
     if tensorboard_writer(logger) is None or _has_dashboard(callback):
         return callback
-    dashboard = DashboardCallback(DEFAULT_PICTURE_FREQ if find_spec("matplotlib") is not None else None)
+    picture_freq = DEFAULT_PICTURE_FREQ if find_spec("matplotlib") is not None else None
+    dashboard = DashboardCallback(picture_freq, picture_share=DEFAULT_PICTURE_SHARE)
     if callback is None:
         return dashboard
     given: list[Any] = callback if isinstance(callback, list) else [callback]

@@ -15,7 +15,11 @@ ALGORITHMS = {
     "timbrel": sample_timbrel_params,
     "combrel": sample_combrel_params,
 }
-"""What draws hyperparameters for each algorithm, by its name for ``--algo``. All are Fitted R-Max; each has its own configuration file, log folder and column in tables."""
+"""
+Names for ``--algo``, and what draws hyperparameters for each.
+
+All are Fitted R-Max; each has its own configuration file, log folder and column in tables.
+"""
 
 
 def register() -> None:

@@ -232,11 +232,33 @@ def test_pictures_come_at_the_asked_steps_and_at_the_end(transfers, tmp_path):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_pictures_of_every_method(method, transfers, tmp_path):
-    walker(tmp_path, transfers[method]).learn(120, log_interval=1)
+    walker(tmp_path, transfers[method]).learn(120, DashboardCallback(), log_interval=1)
     found = events(tmp_path / "FittedRMax_1")
     of_choice = ["source_action/place_height", "state_mappings/chosen"] if method in ("TIMBREL", "COMBREL") else []
     assert sorted(found.Tags()["images"]) == sorted(["value_and_policy/place_height", *of_choice])
     assert ("transfer/most_chosen_mappings/text_summary" in found.Tags()["tensors"]) == (method != "none")
+
+
+def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(transfers, tmp_path, monkeypatch):
+    def slowly(self):
+        shown.append(time.perf_counter() - began)
+        time.sleep(0.05)
+
+    shown = []
+    monkeypatch.setattr(DashboardCallback, "_write_pictures", slowly)
+    monkeypatch.setattr("sb3_combrel.callbacks.FIRST_PICTURES_SECONDS", 0.01)
+    monkeypatch.setattr("sb3_combrel.callbacks.DEFAULT_PICTURE_FREQ", 10)
+    began = time.perf_counter()
+    walker(tmp_path, transfers["COMBREL"]).learn(3000)
+    took = time.perf_counter() - began
+    # The first set was expected to take 0.01 seconds, so it came after 0.2 seconds at the earliest.
+    assert 1 <= len(shown) <= 2 + 0.05 * took / 0.05 and shown[0] > 0.15
+
+
+def test_a_short_run_has_no_pictures_unless_they_are_asked_for(tmp_path):
+    walker(tmp_path).learn(120)
+    found = events(tmp_path / "FittedRMax_1")
+    assert not found.Tags()["images"] and "model/known" in found.Tags()["scalars"]
 
 
 def test_no_pictures_without_a_frequency(tmp_path):
@@ -305,7 +327,7 @@ class Box3(gym.Env):
 
 
 def test_a_task_with_one_variable_has_pictures_too(tmp_path):
-    FittedRMax(Box3(np.float32([0]), np.float32([1])), seed=0, tensorboard_log=str(tmp_path)).learn(50)
+    FittedRMax(Box3(np.float32([0]), np.float32([1])), seed=0, tensorboard_log=str(tmp_path)).learn(50, DashboardCallback())
     assert events(tmp_path / "FittedRMax_1").Tags()["images"] == ["value_and_policy/s0"]
 
 
@@ -443,7 +465,7 @@ def test_it_stands_beside_other_callbacks(given, tmp_path):
         "nested": CallbackList([EveryNTimesteps(10, Witness(len)), witness]),
     }[given]
     walker(tmp_path).learn(150, callback)
-    assert calls and events(tmp_path / "FittedRMax_1").Tags()["images"]
+    assert calls and "planner/residual" in events(tmp_path / "FittedRMax_1").Tags()["scalars"]
 
 
 @pytest.mark.parametrize("wrap", [list, CallbackList])
@@ -460,7 +482,7 @@ def test_a_model_is_saved_without_it(transfers, tmp_path):
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert "ashboard" not in str(model.__dict__)
-    loaded.learn(50, reset_num_timesteps=False)
+    loaded.learn(50, DashboardCallback(), reset_num_timesteps=False)
     assert events(tmp_path / "log" / "FittedRMax_1").Images("value_and_policy/place_height")[-1].step == 200
 
 
@@ -491,7 +513,7 @@ def test_environments_in_other_processes(transfers, tmp_path):
 
 
 def test_without_logs_of_the_algorithm_there_are_pictures_all_the_same(tmp_path):
-    walker(tmp_path).learn(100, log_interval=None)
+    walker(tmp_path).learn(100, DashboardCallback(), log_interval=None)
     found = events(tmp_path / "FittedRMax_1")
     assert not found.Tags()["scalars"] and found.Tags()["images"]
 
@@ -512,6 +534,13 @@ def test_without_logs_of_the_algorithm_there_are_pictures_all_the_same(tmp_path)
 def test_what_does_not_fit_the_task_is_refused(wrong, words, tmp_path):
     with pytest.raises(ValueError, match=words):
         walker(tmp_path).learn(10, DashboardCallback(**wrong))
+
+
+@pytest.mark.parametrize("name", ["scalar_share", "picture_share"])
+@pytest.mark.parametrize("share", [0, -0.1, 1.5])
+def test_a_share_is_between_nought_and_one(name, share):
+    with pytest.raises(ValueError, match=name):
+        DashboardCallback(**{name: share})
 
 
 @pytest.mark.parametrize("freq", [0, -5, 1.5])

@@ -224,11 +224,21 @@ class TestTablesAndPictures:
         assert (tmp_path / "all.pkl").exists()
 
     @pytest.mark.slow
-    def test_benchmark_writes_a_table(self, logs, tmp_path):
+    @pytest.mark.parametrize("mode", [("--test-mode",), ("--verbose", 2)])
+    def test_benchmark_writes_a_table(self, logs, tmp_path, monkeypatch, mode):
         pytest.importorskip("pandas")
-        options = ("--no-hub", "--test-mode", "-n", 300, "--log-dir", logs, "--benchmark-dir", tmp_path)
-        assert call("benchmark", *options, "--gym-packages", "combrel_envs") == 0
-        assert "fitted_rmax|combrel-MountainCar2D-v0" in (tmp_path / "benchmark.md").read_text().replace(" ", "")
+        # Without --test-mode RL-Zoo copies the table to where it was called.
+        monkeypatch.chdir(tmp_path)
+        options = ("--no-hub", "-n", 5000, "--log-dir", logs, "--benchmark-dir", tmp_path / "table")
+        assert call("benchmark", *options, *mode, "--gym-packages", "combrel_envs") == 0
+        assert "|fitted_rmax|combrel-MountainCar2D-v0|" in (tmp_path / "table/benchmark.md").read_text().replace(" ", "")
+        assert (tmp_path / "benchmark.md").exists() == ("--test-mode" not in mode)
+
+    def test_benchmark_says_that_there_are_no_logs(self, tmp_path, capsys):
+        pytest.importorskip("pandas")
+        options = ("--no-hub", "--log-dir", tmp_path / "nowhere", "--benchmark-dir", tmp_path)
+        assert call("benchmark", *options) == 1
+        assert "nowhere" in capsys.readouterr().err
 
     @pytest.mark.slow
     def test_record_video(self, logs, tmp_path):
