@@ -103,7 +103,18 @@ class SecretiveSet(MappingSet):
         {KIND: "InterTaskMapping"},
         SecretiveSet([[0, 1]], AllActionMappings(2, 2)),
     ],
-    ids=repr,
+    ids=[
+        "function",
+        "object",
+        "set",
+        "number as key",
+        "bytes",
+        "complex",
+        "function inside",
+        "objects",
+        "reserved key",
+        "subclass",
+    ],
 )
 def test_what_is_not_plain_is_refused(value):
     with pytest.raises(TypeError, match="plain data"):
