@@ -1,6 +1,7 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
 # make test    all tests, the slow ones too
 # make bench   speed and memory                make lint, type, format, commit-checks    as in Stable-Baselines3
+# make icub    the arm of the iCub with and without transfer from its torso; tables and figure in icub_experiment/
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
@@ -22,7 +23,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard icub icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -37,6 +38,10 @@ dashboard: $(VENV)/.installed-demo
 	mkdir -p docs/figures
 	cp dashboard/custom_scalars.png docs/figures/tensorboard_custom_scalars.png
 	cp dashboard/images.png docs/figures/tensorboard_images.png
+
+# Hours; a later call goes on with what is there. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
+icub: $(VENV)/.installed-demo
+	$(BIN)/python -m sb3_combrel.experiments.ball_striking $(ICUB_ARGS)
 
 # ICUB_ARGS="--task arm --look primitives", for instance.
 icub-video: $(VENV)/.installed-all gl

@@ -59,7 +59,11 @@ class _Announcer(event.Listener):
     def on_start(self, event: Any) -> None:
         if not self.announced and event.data["dispatcher"].py_func.__module__.startswith("sb3_combrel."):
             self.announced = True
-            print("sb3_combrel: compiling inner loops for this machine, once (half a minute) ...", file=sys.stderr, flush=True)
+            print(
+                "sb3_combrel: compiling inner loops for this machine, once (up to half a minute) ...",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def on_end(self, event: Any) -> None:
         pass

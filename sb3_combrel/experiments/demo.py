@@ -87,7 +87,7 @@ def run_demo(
     _epilogue(output, n_seeds, console)
 
 
-def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool) -> None:
+def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool = False) -> None:
     """
     Make the folder ready to take up results, those of an earlier call with the same settings included.
 

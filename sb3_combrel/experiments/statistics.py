@@ -66,3 +66,18 @@ def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
     test = stats.ttest_ind(without, with_transfer, equal_var=False)
     interval = test.confidence_interval(CONFIDENCE)
     return Saving(steps, float(interval.low), float(interval.high), share, float(test.pvalue))
+
+
+def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
+    """
+    Environment steps of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
+
+    :param steps: steps of each episode, shape (n_runs, n_episodes)
+    """
+    reached = np.full(len(steps), np.inf)
+    if steps.shape[1] >= window:
+        medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, window, axis=1), axis=-1)
+        for n, good in enumerate(medians <= threshold):
+            if good.any():
+                reached[n] = steps[n, : int(good.argmax()) + window].sum()
+    return reached

@@ -66,18 +66,19 @@ class FittedRMax(BaseAlgorithm):
     - Successors are cut at the edge of the grid, one cell beyond the box for up to two state variables and the box
       itself for more: far fewer states, and no worse learning.
     - A pair that was known once stays known (the original falls back when a nearer instance shortens its list).
-    - Planning is bounded by ``max_backups`` a step, first come, first served; the rest is done as time comes, at an
-      episode's end at the latest. Staying in a grid point is summed in closed form.
+    - Planning is bounded by ``max_backups`` a step, what is around the agent first; the rest is done as time comes, most
+      of it at an episode's end. Staying in a grid point is summed in closed form.
     - Where the agent comes back to the same place again and again, a wrong promise of the interpolated value is
       corrected (see ``sb3_combrel.fitted_rmax.corrections``): a plain implementation can stick there for ever.
-    - A time limit is not a terminal state.
+    - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%: with a narrow
+      kernel all that is within reach cannot become known, and exploration would not end.
 
     ``predict(obs, deterministic=True)`` takes the best action that has a model, ``deterministic=False`` the optimistic
     ones first, as in learning.
 
     Cost: a step's time grows with the instances near it and in a slow line with all instances (a look at one box for
     every 8 of them); memory is about 400 bytes an instance, and per state-action pair of the grid, once known, some
-    500 bytes. Both are bounded, by ``max_instances`` and by the grid.
+    800 bytes. Both are bounded, by ``max_instances`` and by the grid.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", for habit's sake); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
@@ -88,7 +89,7 @@ class FittedRMax(BaseAlgorithm):
     :param min_fraction: an instance counts while it has this part of the weight of the nearer ones; 0.1 keeps at most
         11 instances a pair, 0.01 (the original's) 101
     :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach
-    :param exploration_threshold: weight of instances that makes a state-action pair known
+    :param exploration_threshold: weight of instances that makes a state-action pair known, before it is lowered
     :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: at
         least 6 for one or two variables, 4 for three, 3 for more, and finer if the breadth needs it and memory allows.
     :param max_value: an upper bound on the return from any state, the value of what is unknown
@@ -127,7 +128,7 @@ class FittedRMax(BaseAlgorithm):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 30,
+        max_backups: int = 25,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,

@@ -95,7 +95,7 @@ def coarsest_in_reach(n_variables: int, reach: float) -> int:
 
 
 # Arrays of a pair and of a point when all of them are settled, from the sizes of ModelArrays and SweepQueue.
-BYTES_PER_PAIR = 700
+BYTES_PER_PAIR = 1000
 BYTES_PER_POINT = 200
 MOST_PAIRS_BY_DEFAULT = 1_000_000
 

@@ -26,6 +26,9 @@ MOST_PAIRS_AT_ONCE = 4096
 # Part of the threshold by which own weight must have grown before a pair that draws on transferred instances is settled
 # anew within an episode.
 NEWS = 0.1
+# A time limit reached this often is taken as it comes; each further time the threshold shrinks by the factor.
+EPISODES_OF_PATIENCE = 10
+IMPATIENCE = 0.98
 
 
 class KernelModel:
@@ -66,7 +69,7 @@ class KernelModel:
         self.model_breadth = model_breadth
         self.min_weight = min_weight
         self.min_fraction = min_fraction
-        self.exploration_threshold = float(exploration_threshold)
+        self.full_threshold = self.exploration_threshold = float(exploration_threshold)
         self.gamma = float(gamma)
         self.transfer = transfer
         self.max_instances = max_instances
@@ -168,6 +171,20 @@ class KernelModel:
         rest = (self._kernel, action, slot, np.zeros(self.grid.n_points), self.scratch)
         changed = leave_lists(self.instances, self.arrays, self.grid.arrays, *rest)
         return self.scratch.point[:changed] + action * self.grid.n_points
+
+    def lower_threshold(self, n_truncated: int) -> np.ndarray:
+        """Be content with less weight after so many episodes that ran into their time limit.
+
+        Where the kernel is so narrow that all that is within an episode's reach cannot become known, exploration would
+        otherwise go on for ever. In the end any instance that counts at all will do.
+
+        :return: the pairs that become known by that, to be settled anew
+        """
+        lowered = self.full_threshold * IMPATIENCE ** max(0, n_truncated - EPISODES_OF_PATIENCE)
+        self.exploration_threshold = max(lowered, min(self.full_threshold, self.min_weight))
+        newly_known = np.flatnonzero(~self.arrays.known & (self.arrays.total >= self.exploration_threshold))
+        self.arrays.known[newly_known] = True
+        return newly_known
 
     def worth_settling(self, pairs: np.ndarray) -> np.ndarray:
         """Those of ``pairs`` (which is overwritten) that have news; the others wait for :meth:`waiting`."""

@@ -15,7 +15,7 @@ class ModelArrays(NamedTuple):
 
     :param lists: kept instances of each pair, heaviest first, with their kernel weights
     :param rows: what each settled pair leads to: grid points, with discounted probabilities (see ``build_row``)
-    :param predecessors: for each grid point those whose rows have led to it, with the largest such probability
+    :param predecessors: for each grid point those whose rows have led to it, with a bound on that probability
     :param entry: float64, shape (n_pairs,): the weight that a further instance needs to enter the pair's list
     :param total: float64, shape (n_pairs,): sum of the kept weights
     :param known: bool, shape (n_pairs,): the target's own instances settle the pair
@@ -55,7 +55,8 @@ class Scratch(NamedTuple):
     :param position: float64, shape (n_variables,)
     :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
     :param dense: float64, shape (n_points,), all 0 between calls
-    :param touched: int64, shape (n_points,)
+    :param touched: int64, shape (2 * n_points,)
+    :param told: float64, shape (n_points,), all 0 between calls
     :param point: int64, shape (n_points,); ``weight``: float64, same shape: pairs that an instance reaches
     """
 
@@ -68,6 +69,7 @@ class Scratch(NamedTuple):
     corner_weight: np.ndarray
     dense: np.ndarray
     touched: np.ndarray
+    told: np.ndarray
     point: np.ndarray
     weight: np.ndarray
 
@@ -84,7 +86,8 @@ class Scratch(NamedTuple):
             corner_index=np.empty(2**d, dtype=np.int64),
             corner_weight=np.empty(2**d),
             dense=np.zeros(n_points),
-            touched=np.empty(n_points, dtype=np.int64),
+            touched=np.empty(2 * n_points, dtype=np.int64),
+            told=np.zeros(n_points),
             point=np.empty(n_points, dtype=np.int64),
             weight=np.empty(n_points),
         )
@@ -279,8 +282,19 @@ def scatter(p, effect, scratch, grid, n_touched):
 
 
 @inlined
+def next_power(weight):
+    """The least power of two that is not below ``weight``."""
+    return 2.0 ** np.ceil(np.log2(weight))
+
+
+@inlined
 def note_predecessor(predecessors, to, point, weight):
-    """Enter ``point`` among those that lead ``to`` a point with a probability of ``weight``; False if the pool must grow."""
+    """Enter ``point`` among those that lead ``to`` a point with a probability of ``weight``; False if the pool must grow.
+
+    The next power of two is noted, so that a little more of the same is no news: to find one among the predecessors
+    takes longer than to work out an entry of a row.
+    """
+    weight = next_power(weight)
     start = predecessors.start[to]
     length = predecessors.length[to]
     for k in range(start, start + length):
@@ -294,6 +308,38 @@ def note_predecessor(predecessors, to, point, weight):
     predecessors.weight[end] = weight
     predecessors.length[to] = length + 1
     return True
+
+
+@inlined
+def store_row(arrays, pair, point, n_touched, discount, scratch):
+    """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and have predecessors noted.
+
+    :param discount: 0: the row is left empty
+    :return: False if the predecessors' pool must grow; the row is empty then
+    """
+    slot = arrays.rows.start[pair]
+    n_old = arrays.rows.length[pair]
+    for k in range(n_old):
+        to = arrays.rows.index[slot + k]
+        scratch.told[to] = arrays.rows.weight[slot + k]
+        scratch.touched[n_touched + k] = to
+    length = 0
+    room = True
+    for t in range(n_touched):
+        to = scratch.touched[t]
+        if to != point and discount > 0.0:
+            weight = scratch.dense[to] * discount
+            told = scratch.told[to]
+            if weight > told and (told == 0.0 or weight > next_power(told)):
+                room = room and note_predecessor(arrays.predecessors, to, point, weight)
+            arrays.rows.index[slot + length] = to
+            arrays.rows.weight[slot + length] = weight
+            length += 1
+        scratch.dense[to] = 0.0
+    for t in range(n_touched, n_touched + n_old):
+        scratch.told[scratch.touched[t]] = 0.0
+    arrays.rows.length[pair] = length if room else 0
+    return room
 
 
 @inlined
@@ -341,26 +387,8 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     leave = 1.0 - gamma * scratch.dense[point]
     stays_for_ever = leave < 1e-9
     discount = 0.0 if stays_for_ever else gamma / leave
-    slot = arrays.rows.start[pair]
-    old_length = arrays.rows.length[pair]
-    length = 0
-    room = True
-    for t in range(n_touched):
-        to = scratch.touched[t]
-        if to != point and not stays_for_ever:
-            at = slot + length
-            weight = scratch.dense[to] * discount
-            # Where nothing new leads there from here, nobody has to be told.
-            if length >= old_length or arrays.rows.index[at] != to or arrays.rows.weight[at] < weight:
-                room = room and note_predecessor(arrays.predecessors, to, point, weight)
-            arrays.rows.index[at] = to
-            arrays.rows.weight[at] = weight
-            length += 1
-        scratch.dense[to] = 0.0
-    if not room:
-        arrays.rows.length[pair] = 0
+    if not store_row(arrays, pair, point, n_touched, discount, scratch):
         return False
-    arrays.rows.length[pair] = length
     if stays_for_ever:
         arrays.reward[pair] = 0.0 if reward == 0.0 else np.inf * reward
     else:

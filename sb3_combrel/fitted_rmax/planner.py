@@ -5,11 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner
+from sb3_combrel.common.kernels import corners_of
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
 from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel
 from sb3_combrel.fitted_rmax.model_kernels import settle_pairs
 
 EXPLOITATION_SWEEPS = 300
+NOWHERE = np.empty(0)
 
 
 class SweepQueue(NamedTuple):
@@ -155,6 +157,24 @@ def announce(values, arrays, queue, point, tolerance):
             push(queue, before)
 
 
+@inner
+def back_up_around(values, arrays, queue, state, grid, bounds, tolerance, scratch):
+    """Back up the grid points around ``state`` that have been announced a change; backups done.
+
+    Where the agent is, a wrong promise must not wait its turn: it would wait with it.
+    """
+    for k in range(len(state)):
+        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
+    backups = 0
+    for c in range(corners_of(scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)):
+        point = scratch.corner_index[c]
+        if queue.pending[point] > 0.0 and arrays.n_optimistic[point] == 0:
+            back_up(values, arrays, queue, point, bounds, tolerance)
+            announce(values, arrays, queue, point, tolerance)
+            backups += 1
+    return backups
+
+
 @inlined
 def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
     """Take over the pairs ``changed``, then back up the points that wait, in the order of their coming.
@@ -184,15 +204,21 @@ def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
 
 
 @compiled
-def settle_and_sweep(values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, scratch):
+def settle_and_sweep(
+    values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, around, scratch
+):
     """``settle_pairs`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
 
     :param pairs: at most MOST_PAIRS_AT_ONCE
+    :param around: a state around which all is backed up, unit coordinates; or nothing, shape (0,)
     :return: backups done; -1, and nothing swept, if a pool of the model must grow first
     """
     if settle_pairs(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
         return -1
-    return sweep(values, arrays, queue, pairs, bounds, tolerance, max_backups)
+    backups = sweep(values, arrays, queue, pairs, bounds, tolerance, max_backups)
+    if len(around) > 0:
+        backups += back_up_around(values, arrays, queue, around, grid, bounds, tolerance, scratch)
+    return backups
 
 
 @compiled
@@ -248,21 +274,22 @@ class Planner:
         self._sweep_all = SameTypes(sweep_all)
         self._exploitation: np.ndarray | None = None
 
-    def update(self, pairs: np.ndarray, max_backups: int) -> int:
+    def update(self, pairs: np.ndarray, max_backups: int, around: np.ndarray = NOWHERE) -> int:
         """Bring the rows of ``pairs`` up to date, then back up these points and what waits.
 
         :param pairs: pairs whose model changed
         :param max_backups: of the points that wait; the others wait for the next call
+        :param around: a state, unit coordinates: the grid points around it need not wait
         :return: backups done
         """
         self._exploitation = None
         backups = 0
         while len(pairs) > MOST_PAIRS_AT_ONCE:
-            backups += self._update_some(pairs[:MOST_PAIRS_AT_ONCE], 0)
+            backups += self._update_some(pairs[:MOST_PAIRS_AT_ONCE], 0, NOWHERE)
             pairs = pairs[MOST_PAIRS_AT_ONCE:]
-        return backups + self._update_some(pairs, max_backups)
+        return backups + self._update_some(pairs, max_backups, around)
 
-    def _update_some(self, pairs: np.ndarray, max_backups: int) -> int:
+    def _update_some(self, pairs: np.ndarray, max_backups: int, around: np.ndarray) -> int:
         model = self.model
         supply = model.supply_for(pairs)
         while True:
@@ -278,6 +305,7 @@ class Planner:
                 self.bounds,
                 self.tolerance,
                 max_backups,
+                around,
                 model.scratch,
             )
             if backups >= 0:

@@ -20,7 +20,7 @@ from sb3_combrel.common.supply import Supply
 from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
-from sb3_combrel.fitted_rmax.planner import Planner
+from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around
 from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.transfer.base import TargetTask, Transfer
@@ -31,9 +31,9 @@ from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 LONGEST_PLAN = 10_000
 
 # Backups in multiples of max_backups, passes over the grid, and backups for each pair that transfer has changed.
-AT_EPISODE_END = 150
+AT_EPISODE_END = 100
 BEFORE_THE_FIRST_STEP = 300
-BACKUPS_PER_RENEWED_PAIR = 10
+BACKUPS_PER_RENEWED_PAIR = 2
 NO_PAIRS = np.empty(0, dtype=np.int64)
 NOBODY = (-1, 0.0, 0)
 
@@ -66,7 +66,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 30,
+        max_backups: int = 25,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | dict[str, Any] | None = None,
@@ -76,8 +76,8 @@ class FittedRMaxPolicy(BasePolicy):
     ):
         super().__init__(observation_space, action_space, normalize_images=False)
         self.kernel = (float(model_breadth), float(min_weight), float(min_fraction))
-        self.exploration_threshold = float(exploration_threshold)
         self.gamma = float(gamma)
+        self.n_truncated = 0
         self.max_backups = max_backups
         self.transfer: Transfer | None = restore_transfer(transfer)
         self.rng = np.random.default_rng() if rng is None else rng
@@ -105,7 +105,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.state_names = tuple(state_names or (f"s{k}" for k in range(grid.n_variables)))
         self.action_names = tuple(action_names or (f"a{k}" for k in range(self.n_actions)))
         if self.transfer is not None:
-            self._task = self._target_task(grid)
+            self._task = self._target_task(grid, exploration_threshold)
             self.transfer.bind(self._task, self.rng)
         self.model = KernelModel(
             grid,
@@ -132,12 +132,12 @@ class FittedRMaxPolicy(BasePolicy):
         self.timed, self.reporting = False, True
         self.planning_seconds = 0.0
 
-    def _target_task(self, grid: StateGrid) -> TargetTask:
+    def _target_task(self, grid: StateGrid, exploration_threshold: float) -> TargetTask:
         return TargetTask(
             scaling=self.scaling,
             n_actions=self.n_actions,
             sample_states=grid.points(),
-            exploration_threshold=self.exploration_threshold,
+            exploration_threshold=float(exploration_threshold),
             min_weight=self.kernel[1],
             min_fraction=self.kernel[2],
             state_names=self.state_names,
@@ -190,7 +190,8 @@ class FittedRMaxPolicy(BasePolicy):
     def _choose_at(self, state: np.ndarray, values: np.ndarray, visitor: tuple[int, float, int]) -> int:
         """Work out ``_q`` at a state, and note a visit there (see ``choose``); the best action, -1 if several are."""
         instances = self.model.instances
-        rest = (self.exploration_threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
+        threshold = self.model.exploration_threshold
+        rest = (threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
         if self.transfer is None:
             return int(
                 self._look_and_choose(instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor)
@@ -256,10 +257,13 @@ class FittedRMaxPolicy(BasePolicy):
         else:
             self._unsettled.append(self.model.worth_settling(changed))
             self.transfer.observe(state, action, reward, next_state, terminated)
-        return self._plan(self.max_backups)
+        return self._plan(self.max_backups, NOWHERE if terminated else next_state)
 
     def end_episode(self, truncated: bool) -> int:
         """Time to think: plan on while no action is due; backups done."""
+        if truncated:
+            self.n_truncated += 1
+            self._unsettled.append(self.model.lower_threshold(self.n_truncated))
         if self.transfer is not None:
             self.transfer.end_episode(truncated)
             self._unsettled.append(self.model.waiting())
@@ -275,16 +279,16 @@ class FittedRMaxPolicy(BasePolicy):
         self.planner.start_anew()
         return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
 
-    def _plan(self, max_backups: int) -> int:
+    def _plan(self, max_backups: int, around: np.ndarray = NOWHERE) -> int:
         """Plan, and note how long it took if that is wanted (``timed``); backups done."""
         if not self.timed:
-            return self._settle_and_plan(max_backups)
+            return self._settle_and_plan(max_backups, around)
         began = perf_counter()
-        backups = self._settle_and_plan(max_backups)
+        backups = self._settle_and_plan(max_backups, around)
         self.planning_seconds += perf_counter() - began
         return backups
 
-    def _settle_and_plan(self, max_backups: int) -> int:
+    def _settle_and_plan(self, max_backups: int, around: np.ndarray) -> int:
         """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
         passes = 0
         if self.transfer is not None:
@@ -296,10 +300,10 @@ class FittedRMaxPolicy(BasePolicy):
                 passes = backups // self.model.grid.n_points
                 max_backups += backups if passes == 0 else 0
         if not self._unsettled:
-            return self.planner.update(NO_PAIRS, max_backups)
+            return self.planner.update(NO_PAIRS, max_backups, around)
         # Left on the list until all is done: an interrupt in between loses no change.
         pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
-        backups = self.planner.update(pairs, max_backups)
+        backups = self.planner.update(pairs, max_backups, around)
         self._unsettled.clear()
         return backups + (self.planner.sweep_all(passes) if passes else 0)
 
@@ -320,6 +324,7 @@ class FittedRMaxPolicy(BasePolicy):
             "model/known": known,
             "model/transferred": settled - known,
             "model/optimistic": 1.0 - settled,
+            "model/threshold": self.model.exploration_threshold,
             "planner/waiting": self.planner.n_waiting,
             "planner/corrections": int(self.corrections.count[0]),
         }
@@ -355,6 +360,7 @@ class FittedRMaxPolicy(BasePolicy):
             "known": self.model.arrays.known,
             "total": self.model.arrays.total,
             "lowest_value": np.array([self.planner.bounds[0]]),
+            "n_truncated": np.array([float(self.n_truncated)]),
             "corrections": np.column_stack([self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]),
         }
 
@@ -398,10 +404,12 @@ class FittedRMaxPolicy(BasePolicy):
             "known": (n_pairs,),
             "total": (n_pairs,),
             "lowest_value": (1,),
+            "n_truncated": (1,),
         }
 
     def _restore(self, saved: dict[str, np.ndarray]) -> None:
         model, d = self.model, self.scaling.n_variables
+        self.n_truncated = int(saved["n_truncated"][0])
         rows = saved["instances"]
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
         order = np.argsort(actions, kind="stable")
@@ -412,7 +420,7 @@ class FittedRMaxPolicy(BasePolicy):
             model_breadth=model.model_breadth,
             min_weight=model.min_weight,
             min_fraction=model.min_fraction,
-            exploration_threshold=model.exploration_threshold,
+            exploration_threshold=model.full_threshold,
             gamma=model.gamma,
             transfer=model.transfer,
             max_instances=model.max_instances,
@@ -424,6 +432,7 @@ class FittedRMaxPolicy(BasePolicy):
         fresh.instances = InstanceArrays.of_rows(
             self.n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5
         )
+        fresh.lower_threshold(self.n_truncated)
         fresh.restore(rows[:, -1] > 0.5, saved["known"] > 0.5, saved["total"])
         self.model = self.planner.model = fresh
         self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])

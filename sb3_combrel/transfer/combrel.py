@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_count, check_finite
-from sb3_combrel.common.compiled import compiled, inner, SameTypes
+from sb3_combrel.common.checks import check_count, check_finite, check_positive
+from sb3_combrel.common.compiled import SameTypes, compiled, inner
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.compliance import ComplianceScratch, standstill_compliance, transition_compliance
@@ -35,6 +35,9 @@ class COMBREL(VirtualSourceTransfer):
         left alone), "surjective", "all", "balanced", "paper_mountain_car", "paper_icub", a list of mappings or a
         ``MappingSet``. The paper uses sets without unmapped variables, which help much less.
     :param n_neighbors: how many of the nearest target transitions vote; k of Algorithm 1 (the paper: 3)
+    :param voting_radius: how far, in unit coordinates, a target transition may be and still vote. Where none is near enough
+        nothing is transferred: what nobody has seen stays worth exploring, and what has been seen need not be tried with
+        every action. None: the nearest vote however far they are, as in the paper.
     :param measured: when compliance is measured: "online", with every transition (the default, which works best); or
         "first_episode", once, after the first episode, as in the paper
     :param max_transitions: target transitions measured at most
@@ -44,8 +47,8 @@ class COMBREL(VirtualSourceTransfer):
     :param breadth: kernel breadth of transferred instances, in unit coordinates; the paper names none
     :param fading: factor on ``breadth`` for each episode that runs into its time limit (the paper: none, 1). Whatever
         the source, pairs that it settled wrongly are explored in the end.
-    :param believe_terminal: whether a source instance that ended its episode ends the target's too; the paper does not
-        say
+    :param believe_terminal: whether a source instance that ended its episode ends the target's too. The paper does not
+        say. What is wrong with it the target's own transitions soon tell; without it nothing leads to an end at first.
     :param relevance: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful.
     :param relevance_fraction: mu of Eq. 4: the part of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
@@ -59,12 +62,13 @@ class COMBREL(VirtualSourceTransfer):
         mappings: MappingsLike = "injective",
         *,
         n_neighbors: int = 3,
+        voting_radius: float | None = None,
         measured: str = "online",
         max_transitions: int = 3000,
         min_compliance: float = 0.8,
         breadth: float = DEFAULT_BREADTH,
         fading: float = DEFAULT_FADING,
-        believe_terminal: bool = False,
+        believe_terminal: bool = True,
         relevance: bool = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
@@ -72,6 +76,8 @@ class COMBREL(VirtualSourceTransfer):
         check_count("n_neighbors", n_neighbors)
         check_count("max_transitions", max_transitions)
         check_finite("min_compliance", min_compliance)
+        if voting_radius is not None:
+            check_positive("voting_radius", voting_radius)
         if min_compliance < 0.0:
             raise ValueError(f"min_compliance must be at least 0, got {min_compliance!r}")
         if measured not in ("online", "first_episode"):
@@ -87,6 +93,7 @@ class COMBREL(VirtualSourceTransfer):
             bandwidths=bandwidths,
         )
         self.n_neighbors = n_neighbors
+        self.voting_radius = voting_radius
         self.measured = measured
         self.max_transitions = max_transitions
         self.min_compliance = min_compliance
@@ -99,7 +106,9 @@ class COMBREL(VirtualSourceTransfer):
         self._tables = np.empty((64, n_rows, n_actions))
         self._least = np.empty(64)
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
-        self._distance = np.full((target.n_actions, n_points, self.n_neighbors), np.inf)
+        # An empty place counts as a neighbour at the limit: whoever is farther away does not enter.
+        self._limit = np.inf if self.voting_radius is None else float(self.voting_radius) ** 2
+        self._distance = np.full((target.n_actions, n_points, self.n_neighbors), self._limit)
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._changed_points = np.empty(n_points, dtype=np.int64)
         self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._choose_at = map(
@@ -234,6 +243,7 @@ class COMBREL(VirtualSourceTransfer):
             self._tables,
             self._least,
             self._ways,
+            self._limit,
             self._near_at,
             self._distance_at,
             self._choice_at,
@@ -281,7 +291,7 @@ def note_neighbor(i, state, sample_states, near, distance, changed):
     """Enter transition ``i`` at every sample state that has it among its nearest.
 
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
-    :param distance: squared distances to them, inf for none, updated
+    :param distance: squared distances to them, the limit for none, updated
     :param changed: receives the points at which it entered
     :return: how many
     """
@@ -348,10 +358,11 @@ def vote(points, near, tables, least, ways, action, choice):
 
 
 @compiled
-def choose_at(state, missing, states, actions, n, tables, least, ways, near, distance, choice):
+def choose_at(state, missing, states, actions, n, tables, least, ways, limit, near, distance, choice):
     """The candidate for every action with ``missing`` at an exact state, by the same vote; -1 for none.
 
     :param states: target transitions' states, of which the first ``n`` are measured; ``actions``: their actions
+    :param limit: squared distance from which on a transition does not vote
     :param near: int64 scratch, shape (n_neighbors,); ``distance``: float64, same shape
     :param choice: receives the candidates, shape (n_actions,)
     """
@@ -362,7 +373,7 @@ def choose_at(state, missing, states, actions, n, tables, least, ways, near, dis
             continue
         for k in range(len(near)):
             near[k] = -1
-            distance[k] = np.inf
+            distance[k] = limit
         for i in range(n):
             if actions[i] != action:
                 continue

@@ -145,6 +145,33 @@ class SourceInstances:
         return learn_source(env, n_instances, seed, total_timesteps=total_timesteps, method=method, **q_learning)
 
     @classmethod
+    def from_fitted_rmax(
+        cls,
+        env: str | gym.Env[Any, Any],
+        n_instances: int = 1000,
+        seed: int | None = None,
+        *,
+        n_episodes: int = 100,
+        method: str = "covering",
+        **learner: Any,
+    ) -> SourceInstances:
+        """
+        Learn the source task with Fitted R-Max and keep a choice of all its experience, as in Section 5.2 of the paper.
+
+        :param env: a task, or its id, e.g. "combrel/ICubTorsoStrike-v0"
+        :param n_instances: number of instances to keep
+        :param seed: seed of the learner, its environment and the choice
+        :param n_episodes: episodes of learning
+        :param method: how to choose the instances, see :meth:`subset`; most of the experience is of one path, so by default
+            those that cover most
+        :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, such as ``max_value``
+        :raises ValueError: if the spaces do not fit, or if a number is below 1
+        """
+        from sb3_combrel.transfer.model_learning import learn_source
+
+        return learn_source(env, n_instances, seed, n_episodes=n_episodes, method=method, **learner)
+
+    @classmethod
     def from_minari(
         cls,
         dataset: str | MinariDataset,

@@ -40,7 +40,7 @@ class TIMBREL(VirtualSourceTransfer):
     :param fading: factor on ``breadth`` for each episode that runs into its time limit (the paper: none, 1). Whatever
         the source, pairs that it settled wrongly are explored in the end.
     :param believe_terminal: whether a source instance that ended its episode ends the target's too. The paper does not
-        say; reaching one of two goals at once is not the end, so the default is not.
+        say. What is wrong with it the target's own transitions soon tell; without it nothing leads to an end at first.
     :param relevance: order the instances by relevance (Eq. 7) to the target's transitions, not by distance. The paper
         finds it harmful.
     :param relevance_fraction: mu of Eq. 4: the part of the weight over which distances are averaged
@@ -56,7 +56,7 @@ class TIMBREL(VirtualSourceTransfer):
         mappings: MappingsLike = "injective",
         breadth: float = DEFAULT_BREADTH,
         fading: float = DEFAULT_FADING,
-        believe_terminal: bool = False,
+        believe_terminal: bool = True,
         relevance: bool = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,

@@ -16,6 +16,7 @@ from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.source import SourceInstances
 
 CACHE_VARIABLE = "SB3_COMBREL_CACHE"
+FITTED_RMAX = "fitted_rmax"
 DEFAULT_RECIPE: Mapping[str, Any] = {"n_instances": 1000, "total_timesteps": 30_000, "seed": 0}
 
 
@@ -64,7 +65,8 @@ def find_source(source: Any) -> SourceInstances:
 
     :param source: source instances; the path of a file of them; the id of an environment, learnt as
         :data:`DEFAULT_RECIPE` says; or a recipe: a dict with ``env``, the id, and arguments of
-        :meth:`~sb3_combrel.SourceInstances.from_q_learning`
+        :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
+        :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
     :raises ValueError: if it is none of these
     """
     if isinstance(source, SourceInstances):
@@ -72,7 +74,8 @@ def find_source(source: Any) -> SourceInstances:
     if isinstance(source, Mapping):
         if not isinstance(source.get("env"), str):
             raise ValueError(f"the recipe of a source needs 'env', the id of its task, got {dict(source)!r}")
-        return learn_or_read({**DEFAULT_RECIPE, **source})
+        default = {**DEFAULT_RECIPE, "total_timesteps": None} if source.get("learner") == FITTED_RMAX else DEFAULT_RECIPE
+        return learn_or_read({name: value for name, value in {**default, **source}.items() if value is not None})
     if not isinstance(source, str | os.PathLike):
         raise ValueError(f"source must be a file, the id of an environment or a recipe, got {source!r}")
     path = Path(source)
@@ -88,11 +91,11 @@ def find_source(source: Any) -> SourceInstances:
 
 def learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     """
-    Instances of a task learnt by Q-learning; the second time they are read from a file.
+    Instances of a task learnt by Q-learning or Fitted R-Max; the second time they are read from a file.
 
     Processes that begin at once each learn it; as the seed is theirs too, so is the result, and no file is half written.
 
-    :param recipe: ``env`` and arguments of :meth:`~sb3_combrel.SourceInstances.from_q_learning`
+    :param recipe: see :func:`find_source`
     :raises ValueError: if the task cannot be learnt so
     """
     file = cache_file(recipe)
@@ -100,9 +103,13 @@ def learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
         return SourceInstances.load(file)
     arguments = dict(recipe)
     env_id = arguments.pop("env")
-    print(f"Learning the source task {env_id} for {arguments['total_timesteps']:,} steps; kept in {file}")
+    learner = arguments.pop("learner", "q_learning")
+    if learner not in ("q_learning", FITTED_RMAX):
+        raise ValueError(f"the recipe's learner must be q_learning or {FITTED_RMAX}, got {learner!r}")
+    print(f"Learning the source task {env_id} by {learner}; kept in {file}")
     try:
-        source = SourceInstances.from_q_learning(env_id, **arguments)
+        by_model = learner == FITTED_RMAX
+        source = (SourceInstances.from_fitted_rmax if by_model else SourceInstances.from_q_learning)(env_id, **arguments)
     except (TypeError, gym.error.Error) as error:
         raise ValueError(f"the source task cannot be learnt by the recipe {dict(recipe)}: {error}") from error
     source.save(file)

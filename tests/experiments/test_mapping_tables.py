@@ -1,0 +1,50 @@
+"""Tables of the mappings used, and the most frequent one, from the words that runs leave."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from sb3_combrel import InterTaskMapping
+from sb3_combrel.experiments.mapping_tables import Use, action_table, most_frequent_mapping, state_table
+from sb3_combrel.experiments.statistics import steps_to_reach
+
+SOURCE = (("pitch", "yaw"), ("S1-", "S1+", "S2-", "S2+"))
+TARGET = (("a", "b", "c"), ("T1-", "T1+"))
+USES = Counter(
+    {
+        Use("T1-", "S1-", "a<-pitch, c<-(-yaw)"): 6,
+        Use("T1-", "S2+", "a<-pitch, c<-(-yaw)"): 2,
+        Use("T1-", "S2+", "a<-yaw, b<-pitch"): 5,
+        Use("T1+", "S1+", "a<-yaw, b<-pitch"): 1,
+    }
+)
+
+
+def test_the_most_frequent_mapping_is_the_state_mapping_used_most_with_its_own_actions():
+    mapping = most_frequent_mapping(USES, SOURCE[0], TARGET[0], SOURCE[1], TARGET[1])
+    # T1+ was never seen through it: what stood for it otherwise takes its place.
+    assert mapping == InterTaskMapping(state=(0, None, 1), action=(0, 1), sign=(1, 1, -1))
+
+
+def test_without_uses_there_is_no_most_frequent_mapping():
+    with pytest.raises(ValueError, match="no mapping has been used"):
+        most_frequent_mapping({}, SOURCE[0], TARGET[0], SOURCE[1], TARGET[1])
+
+
+def test_shares_are_of_each_target_action():
+    table = action_table(USES, "COMBREL", SOURCE[1], TARGET[1])
+    assert dict((row[0], row[1:]) for row in table.rows) == {
+        "S1-": ("46.2%", "0.0%"),
+        "S1+": ("0.0%", "100.0%"),
+        "S2-": ("0.0%", "0.0%"),
+        "S2+": ("53.8%", "0.0%"),
+        "transfers": ("13", "1"),
+    }
+    assert state_table(USES, "COMBREL").rows[0] == ("a<-pitch, c<-(-yaw)", "57.1%")
+
+
+def test_steps_to_reach_counts_up_to_the_end_of_the_first_good_window():
+    steps = np.array([[400, 30, 400, 30, 30, 30], [400, 400, 400, 400, 400, 400]])
+    np.testing.assert_array_equal(steps_to_reach(steps, 50, 3), [860, np.inf])
+    np.testing.assert_array_equal(steps_to_reach(steps, 50, 7), [np.inf, np.inf])
