@@ -73,7 +73,7 @@ class ZooFittedRMax(FittedRMax):
             raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         n_actions = int(self.action_space.n)
-        (suited, *_) = fitting_grid(n_variables, n_actions, None, self._breadth(), self.min_weight).resolution
+        suited, *_ = fitting_grid(n_variables, n_actions, None, self._breadth(), self.min_weight).resolution
         if wanted == "coarser":
             return max(1, suited - 1)
         n_pairs = (2 ** (suited + 1) + 1) ** n_variables * n_actions

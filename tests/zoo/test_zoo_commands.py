@@ -111,6 +111,24 @@ class TestTrainAndEnjoy:
         assert "train" in capsys.readouterr().out
 
 
+class TestShippedConfigurations:
+    @pytest.mark.parametrize("algo", ["dqn", "qrdqn", "ppo"])
+    def test_other_algorithms_have_settings_for_every_task(self, algo):
+        tasks = {CAR, BIG_CAR, "combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0"}
+        assert tasks <= set(yaml.safe_load((CONFIGS / f"{algo}.yml").read_text()))
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("algo", ["dqn", "qrdqn", "ppo"])
+    def test_a_table_compares_them_with_fitted_rmax(self, logs, tmp_path, capsys, algo):
+        pytest.importorskip("pandas")
+        # Too few steps to learn anything: what counts is that logs of both are understood.
+        assert call("train", *train_args(tmp_path, algo=algo)) == 0
+        options = ("-e", "combrel-MountainCar2D-v0", "-f", logs, tmp_path, "-l", "mine", "theirs", "--no-display")
+        assert call("all_plots", "-a", "fitted_rmax", algo, *options, "--no-million") == 0
+        printed = capsys.readouterr().out
+        assert "FITTED_RMAX" in printed and algo.upper() in printed
+
+
 class TestTransfer:
     @pytest.mark.parametrize("algo", ["timbrel", "combrel"])
     @pytest.mark.parametrize("env", [CAR, BIG_CAR])
