@@ -128,7 +128,7 @@ class FittedRMax(BaseAlgorithm):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 25,
+        max_backups: int = 100,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,

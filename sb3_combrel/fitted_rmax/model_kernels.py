@@ -431,6 +431,9 @@ def settle_pairs(arrays, instances, grid, gamma, pairs, done, supply, scratch):
             return done
         arrays.heard[pair] = arrays.total[pair]
         if has_row != arrays.settled[pair]:
+            if not has_row:
+                arrays.rows.length[pair] = 0
+                arrays.reward[pair] = 0.0
             arrays.settled[pair] = has_row
             arrays.n_optimistic[pair % n_points] += -1 if has_row else 1
         done += 1

@@ -66,7 +66,7 @@ class FittedRMaxPolicy(BasePolicy):
         max_value: float = 0.0,
         gamma: float = 1.0,
         planning_tolerance: float = 0.01,
-        max_backups: int = 25,
+        max_backups: int = 100,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | dict[str, Any] | None = None,
