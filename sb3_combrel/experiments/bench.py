@@ -20,6 +20,7 @@ class Case(NamedTuple):
     :param env_kwargs: its arguments
     :param kwargs: arguments of FittedRMax
     :param n_episodes: how many to learn
+    :param transfers: whether with COMBREL, from Mountain Car 2D
     """
 
     name: str
@@ -27,8 +28,10 @@ class Case(NamedTuple):
     env_kwargs: dict[str, Any]
     kwargs: dict[str, Any]
     n_episodes: int
+    transfers: bool = False
 
 
+_BROAD: dict[str, Any] = dict(model_breadth=0.4, resolution=3, min_fraction=0.1)
 CASES = (
     Case(
         "Mountain Car 2D, breadth 1/16, resolution 4",
@@ -37,13 +40,8 @@ CASES = (
         dict(model_breadth=1 / 16, resolution=4, min_fraction=0.01),
         50,
     ),
-    Case(
-        "Mountain Car 4D, breadth 0.4, resolution 3",
-        "combrel/MountainCar4D-v0",
-        {},
-        dict(model_breadth=0.4, resolution=3, min_fraction=0.1),
-        200,
-    ),
+    Case("Mountain Car 4D, breadth 0.4, resolution 3", "combrel/MountainCar4D-v0", {}, _BROAD, 200),
+    Case("the same with COMBREL", "combrel/MountainCar4D-v0", {}, _BROAD, 200, transfers=True),
     Case(
         "Mountain Car 4D, breadth 0.2, resolution 3",
         "combrel/MountainCar4D-v0",
@@ -90,10 +88,12 @@ def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
     from stable_baselines3.common.env_util import make_vec_env
 
     import combrel_envs  # noqa: F401 - registers the environments
-    from sb3_combrel import FittedRMax
+    from sb3_combrel import COMBREL, FittedRMax
+    from sb3_combrel.experiments.mountain_car import learn_source
 
     env = make_vec_env(case.env_id, seed=seed, env_kwargs=case.env_kwargs)
-    model = FittedRMax(env, seed=seed, **case.kwargs)
+    transfer = COMBREL(learn_source()) if case.transfers else None
+    model = FittedRMax(env, seed=seed, transfer=transfer, **case.kwargs)
     start = time.process_time()
     model.learn(10**7, callback=StopTrainingOnMaxEpisodes(n_episodes), log_interval=None)
     return model.num_timesteps, time.process_time() - start
@@ -106,6 +106,7 @@ def measure(number: int, part: float = 1.0) -> tuple[int, float, float]:
         "from sb3_combrel.experiments import bench\n"
         f"case = bench.CASES[{number}]\n"
         "bench.learn(bench.CASES[0], 1, seed=1)\n"
+        "if case.transfers: bench.learn(case, 1, seed=1)\n"
         "before = bench.resident_memory()\n"
         f"steps, seconds = bench.learn(case, max(1, round({part} * case.n_episodes)))\n"
         "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"

@@ -95,7 +95,8 @@ class FittedRMax(BaseAlgorithm):
     :param max_value: an upper bound on the return from any state, the value of what is unknown
     :param gamma: discount factor, in (0, 1]
     :param planning_tolerance: changes of value up to this are not passed on
-    :param max_backups: grid points backed up in a step at most, besides those whose model changed
+    :param max_backups: grid points backed up in a step at most, besides those whose model changed; 400 times as many when an
+        episode ends. None: 400 / 2^d with d state variables, as a backup costs the more the more of them there are.
     :param max_instances: of one action; beyond, the instance that fewest grid points rely on gives way. None: no limit.
     :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
         where those are infinite
@@ -127,8 +128,8 @@ class FittedRMax(BaseAlgorithm):
         resolution: int | Sequence[int] | None = None,
         max_value: float = 0.0,
         gamma: float = 1.0,
-        planning_tolerance: float = 0.01,
-        max_backups: int = 100,
+        planning_tolerance: float = 0.001,
+        max_backups: int | None = None,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         stats_window_size: int = 100,
@@ -229,7 +230,7 @@ class FittedRMax(BaseAlgorithm):
         check_positive("gamma", self.gamma, largest=1.0)
         check_positive("planning_tolerance", self.planning_tolerance)
         check_finite("max_value", self.max_value)
-        check_count("max_backups", self.max_backups, least=0)
+        check_count("max_backups", self.max_backups, least=0, none_allowed=True)
         check_count("max_instances", self.max_instances, none_allowed=True)
         check_resolution(self.resolution, n_variables)
 

@@ -30,8 +30,10 @@ from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
 LONGEST_PLAN = 10_000
 
+# By default so many corners of grid cells are looked at in a step: a backup costs as much as a cell has corners.
+CORNERS_A_STEP = 400
 # Backups in multiples of max_backups, passes over the grid, and backups for each pair that transfer has changed.
-AT_EPISODE_END = 100
+AT_EPISODE_END = 400
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 2
 NO_PAIRS = np.empty(0, dtype=np.int64)
@@ -65,8 +67,8 @@ class FittedRMaxPolicy(BasePolicy):
         resolution: int | Sequence[int] | None = None,
         max_value: float = 0.0,
         gamma: float = 1.0,
-        planning_tolerance: float = 0.01,
-        max_backups: int = 100,
+        planning_tolerance: float = 0.001,
+        max_backups: int | None = None,
         max_instances: int | None = 20_000,
         bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | dict[str, Any] | None = None,
@@ -78,10 +80,10 @@ class FittedRMaxPolicy(BasePolicy):
         self.kernel = (float(model_breadth), float(min_weight), float(min_fraction))
         self.gamma = float(gamma)
         self.n_truncated = 0
-        self.max_backups = max_backups
         self.transfer: Transfer | None = restore_transfer(transfer)
         self.rng = np.random.default_rng() if rng is None else rng
         self.scaling = StateScaling.from_space(observation_space, bounds)
+        self.max_backups = max(1, CORNERS_A_STEP // 2**self.scaling.n_variables) if max_backups is None else max_backups
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
         self._scale_into_box = SameTypes(scale_into_box)
         self._look_around, self._choose, self._look_and_choose = map(SameTypes, (look_around, choose, look_and_choose))

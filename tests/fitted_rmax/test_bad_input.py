@@ -154,7 +154,6 @@ BAD_ARGUMENTS = [
     ("planning_tolerance", -1.0),
     ("max_backups", -1),
     ("max_backups", 1.5),
-    ("max_backups", None),
     ("max_instances", 0),
     ("max_instances", 10.5),
 ]

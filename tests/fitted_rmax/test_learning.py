@@ -102,6 +102,5 @@ def test_cart_pole(seed):
         max_value=100,
         exploration_threshold=0.5,
         resolution=4,
-        max_backups=300,
     )
     assert returns.mean() >= 475
