@@ -34,7 +34,7 @@ MAX_EPISODE_STEPS = 400
 #: steps.
 LEARNER: dict[str, Any] = {"model_breadth": 0.2, "max_value": 100.0}
 #: How COMBREL is set here; see the class for what each argument is.
-TRANSFER: dict[str, Any] = {"voting_radius": 0.4, "breadth": 0.4, "fading": 1.0, "max_transitions": 20_000}
+TRANSFER: dict[str, Any] = {"voting_radius": 0.8, "breadth": 0.4, "fading": 1.0, "max_transitions": 20_000}
 #: As near to the paper as its text allows.
 FAITHFUL: dict[str, Any] = {
     "mappings": "paper_icub",
