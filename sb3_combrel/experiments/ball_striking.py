@@ -14,7 +14,7 @@ import numpy as np
 from joblib import cpu_count
 from rich.console import Console
 
-from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, MappingSet, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.experiments import mapping_tables, report
 from sb3_combrel.experiments.demo import prepare_folder
 from sb3_combrel.experiments.figures import draw_smoothed_curves
@@ -67,11 +67,6 @@ def learn_source(seed: int = 0) -> SourceInstances:
     return SourceInstances.from_fitted_rmax(SOURCE_ID, N_INSTANCES, seed, max_value=LEARNER["max_value"])
 
 
-def signed_injective() -> MappingSet:
-    """All mappings that give each torso joint to exactly one arm joint, in either direction, with all action mappings."""
-    return MappingSet.injective(2, 4, 4, 8, signs=True)
-
-
 def transfer_of(method: str, source: SourceInstances, mapping: InterTaskMapping | None = None) -> Transfer | None:
     """
     The transfer method of a name.
@@ -84,7 +79,7 @@ def transfer_of(method: str, source: SourceInstances, mapping: InterTaskMapping 
     if method == PAPERS_MAPPINGS:
         return COMBREL(source, "paper_icub", **TRANSFER)
     if method == ALL_MAPPINGS:
-        return COMBREL(source, signed_injective(), **TRANSFER)
+        return COMBREL(source, "signed_injective", **TRANSFER)
     if method == RANDOM:
         return TIMBREL(source, "random", mappings="paper_icub", **timbrel)
     if method == FREQUENT:

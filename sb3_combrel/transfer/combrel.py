@@ -32,8 +32,9 @@ class COMBREL(VirtualSourceTransfer):
 
     :param source: source instances, a path to them, or a list of several, which then compete
     :param mappings: "injective" (each source variable stands for one target variable, the other target variables are
-        left alone), "surjective", "all", "balanced", "paper_mountain_car", "paper_icub", a list of mappings or a
-        ``MappingSet``. The paper uses sets without unmapped variables, which help much less.
+        left alone), "surjective", "all", "balanced", these with "signed_" before them (variables may be mirrored as well),
+        "paper_mountain_car", "paper_icub", a list of mappings or a ``MappingSet``. The paper uses sets without unmapped
+        variables, which help much less.
     :param n_neighbors: how many of the nearest target transitions vote; k of Algorithm 1 (the paper: 3)
     :param voting_radius: how far, in unit coordinates, a target transition may be and still vote. Where none is near enough
         nothing is transferred: what nobody has seen stays worth exploring, and what has been seen need not be tried with

@@ -28,8 +28,7 @@ class ListedMappingSet(MappingSet):
         for mapping in mappings:
             if len(mapping.state) != len(first.state) or len(mapping.action) != len(first.action):
                 raise ValueError(
-                    "mappings must all have the same numbers of target variables and actions, "
-                    f"got {first!r} and {mapping!r}"
+                    f"mappings must all have the same numbers of target variables and actions, got {first!r} and {mapping!r}"
                 )
         # Dictionaries keep the order of first appearance, which the numbers of the factors follow.
         state_number: dict[tuple[tuple[int, ...], tuple[int, ...]], int] = {}

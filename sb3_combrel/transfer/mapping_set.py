@@ -207,14 +207,16 @@ class MappingSet:
         """
         One of the sets by its name, as in a YAML file.
 
-        :param name: "injective", "surjective", "all" or "balanced"
+        :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``
         :raises ValueError: for another name; for the other parameters and errors see :meth:`injective`
         """
         constructors = {"injective": cls.injective, "surjective": cls.surjective, "all": cls.all, "balanced": cls.balanced}
-        if name not in constructors:
-            names = [*constructors, "paper_mountain_car", "paper_icub"]
+        unsigned = name.removeprefix("signed_")
+        if unsigned not in constructors:
+            names = [*constructors, *(f"signed_{each}" for each in constructors), "paper_mountain_car", "paper_icub"]
             raise ValueError(f"mappings must be one of {', '.join(names)}, got {name!r}")
-        return constructors[name](n_source_variables, n_target_variables, n_source_actions, n_target_actions, signs=signs)
+        numbers = (n_source_variables, n_target_variables, n_source_actions, n_target_actions)
+        return constructors[unsigned](*numbers, signs=signs or unsigned != name)
 
     @classmethod
     def _of(cls, state_mappings: Ints, actions: ActionMappings, signs: bool) -> MappingSet:

@@ -30,7 +30,7 @@ def sample_fitted_rmax_params(trial: Trial, n_actions: int, n_envs: int, additio
             "model_breadth": trial.suggest_float("model_breadth", 0.05, 0.5, log=True),
             "min_fraction": trial.suggest_float("min_fraction", 0.01, 0.3, log=True),
             "exploration_threshold": trial.suggest_float("exploration_threshold", 0.3, 3.0, log=True),
-            "planning_tolerance": trial.suggest_float("planning_tolerance", 1e-3, 0.1, log=True),
+            "planning_tolerance": trial.suggest_float("planning_tolerance", 1e-4, 0.1, log=True),
             "max_backups_power": trial.suggest_int("max_backups_power", 3, 10),
             "resolution": trial.suggest_categorical("resolution", [None, "coarser", "finer"]),
         }
@@ -49,6 +49,7 @@ def sample_combrel_params(trial: Trial, n_actions: int, n_envs: int, additional_
     of_transfer = {
         "breadth": _transfer_breadth(trial),
         "n_neighbors": trial.suggest_int(f"{OF_TRANSFER}n_neighbors", 1, 10, log=True),
+        "voting_radius": trial.suggest_categorical(f"{OF_TRANSFER}voting_radius", [None, 0.2, 0.4, 0.8]),
         "min_compliance": trial.suggest_float(f"{OF_TRANSFER}min_compliance", 0.0, 1.5),
         "relevance": trial.suggest_categorical(f"{OF_TRANSFER}relevance", [False, True]),
     }

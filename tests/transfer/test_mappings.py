@@ -102,7 +102,7 @@ class TestInterTaskMapping:
             ["Neutral", "West", "East", "South", "North"],
         )
         assert repr(mapping) == (
-            "InterTaskMapping(x<-x, vx<-(-v); " "Neutral<-Neutral, West<-Left, East<-Right, South<-Neutral, North<-Neutral)"
+            "InterTaskMapping(x<-x, vx<-(-v); Neutral<-Neutral, West<-Left, East<-Right, South<-Neutral, North<-Neutral)"
         )
         assert mapping == InterTaskMapping(mapping.state, mapping.action, mapping.sign)
         with pytest.raises(ValueError, match="target_variables must hold 4 names"):
@@ -170,6 +170,13 @@ class TestStateFactor:
         sizes = {name: MappingSet.from_name(name, **MOUNTAIN_CAR) for name in ("injective", "surjective", "all", "balanced")}
         factors = {name: (each.n_state_mappings, each.n_action_mappings) for name, each in sizes.items()}
         assert factors == {"injective": (12, 243), "surjective": (14, 243), "all": (50, 243), "balanced": (12, 90)}
+
+    @pytest.mark.parametrize("name", ["injective", "surjective", "all", "balanced"])
+    def test_signed_sets_have_names_too(self, name):
+        numbers = (2, 4, 1, 2)
+        signed = MappingSet.from_name(name, *numbers, signs=True)
+        assert list(MappingSet.from_name(f"signed_{name}", *numbers)) == list(signed)
+        assert len(signed) > len(MappingSet.from_name(name, *numbers))
 
     @pytest.mark.parametrize(("n_source", "n_target"), [(1, 3), (2, 3), (3, 2)])
     def test_signs_add_every_mirrored_variant_once(self, n_source, n_target):
@@ -395,7 +402,7 @@ class TestResolve:
     @pytest.mark.parametrize(
         ("mappings", "message"),
         [
-            ("bijective", "one of injective, surjective, all, balanced, paper_mountain_car, paper_icub, got 'bijective'"),
+            ("bijective", "one of injective, .*, signed_injective, .*, paper_mountain_car, paper_icub, got 'bijective'"),
             (3, "mappings must be a name, .* got 3"),
             ([], "at least one InterTaskMapping"),
             ([3], "each of the mappings must be"),
