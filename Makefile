@@ -23,7 +23,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard icub icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard icub icub-figures icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -39,9 +39,16 @@ dashboard: $(VENV)/.installed-demo
 	cp dashboard/custom_scalars.png docs/figures/tensorboard_custom_scalars.png
 	cp dashboard/images.png docs/figures/tensorboard_images.png
 
-# Hours; a later call goes on with what is there. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
+# Half an hour on two cores; a later call goes on with what is there. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
 icub: $(VENV)/.installed-demo
 	$(BIN)/python -m sb3_combrel.experiments.ball_striking $(ICUB_ARGS)
+
+# Takes the results of `make icub` into the documentation.
+icub-figures: icub
+	mkdir -p docs/figures docs/results
+	cp icub_experiment/learning_curves.png docs/figures/icub_learning_curves.png
+	cp icub_experiment/summary.csv docs/results/icub.csv
+	cp icub_experiment/tables.md docs/results/icub.md
 
 # ICUB_ARGS="--task arm --look primitives", for instance.
 icub-video: $(VENV)/.installed-all gl

@@ -6,6 +6,7 @@ Run as ``python -m sb3_combrel.experiments.ball_striking``; ``make icub`` does.
 from __future__ import annotations
 
 import argparse
+import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -161,7 +162,7 @@ def settings() -> dict[str, Any]:
 
 def write_report(runs: Sequence[Run], source: SourceInstances, output: Path, console: Console) -> None:
     """
-    Write ``results.csv``, ``tables.md`` and ``learning_curves.png``, and show the tables.
+    Write ``results.csv``, ``summary.csv``, ``tables.md`` and ``learning_curves.png``, and show the tables.
 
     :param runs: the experiment's runs, all complete
     """
@@ -170,6 +171,7 @@ def write_report(runs: Sequence[Run], source: SourceInstances, output: Path, con
         for method in dict.fromkeys(run.method for run in runs)
     }
     report.write_results(runs, output / "results.csv")
+    write_summary(runs, output / "summary.csv")
     draw_smoothed_curves(steps, output / "learning_curves.png", "iCub: the arm, learned with 1000 instances of the torso")
     tables = [threshold_table(steps), end_table(steps)]
     _, actions = _names_of_target()
@@ -181,6 +183,22 @@ def write_report(runs: Sequence[Run], source: SourceInstances, output: Path, con
     (output / "tables.md").write_text("\n".join(table.as_markdown() for table in tables))
     for table in tables:
         console.print(table.for_terminal())
+
+
+def write_summary(runs: Sequence[Run], path: Path) -> None:
+    """
+    Write one line for each run: steps to the thresholds, commands in the end, all steps.
+
+    :param runs: the experiment's runs, all complete
+    :param path: file to write
+    """
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("method", "seed", *(f"steps_to_{t}" for t in THRESHOLDS), "last_10_median", "steps"))
+        for run in runs:
+            steps = np.array(run.steps())
+            reached = [steps_to_reach(steps[None], threshold, WINDOW)[0] for threshold in THRESHOLDS]
+            writer.writerow((run.method, run.seed, *(f"{n:.0f}" for n in reached), np.median(steps[-10:]), steps.sum()))
 
 
 def threshold_table(steps: Mapping[str, np.ndarray]) -> Table:
@@ -195,7 +213,8 @@ def threshold_table(steps: Mapping[str, np.ndarray]) -> Table:
         cells = []
         for number, runs in enumerate(of_thresholds):
             without = np.median(needed[NO_TRANSFER][number]) if NO_TRANSFER in needed else np.nan
-            cells += [f"{np.median(runs):,.0f} ({runs.min():,.0f} to {runs.max():,.0f})", f"{np.median(runs) / without:.2f}"]
+            share = f"{np.median(runs) / without:.2f}" if np.isfinite(without) else ""
+            cells += [f"{np.median(runs):,.0f} ({runs.min():,.0f} to {runs.max():,.0f})", share]
         rows.append((method, *cells))
     header = ("method", *(text for t in THRESHOLDS for text in (f"steps until {t} commands", "share")))
     n_runs = len(next(iter(steps.values())))
