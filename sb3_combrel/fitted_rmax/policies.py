@@ -21,7 +21,7 @@ from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
-from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose, look_around
+from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose
 from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
@@ -86,7 +86,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.max_backups = max(1, CORNERS_A_STEP // 2**self.scaling.n_variables) if max_backups is None else max_backups
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
         self._scale_into_box = SameTypes(scale_into_box)
-        self._look_around, self._choose, self._look_and_choose = map(SameTypes, (look_around, choose, look_and_choose))
+        self._choose, self._look_and_choose = SameTypes(choose), SameTypes(look_and_choose)
         self._flat = (-1, self.scaling.n_variables)
         self.n_actions = int(action_space.n)
         self._first_action = int(action_space.start)
@@ -194,13 +194,14 @@ class FittedRMaxPolicy(BasePolicy):
         instances = self.model.instances
         threshold = self.model.exploration_threshold
         rest = (threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
-        if self.transfer is None:
-            return int(
-                self._look_and_choose(instances, state, self.kernel, *rest, self._no_supply, self._query, self._q, visitor)
-            )
-        self._look_around(instances, state, self.kernel, self._query)
-        supply = self.transfer.supply_at(state, self._query.total)
-        return int(self._choose(instances, state, *rest, supply, self._query, self._q, visitor))
+        output = (self._query, self._q, visitor)
+        waits = self.transfer is not None
+        best = int(self._look_and_choose(instances, state, self.kernel, *rest, self._no_supply, *output, waits))
+        if best == -2:
+            assert self.transfer is not None
+            supply = self.transfer.supply_at(state, self._query.total)
+            best = int(self._choose(instances, state, *rest, supply, *output))
+        return best
 
     def explore(self, state: np.ndarray, episode: int) -> int:
         """

@@ -150,19 +150,23 @@ def find_best(instances, state, threshold, gamma, values, corrections, grid, bou
 
 
 @compiled
-def look_and_choose(instances, state, kernel, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
-    """:func:`find_near` and :func:`find_best` in one call: handing over arrays takes as long as the work."""
+def look_and_choose(
+    instances, state, kernel, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor, waits
+):
+    """:func:`find_near` and :func:`find_best` in one call: handing over arrays takes as long as the work.
+
+    :param waits: whether to leave off after the first, and return -2, where an action's own instances do not reach the
+        threshold: for a caller that has a supply to make before it calls :func:`choose`
+    """
     find_near(instances, state, kernel, query)
+    if waits:
+        for action in range(len(q)):
+            if query.total[action] < threshold:
+                return -2
     return find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)
 
 
 @compiled
-def look_around(instances, state, kernel, query):
-    """:func:`find_near`, for a caller that has a supply to make from it before the next call."""
-    find_near(instances, state, kernel, query)
-
-
-@compiled
 def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
-    """:func:`find_best`, for the same caller."""
+    """:func:`find_best`, for a caller whom :func:`look_and_choose` left waiting."""
     return find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)

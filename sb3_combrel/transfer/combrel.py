@@ -223,6 +223,8 @@ class COMBREL(VirtualSourceTransfer):
 
     def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
         assert self.target is not None
+        if known.all():
+            return self._nothing_for(len(pairs))
         chosen = np.where(known, -1, self._choice[pairs])
         if (chosen < 0).all():
             return self._nothing_for(len(pairs))

@@ -121,6 +121,7 @@ class VirtualSourceTransfer(Transfer):
         self._most_transferred = min(list_room(target.min_fraction), MOST_TRANSFERRED)
         self._translate = SameTypes(translate)
         self._best = BestInstances.empty(self._most_transferred, target.n_variables)
+        self._nothing = Supply.none(64, target.n_variables)
 
     def _most_ways_at_once(self) -> int:
         """Candidates from which one pair may draw at the same time."""
@@ -219,7 +220,9 @@ class VirtualSourceTransfer(Transfer):
 
     def _nothing_for(self, n: int) -> Supply:
         assert self.target is not None
-        return Supply.none(n, self.target.n_variables)
+        if n > len(self._nothing.count):
+            self._nothing = Supply.none(2 * n, self.target.n_variables)
+        return Supply(*(array[:n] for array in self._nothing))
 
     def _renew_relevance(self) -> None:
         """Relevance of all instances to the target transitions seen so far."""
