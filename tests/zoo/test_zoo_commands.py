@@ -195,6 +195,7 @@ class TestTuning:
             "transfer_n_neighbors",
             "transfer_min_compliance",
             "transfer_relevance",
+            "transfer_voting_radius",
         }
         # They take the place of those in the configuration; what was not drawn stays.
         options = ("--storage", url, "--study-name", "car", "--trial-id", 1, "--eval-freq", -1)
