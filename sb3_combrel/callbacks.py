@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 # Half a second a set: a few per cent of the time where a step takes a third of a millisecond.
 DEFAULT_PICTURE_FREQ = 50_000
-# Of one that nobody asked for. With the first set matplotlib is loaded, so it is expected to take as long as that.
+# Of one that nobody asked for. With the first set matplotlib is loaded; it took up to two seconds on a busy machine.
 DEFAULT_PICTURE_SHARE = 0.05
-FIRST_PICTURES_SECONDS = 0.5
+FIRST_PICTURES_SECONDS = 1.5
 
 
 class DashboardCallback(BaseCallback):
@@ -36,8 +36,8 @@ class DashboardCallback(BaseCallback):
 
     ``FittedRMax.learn`` adds one by itself where there is a TensorBoard log (``tensorboard_log``, or a logger of the
     user's with that format) and none was given. Its pictures are left out where they would take more than a twentieth of
-    the time, so runs of a few seconds have none. Give one to choose what is shown. Without such a log it does nothing; what
-    is learned is the same in any case.
+    the time, so runs of less than half a minute have none. Give one to choose what is shown. Without such a log it does
+    nothing; what is learned is the same in any case.
 
     - Scalars, with every log of the algorithm (``log_interval``): ``rollout/``, ``time/``, ``model/``, ``planner/`` and
       ``transfer/``, and a page of custom scalars on which runs with and without transfer can be compared.

@@ -16,6 +16,7 @@ from joblib import cpu_count
 from rich.console import Console
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments import mapping_tables, report
 from sb3_combrel.experiments.demo import prepare_folder
 from sb3_combrel.experiments.figures import draw_smoothed_curves
@@ -31,8 +32,7 @@ TARGET_ID = "combrel/ICubArmStrike-v0"
 N_INSTANCES = 1000
 MAX_EPISODE_STEPS = 400
 
-#: A hit by the first command returns 99. The paper's breadth (Table 3) is 0.1; with 0.2 all methods learn in a third of the
-#: steps.
+#: A hit by the first command returns 99. The paper's breadth (Table 3) is 0.1; with 0.2 the arm is learnt in fewer steps.
 LEARNER: dict[str, Any] = {"model_breadth": 0.2, "max_value": 100.0}
 #: How COMBREL is set here; see the class for what each argument is.
 TRANSFER: dict[str, Any] = {"voting_radius": 0.6, "breadth": 0.4, "fading": 1.0, "max_transitions": 20_000}
@@ -111,7 +111,7 @@ def run_experiment(
     methods: Sequence[str],
     workers: int,
     console: Console | None = None,
-    first_seed: int = 0,
+    first_seed: int = FIRST_SEED,
 ) -> None:
     """
     Learn the arm's task with each method, and write table and figure; what is complete is not done again.
@@ -123,7 +123,15 @@ def run_experiment(
     :param workers: processes at a time
     :param console: where to write; None for the standard output
     :param first_seed: the seeds are this and those after it
+    :raises ValueError: if a number is below 1, a method is unknown, or one lacks the method whose mapping it takes over
     """
+    for name, number in {"n_seeds": n_seeds, "n_episodes": n_episodes, "workers": workers}.items():
+        check_count(name, number)
+    unknown = [method for method in methods if method not in METHODS]
+    if unknown or not methods:
+        raise ValueError(f"methods must be some of {', '.join(METHODS)}, got {list(methods)!r}")
+    if FREQUENT in methods and PAPERS_MAPPINGS not in methods:
+        raise ValueError(f"{FREQUENT!r} takes over the mapping that {PAPERS_MAPPINGS!r} used most: methods needs both")
     console = console or Console()
     prepare_folder(output, settings())
     source = _source(output / "source.npz", console)
@@ -196,7 +204,7 @@ def write_summary(runs: Sequence[Run], path: Path) -> None:
         writer = csv.writer(file)
         writer.writerow(("method", "seed", *(f"steps_to_{t}" for t in THRESHOLDS), "last_10_median", "steps"))
         for run in runs:
-            steps = np.array(run.steps())
+            steps = run.steps()
             reached = [steps_to_reach(steps[None], threshold, WINDOW)[0] for threshold in THRESHOLDS]
             writer.writerow((run.method, run.seed, *(f"{n:.0f}" for n in reached), np.median(steps[-10:]), steps.sum()))
 

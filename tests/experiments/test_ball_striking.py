@@ -40,3 +40,20 @@ def test_the_experiment_runs_to_its_end_and_is_not_done_twice(tmp_path):
     before = [path.stat().st_mtime_ns for path in sorted((tmp_path / "runs").glob("*.zip"))]
     ball_striking.run_experiment(*arguments, first_seed=7)
     assert [path.stat().st_mtime_ns for path in sorted((tmp_path / "runs").glob("*.zip"))] == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(n_seeds=0), "n_seeds must be .* got 0"),
+        (dict(n_episodes=0), "n_episodes must be .* got 0"),
+        (dict(methods=["Q-learning"]), "some of no transfer, .* got .*Q-learning"),
+        (dict(methods=[]), "some of no transfer"),
+        (dict(methods=[ball_striking.FREQUENT]), "methods needs both"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_learnt(tmp_path, change, message):
+    arguments = dict(output=tmp_path / "results", n_seeds=1, n_episodes=1, methods=METHODS, workers=1) | change
+    with pytest.raises(ValueError, match=message):
+        ball_striking.run_experiment(**arguments)
+    assert not (tmp_path / "results").exists()
