@@ -19,6 +19,9 @@ inner = _njit(**_options, no_cpython_wrapper=True)
 # The same for functions called in the innermost loops: handing over a handful of arrays costs more than such a function.
 inlined = _njit(**_options, no_cpython_wrapper=True, forceinline=True)
 
+# The same, but callable from Python as well.
+compiled_and_inlined = _njit(**_options, forceinline=True)
+
 # The same for loops whose sums may be taken in any order, as vector registers do.
 compiled_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 

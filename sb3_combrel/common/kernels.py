@@ -94,7 +94,7 @@ def near_instances(instances, action, state, breadth, min_weight, min_fraction, 
     instances.searches[0] += 1
     search = instances.searches[0]
     for b in range(n_before):
-        i = indices[b]
+        i = np.int64(indices[b])
         if i < count:
             instances.seen[action, i] = search
             w = np.exp(squared_distance(state, instances.state[action, i]) * scale)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inner
+from sb3_combrel.common.compiled import compiled, compiled_and_inlined, inlined, inner
 from sb3_combrel.common.kernels import interpolate
 
 CELLS_PER_GRID_CELL = 3
@@ -85,7 +85,7 @@ class CorrectionArrays(NamedTuple):
         return larger
 
 
-@compiled
+@compiled_and_inlined
 def cell_key(position, shape):
     """The number of the small cell around a position in grid coordinates."""
     key = 0
@@ -96,7 +96,7 @@ def cell_key(position, shape):
     return key
 
 
-@compiled
+@compiled_and_inlined
 def find_cell(corrections, key):
     """Where in the table ``key`` stands, or the free place where it would."""
     mask = len(corrections.table) - 1
@@ -113,16 +113,21 @@ def note_all(corrections):
         corrections.table[find_cell(corrections, corrections.key[m])] = m
 
 
-@inner
+@inlined
 def corrected_value(values, corrections, position, grid, scratch):
     """The value at ``position`` (unit coordinates times cells): interpolated, and cut by what is remembered there."""
     value = interpolate(values, position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
-    if corrections.count[0] == 0:
-        return value
-    m = corrections.table[find_cell(corrections, cell_key(position, grid.shape))]
-    if m < 0:
-        return value
-    for k in range(len(position)):
+    if corrections.count[0] > 0:
+        m = corrections.table[find_cell(corrections, cell_key(position, grid.shape))]
+        if m >= 0:
+            value = cut_value(value, m, values, corrections, grid, scratch)
+    return value
+
+
+@inner
+def cut_value(value, m, values, corrections, grid, scratch):
+    """``value`` cut by what is remembered as number ``m``: as much as the value there was too large."""
+    for k in range(len(scratch.there)):
         scratch.there[k] = corrections.state[m, k] * grid.cells[k] + grid.margin[k]
     there = interpolate(values, scratch.there, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
     return value + min(0.0, corrections.value[m] - there)

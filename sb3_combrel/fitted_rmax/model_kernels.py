@@ -158,7 +158,7 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
     lists = arrays.lists
     while progress[1] < progress[0]:
         pair = first_pair + scratch.point[progress[1]]
-        length = lists.length[pair]
+        length = np.int64(lists.length[pair])
         if not reserve(lists, pair, length + 1):
             return False
         start = lists.start[pair]

@@ -73,8 +73,8 @@ def push_all(queue, points):
 def pop(queue):
     """The point that has waited longest, -1 if none waits."""
     if queue.ends[1] == 0:
-        return np.int32(-1)
-    point = queue.ring[queue.ends[0]]
+        return np.int64(-1)
+    point = np.int64(queue.ring[queue.ends[0]])
     queue.ends[0] = queue.ends[0] + 1 if queue.ends[0] + 1 < len(queue.ring) else 0
     queue.ends[1] -= 1
     queue.waiting[point] = False
@@ -102,7 +102,7 @@ def back_up(values, arrays, queue, point, bounds, tolerance):
     lie all over the memory, and to read them takes most of the time of planning.
     """
     pending = queue.pending[point]
-    greedy = queue.greedy[point]
+    greedy = np.int64(queue.greedy[point])
     queue.pending[point] = 0.0
     queue.greedy[point] = -1
     if arrays.n_optimistic[point] > 0:
@@ -133,7 +133,7 @@ def take_over(values, arrays, queue, pair, bounds, tolerance):
     """Bring V of the pair's point up to date when nothing but the pair's row has changed."""
     action = pair // len(values)
     point = pair - action * len(values)
-    greedy = queue.greedy[point]
+    greedy = np.int64(queue.greedy[point])
     queue.slack[point, action] = np.inf
     if greedy < 0 or greedy == action or arrays.n_optimistic[point] > 0:
         back_up(values, arrays, queue, point, bounds, tolerance)
@@ -213,7 +213,7 @@ def settle_and_sweep(
     :param around: a state around which all is backed up, unit coordinates; or nothing, shape (0,)
     :return: backups done; -1, and nothing swept, if a pool of the model must grow first
     """
-    if settle_pairs(arrays, instances, grid, gamma, pairs, 0, supply, scratch) < len(pairs):
+    if settle_pairs(arrays, instances, grid, gamma, pairs, np.int64(0), supply, scratch) < len(pairs):
         return -1
     backups = sweep(values, arrays, queue, pairs, bounds, tolerance, max_backups)
     if len(around) > 0:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inner
+from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.kernels import near_instances
 from sb3_combrel.fitted_rmax.corrections import corrected_value, visit
 
@@ -64,7 +64,7 @@ def find_near(instances, state, kernel, query):
         )
 
 
-@inner
+@inlined
 def add_successor(p, state, effect, values, corrections, grid, query):
     """(undiscounted value, probability to stay) that one instance adds to a backup at ``state``."""
     moved = 0.0
