@@ -36,6 +36,9 @@ MAX_EPISODE_STEPS = 400
 LEARNER: dict[str, Any] = {"model_breadth": 0.2, "max_value": 100.0}
 #: How COMBREL is set here; see the class for what each argument is.
 TRANSFER: dict[str, Any] = {"voting_radius": 0.6, "breadth": 0.4, "fading": 1.0, "max_transitions": 20_000}
+#: With all signed injective mappings many comply about equally well. The best of them settles what it gets wrong as well,
+#: and is slow to be found out; drawn ones are not.
+OF_ALL: dict[str, Any] = {**TRANSFER, "mappings": "signed_injective", "choice": "drawn"}
 #: As near to the paper as its text allows.
 FAITHFUL: dict[str, Any] = {
     "mappings": "paper_icub",
@@ -55,7 +58,7 @@ AS_IN_THE_PAPER = "COMBREL faithful"
 METHODS = (NO_TRANSFER, PAPERS_MAPPINGS, ALL_MAPPINGS, RANDOM, FREQUENT, AS_IN_THE_PAPER)
 
 #: The settings above were chosen with lower seeds.
-FIRST_SEED = 30
+FIRST_SEED = 60
 
 #: Median of so many episodes must not exceed a threshold for it to be reached.
 WINDOW = 5
@@ -83,7 +86,7 @@ def transfer_of(method: str, source: SourceInstances, mapping: InterTaskMapping 
     if method == PAPERS_MAPPINGS:
         return COMBREL(source, "paper_icub", **TRANSFER)
     if method == ALL_MAPPINGS:
-        return COMBREL(source, "signed_injective", **TRANSFER)
+        return COMBREL(source, **OF_ALL)
     if method == RANDOM:
         return TIMBREL(source, "random", mappings="paper_icub", **timbrel)
     if method == FREQUENT:
@@ -164,6 +167,7 @@ def settings() -> dict[str, Any]:
         "source_instances": N_INSTANCES,
         "learner": LEARNER,
         "transfer": TRANSFER,
+        "of_all_mappings": OF_ALL,
         "as_in_the_paper": FAITHFUL,
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
-from sb3_combrel.common.compiled import SameTypes, compiled, inner
+from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.compliance import ComplianceScratch, standstill_compliance, transition_compliance
@@ -16,8 +16,10 @@ from sb3_combrel.transfer.virtual_source import (
     SourceLike,
     VirtualSourceTransfer,
 )
+from sb3_combrel.transfer.voting import Ballots, choose_at, note_neighbor, vote
 
 RELEVANCE_RENEWAL = 1.2
+NO_DRAWS = np.empty(0)
 
 
 class COMBREL(VirtualSourceTransfer):
@@ -36,6 +38,9 @@ class COMBREL(VirtualSourceTransfer):
         "paper_mountain_car", "paper_icub", a list of mappings or a ``MappingSet``. The paper uses sets without unmapped
         variables, which help much less.
     :param n_neighbors: how many of the nearest target transitions vote; k of Algorithm 1 (the paper: 3)
+    :param choice: "best": the mapping with the highest mean compliance is chosen, as in the paper; or "drawn": one is
+        drawn, each with a probability in proportion to its mean compliance. Where many mappings comply about equally
+        well none of them then settles everything wrongly: what one hides another shows.
     :param voting_radius: how far, in unit coordinates, a target transition may be and still vote. Where none is near enough
         nothing is transferred: what nobody has seen stays worth exploring, and what has been seen need not be tried with
         every action. None: the nearest vote however far they are, as in the paper.
@@ -63,6 +68,7 @@ class COMBREL(VirtualSourceTransfer):
         mappings: MappingsLike = "injective",
         *,
         n_neighbors: int = 3,
+        choice: str = "best",
         voting_radius: float | None = None,
         measured: str = "online",
         max_transitions: int = 3000,
@@ -81,6 +87,8 @@ class COMBREL(VirtualSourceTransfer):
             check_positive("voting_radius", voting_radius)
         if min_compliance < 0.0:
             raise ValueError(f"min_compliance must be at least 0, got {min_compliance!r}")
+        if choice not in ("best", "drawn"):
+            raise ValueError(f'choice must be "best" or "drawn", got {choice!r}')
         if measured not in ("online", "first_episode"):
             raise ValueError(f'measured must be "online" or "first_episode", got {measured!r}')
         super().__init__(
@@ -94,6 +102,7 @@ class COMBREL(VirtualSourceTransfer):
             bandwidths=bandwidths,
         )
         self.n_neighbors = n_neighbors
+        self.choice = choice
         self.voting_radius = voting_radius
         self.measured = measured
         self.max_transitions = max_transitions
@@ -104,8 +113,8 @@ class COMBREL(VirtualSourceTransfer):
         n_rows, n_actions = len(self._table.index), len(self._instances.count)
         n_points = len(target.sample_states)
         self._compliance_scratch = ComplianceScratch.for_mappings(self._table, int(self._instances.count.max()))
-        self._tables = np.empty((64, n_rows, n_actions))
-        self._least = np.empty(64)
+        self._table_of_one = np.empty((n_rows, n_actions))
+        self._ballots = Ballots.empty(int(np.diff(self._ways.first).max()))
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
         # An empty place counts as a neighbour at the limit: whoever is farther away does not enter.
         self._limit = np.inf if self.voting_radius is None else float(self.voting_radius) ** 2
@@ -120,10 +129,14 @@ class COMBREL(VirtualSourceTransfer):
         self._choice_at = np.empty(target.n_actions, dtype=np.int64)
         self._near_at = np.empty(self.n_neighbors, dtype=np.int64)
         self._distance_at = np.empty(self.n_neighbors)
+        # Nothing is asked before the first transition. To draw here would take from the chance of a model that is loaded.
+        self._draws_at = np.zeros(target.n_actions) if self.choice == "drawn" else NO_DRAWS
 
     # ---------------------------------------------------------------- observing
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        # Anew with each transition, not with each question: a prediction asked for twice is the same, and leaves no trace.
+        self._draws_at = self._draws(len(self._choice_at))
         if self._seen.n >= self.max_transitions or not (self._first_episode or self.measured == "online"):
             return
         i = self._seen.add(state, action, reward, next_state - state)
@@ -148,24 +161,23 @@ class COMBREL(VirtualSourceTransfer):
     def _electorate(self, i: int) -> np.ndarray:
         """Compliance of transition ``i`` with every mapping; the sample states that now have it among their nearest."""
         assert self.target is not None
-        if i == len(self._tables):
-            self._tables = np.concatenate([self._tables, np.empty_like(self._tables)])
-            self._least = np.concatenate([self._least, np.empty_like(self._least)])
-        action = int(self._seen.actions[i])
+        self._ballots = self._ballots.with_room(i)
+        action, reward = int(self._seen.actions[i]), float(self._seen.rewards[i])
         self._transition_compliance(
             self._seen.states[i],
             self._seen.effects[i],
-            float(self._seen.rewards[i]),
+            reward,
             self._instances,
             self._table,
             self._bandwidths,
             self._compliance_scratch,
-            self._tables[i],
+            self._table_of_one,
         )
-        standstill = self._standstill_compliance(
-            self._seen.effects[i], float(self._seen.rewards[i]), self._instances, self._bandwidths
-        )
-        self._least[i] = self.min_compliance * standstill
+        of_action = slice(self._ways.first[action], self._ways.first[action + 1])
+        compliance = self._table_of_one[self._ways.row[of_action], self._ways.action[of_action]]
+        self._ballots.compliance[i, : len(compliance)] = compliance
+        standstill = self._standstill_compliance(self._seen.effects[i], reward, self._instances, self._bandwidths)
+        self._ballots.least[i] = self.min_compliance * standstill
         n = self._note_neighbor(
             i,
             self._seen.states[i],
@@ -183,24 +195,35 @@ class COMBREL(VirtualSourceTransfer):
         changed = self._vote(
             points,
             self._near[action],
-            self._tables,
-            self._least,
-            self._ways,
-            action,
+            self._ballots,
+            int(self._ways.first[action]),
+            int(self._ways.first[action + 1]),
+            self._draws(len(points)),
             self._choice[action * n_points : (action + 1) * n_points],
         )
         self._switches += changed
         self._renewed.append(points[:changed] + action * n_points)
 
+    def _draws(self, n: int) -> np.ndarray:
+        """Random numbers for so many elections, if the choice is drawn."""
+        return self._rng.random(n) if self.choice == "drawn" else NO_DRAWS
+
     def saved_arrays(self) -> dict[str, np.ndarray]:
         own = {"first_episode": np.array([float(self._first_episode)]), "switches": np.array([float(self._switches)])}
+        if self.choice == "drawn":
+            own |= {"choice": self._choice.astype(np.float64), "draws_at": self._draws_at}
         return {**super().saved_arrays(), **own}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         assert self.target is not None
         self._first_episode = bool(saved["first_episode"][0] > 0.5)
         super().restore(saved)
-        if self._measures:
+        if self.choice == "drawn":
+            first, last = self._ways.first[:-1, None], self._ways.first[1:, None] - 1
+            chosen = saved["choice"].astype(np.int64).reshape(self.target.n_actions, -1)
+            self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
+            self._draws_at = np.clip(saved["draws_at"], 0.0, 1.0)
+        elif self._measures:
             # Once for all: only the last vote counts.
             for action in range(self.target.n_actions):
                 self._vote_at(np.arange(len(self.target.sample_states)), action)
@@ -243,12 +266,12 @@ class COMBREL(VirtualSourceTransfer):
             self._seen.states,
             self._seen.actions,
             n_measured,
-            self._tables,
-            self._least,
-            self._ways,
+            self._ballots,
+            self._ways.first,
             self._limit,
             self._near_at,
             self._distance_at,
+            self._draws_at,
             self._choice_at,
         )
         first = np.maximum(self._choice_at, 0)
@@ -271,7 +294,8 @@ class COMBREL(VirtualSourceTransfer):
         near = self._near.reshape(-1, self.n_neighbors)[pairs]
         voting = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
         chosen = np.maximum(self._choice[pairs], 0)[:, None]
-        compliance = self._tables[np.maximum(near, 0), self._ways.row[chosen], self._ways.action[chosen]]
+        first = self._ways.first[pairs // len(self.target.sample_states)][:, None]
+        compliance = self._ballots.compliance[np.maximum(near, 0), np.maximum(chosen - first, 0)]
         n_voting = voting.sum(axis=1)
         total = np.where(voting, compliance, 0.0).sum(axis=1)
         return np.where(n_voting > 0, total / np.maximum(n_voting, 1), np.nan)
@@ -287,110 +311,3 @@ class COMBREL(VirtualSourceTransfer):
             "transfer/distinct_mappings": len(shares),
             "transfer/transitions_measured": self._seen.n,
         }
-
-
-@compiled
-def note_neighbor(i, state, sample_states, near, distance, changed):
-    """Enter transition ``i`` at every sample state that has it among its nearest.
-
-    :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
-    :param distance: squared distances to them, the limit for none, updated
-    :param changed: receives the points at which it entered
-    :return: how many
-    """
-    n_points, d = sample_states.shape
-    last = near.shape[1] - 1
-    n_changed = 0
-    for p in range(n_points):
-        apart = 0.0
-        for v in range(d):
-            along = sample_states[p, v] - state[v]
-            apart += along * along
-        if apart >= distance[p, last]:
-            continue
-        k = last
-        while k > 0 and distance[p, k - 1] > apart:
-            distance[p, k] = distance[p, k - 1]
-            near[p, k] = near[p, k - 1]
-            k -= 1
-        distance[p, k] = apart
-        near[p, k] = i
-        changed[n_changed] = p
-        n_changed += 1
-    return n_changed
-
-
-@inner
-def best_candidate(near, tables, least, ways, action):
-    """The candidate of ``action`` with the highest mean compliance with the transitions ``near``; -1 if none has enough.
-
-    :param least: float64: of each transition, what the compliances of ``near`` must exceed in the mean
-    """
-    best = -1
-    highest = 0.0
-    for k in range(len(near)):
-        if near[k] >= 0:
-            highest += least[near[k]]
-    for c in range(ways.first[action], ways.first[action + 1]):
-        total = 0.0
-        for k in range(len(near)):
-            if near[k] >= 0:
-                total += tables[near[k], ways.row[c], ways.action[c]]
-        if total > highest:
-            highest = total
-            best = c
-    return best
-
-
-@compiled
-def vote(points, near, tables, least, ways, action, choice):
-    """Renew the choice at some sample states; those where it changed are moved to the front of ``points``.
-
-    :param choice: int64, shape (n_points,), updated
-    :return: how many changed
-    """
-    n_changed = 0
-    for f in range(len(points)):
-        p = points[f]
-        chosen = best_candidate(near[p], tables, least, ways, action)
-        if chosen != choice[p]:
-            choice[p] = chosen
-            points[n_changed] = p
-            n_changed += 1
-    return n_changed
-
-
-@compiled
-def choose_at(state, missing, states, actions, n, tables, least, ways, limit, near, distance, choice):
-    """The candidate for every action with ``missing`` at an exact state, by the same vote; -1 for none.
-
-    :param states: target transitions' states, of which the first ``n`` are measured; ``actions``: their actions
-    :param limit: squared distance from which on a transition does not vote
-    :param near: int64 scratch, shape (n_neighbors,); ``distance``: float64, same shape
-    :param choice: receives the candidates, shape (n_actions,)
-    """
-    last = len(near) - 1
-    for action in range(len(missing)):
-        choice[action] = -1
-        if not missing[action]:
-            continue
-        for k in range(len(near)):
-            near[k] = -1
-            distance[k] = limit
-        for i in range(n):
-            if actions[i] != action:
-                continue
-            apart = 0.0
-            for v in range(len(state)):
-                along = states[i, v] - state[v]
-                apart += along * along
-            if apart >= distance[last]:
-                continue
-            k = last
-            while k > 0 and distance[k - 1] > apart:
-                distance[k] = distance[k - 1]
-                near[k] = near[k - 1]
-                k -= 1
-            distance[k] = apart
-            near[k] = i
-        choice[action] = best_candidate(near, tables, least, ways, action)

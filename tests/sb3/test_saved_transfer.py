@@ -16,6 +16,7 @@ VARIANTS = {
     "pool": lambda: TIMBREL(walk_source(), "pool", mappings="all"),
     "two sources": lambda: COMBREL([walk_source(40), walk_source(60)]),
     "first episode": lambda: COMBREL(walk_source(), measured="first_episode"),
+    "drawn": lambda: COMBREL(walk_source(), choice="drawn"),
     "set": lambda: COMBREL(walk_source(), MappingSet.injective(2, 2, 2, 2), n_neighbors=2),
     "list": lambda: COMBREL(walk_source(), [MAPPING, {"state": [0, None], "action": [1, 0]}], min_compliance=0.0),
     "few transitions": lambda: COMBREL(walk_source(), max_transitions=25, bandwidths=(0.1, 0.1, np.float64(1.0))),
@@ -63,7 +64,7 @@ def test_two_halves_make_the_run_that_was_not_interrupted(name, tmp_path):
         np.testing.assert_array_equal(halves.policy.transfer.choices(), whole.policy.transfer.choices())
 
 
-@pytest.mark.parametrize("name", ["TIMBREL", "COMBREL", "two sources", "first episode"])
+@pytest.mark.parametrize("name", ["TIMBREL", "COMBREL", "two sources", "first episode", "drawn"])
 @pytest.mark.parametrize("steps", [0, 13, 47])
 def test_choices_compliance_and_supply_are_the_same_at_once(name, steps, tmp_path):
     model = small(transfer=VARIANTS[name]())

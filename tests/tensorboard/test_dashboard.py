@@ -169,8 +169,7 @@ def slow_compliance(model):
         mine = np.flatnonzero(transfer._seen.actions[:n] == action)
         apart = ((transfer._seen.states[mine] - transfer.target.sample_states[point]) ** 2).sum(axis=1)
         near = mine[np.argsort(apart, kind="stable")[: transfer.n_neighbors]]
-        row, source_action = transfer._ways.row[candidate], transfer._ways.action[candidate]
-        means.append(np.mean([transfer._tables[i, row, source_action] for i in near]))
+        means.append(transfer._ballots.compliance[near, candidate - transfer._ways.first[action]].mean())
     return np.mean(means)
 
 

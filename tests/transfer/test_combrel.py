@@ -417,6 +417,7 @@ IDENTITY = {"state": [0, 1], "action": [0, 1, 2]}
         {"mappings": MappingSet.injective(2, 2, 3, 3, signs=True)},
         {"measured": "first_episode"},
         {"n_neighbors": 1},
+        {"choice": "drawn", "voting_radius": 0.3},
         {"n_neighbors": 10, "max_transitions": 50},
         {"relevance": True, "relevance_fraction": 0.3},
         {"relevance": True, "measured": "first_episode"},

@@ -1,0 +1,163 @@
+"""Compiled loops of COMBREL's vote: the nearest target transitions choose a candidate by compliance (Algorithm 1)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.compiled import compiled, inner
+
+
+class Ballots(NamedTuple):
+    """What the measured target transitions have to say; transition i speaks about the candidates of its action only.
+
+    :param compliance: float64, shape (n_transitions, most candidates of an action): with each of them, in their order
+    :param least: float64, shape (n_transitions,): what the compliances of the voters must exceed in the mean
+    :param total: float64 scratch, shape (most candidates of an action,)
+    """
+
+    compliance: np.ndarray
+    least: np.ndarray
+    total: np.ndarray
+
+    @classmethod
+    def empty(cls, most_candidates: int, capacity: int = 64) -> "Ballots":
+        """Room for ``capacity`` transitions."""
+        return cls(np.empty((capacity, most_candidates)), np.empty(capacity), np.empty(most_candidates))
+
+    def with_room(self, i: int) -> "Ballots":
+        """Itself, or a copy of twice the size if transition ``i`` would not fit."""
+        if i < len(self.least):
+            return self
+        grown = (np.concatenate([array, np.empty_like(array)]) for array in (self.compliance, self.least))
+        return Ballots(*grown, self.total)
+
+
+@compiled
+def note_neighbor(i, state, sample_states, near, distance, changed):
+    """Enter transition ``i`` at every sample state that has it among its nearest.
+
+    :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
+    :param distance: squared distances to them, the limit for none, updated
+    :param changed: receives the points at which it entered
+    :return: how many
+    """
+    n_points, d = sample_states.shape
+    last = near.shape[1] - 1
+    n_changed = 0
+    for p in range(n_points):
+        apart = 0.0
+        for v in range(d):
+            along = sample_states[p, v] - state[v]
+            apart += along * along
+        if apart < distance[p, last]:
+            insert_neighbor(i, apart, near[p], distance[p])
+            changed[n_changed] = p
+            n_changed += 1
+    return n_changed
+
+
+@inner
+def insert_neighbor(i, apart, near, distance):
+    """Enter a transition among the nearest of one state, the nearest first; the last one leaves."""
+    k = len(near) - 1
+    while k > 0 and distance[k - 1] > apart:
+        distance[k] = distance[k - 1]
+        near[k] = near[k - 1]
+        k -= 1
+    distance[k] = apart
+    near[k] = i
+
+
+@inner
+def elect(near, compliance, least, n_candidates, draw, total):
+    """The candidate that the transitions ``near`` choose; -1 if none has more than the least in the mean.
+
+    :param n_candidates: of the action
+    :param draw: a random number from [0, 1): each that has enough is chosen with a probability in proportion to its mean
+        compliance; below 0: the one with the highest is (of equal ones the first)
+    :param total: see ``Ballots``
+    """
+    bar = 0.0
+    total[:n_candidates] = 0.0
+    for k in range(len(near)):
+        voter = near[k]
+        if voter >= 0:
+            bar += least[voter]
+            for c in range(n_candidates):
+                total[c] += compliance[voter, c]
+    best = -1
+    highest = bar
+    mass = 0.0
+    for c in range(n_candidates):
+        if total[c] > bar:
+            mass += total[c]
+        if total[c] > highest:
+            highest = total[c]
+            best = c
+    if draw < 0.0 or best < 0:
+        return best
+    mass *= draw
+    for c in range(n_candidates):
+        if total[c] > bar:
+            mass -= total[c]
+            # Rounding may leave a little to the end.
+            if mass < 0.0:
+                return c
+    return best
+
+
+@compiled
+def vote(points, near, ballots, first, last, draws, choice):
+    """Renew the choice at some sample states; those where it changed are moved to the front of ``points``.
+
+    :param first: first candidate of the action; ``last``: one past its last
+    :param draws: a random number for each of ``points``; or nothing, shape (0,): the best is chosen (see ``elect``)
+    :param choice: int64, shape (n_points,), updated
+    :return: how many changed
+    """
+    n_changed = 0
+    for f in range(len(points)):
+        p = points[f]
+        draw = draws[f] if len(draws) > 0 else -1.0
+        chosen = elect(near[p], ballots.compliance, ballots.least, last - first, draw, ballots.total)
+        if chosen >= 0:
+            chosen += first
+        if chosen != choice[p]:
+            choice[p] = chosen
+            points[n_changed] = p
+            n_changed += 1
+    return n_changed
+
+
+@compiled
+def choose_at(state, missing, states, actions, n, ballots, first, limit, near, distance, draws, choice):
+    """The candidate for every action with ``missing`` at an exact state, by the same vote; -1 for none.
+
+    :param states: target transitions' states, of which the first ``n`` are measured; ``actions``: their actions
+    :param first: see ``CandidateArrays``
+    :param limit: squared distance from which on a transition does not vote
+    :param near: int64 scratch, shape (n_neighbors,); ``distance``: float64, same shape
+    :param draws: a random number for each action; or nothing, shape (0,)
+    :param choice: receives the candidates, shape (n_actions,)
+    """
+    last = len(near) - 1
+    for action in range(len(missing)):
+        choice[action] = -1
+        if not missing[action]:
+            continue
+        for k in range(len(near)):
+            near[k] = -1
+            distance[k] = limit
+        for i in range(n):
+            if actions[i] != action:
+                continue
+            apart = 0.0
+            for v in range(len(state)):
+                along = states[i, v] - state[v]
+                apart += along * along
+            if apart < distance[last]:
+                insert_neighbor(i, apart, near, distance)
+        draw = draws[action] if len(draws) > 0 else -1.0
+        n_candidates = first[action + 1] - first[action]
+        chosen = elect(near, ballots.compliance, ballots.least, n_candidates, draw, ballots.total)
+        choice[action] = chosen if chosen < 0 else first[action] + chosen
