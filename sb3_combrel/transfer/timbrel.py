@@ -31,7 +31,7 @@ class TIMBREL(VirtualSourceTransfer):
 
     :param source: source instances, a path to them, or a list of several
     :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of
-        ``mappings`` drawn anew at each transfer (the baseline of the iCub experiment); or "pool" for the translations
+        ``mappings`` drawn anew with each transition (the baseline of the iCub experiment); or "pool" for the translations
         by all of ``mappings`` in one pool (Figure 3)
     :param mappings: the set that "random" and "pool" draw from: "injective", "surjective", "all", "balanced", the
         paper's sets, a list of mappings or a ``MappingSet``
@@ -83,6 +83,7 @@ class TIMBREL(VirtualSourceTransfer):
                 f"mapping must be one mapping or one for each of the {target.n_actions} target actions, got {len(given)}"
             )
         self._fixed = None if isinstance(given, str) else self._candidate_of_each_action(len(given))
+        self._span_at = self._span(np.arange(target.n_actions))
         self._renew_all()
 
     def _candidate_of_each_action(self, n_given: int) -> np.ndarray:
@@ -115,6 +116,10 @@ class TIMBREL(VirtualSourceTransfer):
         return int(np.diff(self._ways.first).max()) if self.mapping == "pool" else 1
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        # Random ones anew with each transition, not with each question: a prediction asked for twice is the same, and
+        # leaves no trace.
+        if self.mapping == "random":
+            self._span_at = self._span(np.arange(len(self._span_at[0])))
         if not self.relevance:
             return
         self._seen.add(state, action, reward, next_state - state)
@@ -138,8 +143,6 @@ class TIMBREL(VirtualSourceTransfer):
         return self._draw(self.target.sample_states[pairs % n_points], own_weight, first, np.where(known, first, last))
 
     def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
-        assert self.target is not None
         if (own_weight >= self._rules.threshold).all():
             return self._nothing_for(len(own_weight))
-        first, last = self._span(np.arange(self.target.n_actions))
-        return self._draw_at(state, own_weight, first, last)
+        return self._draw_at(state, own_weight, *self._span_at)

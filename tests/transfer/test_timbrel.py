@@ -68,7 +68,7 @@ def test_the_pool_holds_the_translations_by_all_mappings(source, task):
     assert_supplies(method, task, lambda action: [(source, ONE, action), (source, OTHER, action)], 0.1)
 
 
-def test_random_draws_a_mapping_of_the_set_at_each_transfer(source, task):
+def test_random_draws_a_mapping_of_the_set_with_each_transition(source, task):
     method = bound(TIMBREL(source, "random", mappings=[ONE, OTHER], breadth=0.2), task)
     state = np.full(3, 0.4)
     possible = [
@@ -76,7 +76,13 @@ def test_random_draws_a_mapping_of_the_set_at_each_transfer(source, task):
     ]
     drawn = []
     for _ in range(60):
+        method.observe(state, 0, -1.0, state, False)
+        chance = method._rng.bit_generator.state
+        before = method.supply_at(state, np.array([0.0, 1.0])).effect[0].copy()
         supply = method.supply_at(state, np.array([0.0, 1.0]))
+        # Whoever asks twice hears the same and leaves no trace.
+        np.testing.assert_array_equal(supply.effect[0, : supply.count[0]], before[: supply.count[0]])
+        assert method._rng.bit_generator.state == chance
         effects = supply.effect[0, : supply.count[0]]
         [which] = [k for k, p in enumerate(possible) if p.shape == effects.shape and np.allclose(p, effects)]
         drawn.append(which)
