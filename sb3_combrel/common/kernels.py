@@ -94,12 +94,12 @@ def near_instances(instances, action, state, breadth, min_weight, min_fraction, 
     instances.searches[0] += 1
     search = instances.searches[0]
     for b in range(n_before):
-        i = np.int64(indices[b])
-        if i < count:
-            instances.seen[action, i] = search
-            w = np.exp(squared_distance(state, instances.state[action, i]) * scale)
+        before = np.int64(indices[b])
+        if before < count:
+            instances.seen[action, before] = search
+            w = np.exp(squared_distance(state, instances.state[action, before]) * scale)
             if w >= min_weight:
-                length, total = insert_by_weight(indices, weights, start, length, total, i, w, min_fraction)
+                length, total = insert_by_weight(indices, weights, start, length, total, before, w, min_fraction)
     if length > 0:
         farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
     n_blocks = (count + BLOCK - 1) // BLOCK

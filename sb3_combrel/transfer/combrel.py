@@ -294,7 +294,7 @@ class COMBREL(VirtualSourceTransfer):
         near = self._near.reshape(-1, self.n_neighbors)[pairs]
         voting = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
         chosen = np.maximum(self._choice[pairs], 0)[:, None]
-        first = self._ways.first[pairs // len(self.target.sample_states)][:, None]
+        first = self._ways.first[pairs // self._near.shape[1]][:, None]
         compliance = self._ballots.compliance[np.maximum(near, 0), np.maximum(chosen - first, 0)]
         n_voting = voting.sum(axis=1)
         total = np.where(voting, compliance, 0.0).sum(axis=1)

@@ -28,8 +28,10 @@ class Ballots(NamedTuple):
         """Itself, or a copy of twice the size if transition ``i`` would not fit."""
         if i < len(self.least):
             return self
-        grown = (np.concatenate([array, np.empty_like(array)]) for array in (self.compliance, self.least))
-        return Ballots(*grown, self.total)
+        return self._replace(
+            compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
+            least=np.concatenate([self.least, np.empty_like(self.least)]),
+        )
 
 
 @compiled

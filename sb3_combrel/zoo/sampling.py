@@ -49,6 +49,7 @@ def sample_combrel_params(trial: Trial, n_actions: int, n_envs: int, additional_
     of_transfer = {
         "breadth": _transfer_breadth(trial),
         "n_neighbors": trial.suggest_int(f"{OF_TRANSFER}n_neighbors", 1, 10, log=True),
+        "choice": trial.suggest_categorical(f"{OF_TRANSFER}choice", ["best", "drawn"]),
         "voting_radius": trial.suggest_categorical(f"{OF_TRANSFER}voting_radius", [None, 0.2, 0.4, 0.8]),
         "min_compliance": trial.suggest_float(f"{OF_TRANSFER}min_compliance", 0.0, 1.5),
         "relevance": trial.suggest_categorical(f"{OF_TRANSFER}relevance", [False, True]),

@@ -196,6 +196,7 @@ class TestTuning:
             "transfer_min_compliance",
             "transfer_relevance",
             "transfer_voting_radius",
+            "transfer_choice",
         }
         # They take the place of those in the configuration; what was not drawn stays.
         options = ("--storage", url, "--study-name", "car", "--trial-id", 1, "--eval-freq", -1)
