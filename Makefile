@@ -2,6 +2,7 @@
 # make test    all tests, the slow ones too
 # make bench   speed and memory                make lint, type, format, commit-checks    as in Stable-Baselines3
 # make icub    the arm of the iCub with and without transfer from its torso; tables and figure in icub_experiment/
+# make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
@@ -23,7 +24,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard icub icub-figures icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard icub icub-figures icub-breadths icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -49,6 +50,13 @@ icub-figures: icub
 	cp icub_experiment/learning_curves.png docs/figures/icub_learning_curves.png
 	cp icub_experiment/summary.csv docs/results/icub.csv
 	cp icub_experiment/tables.md docs/results/icub.md
+
+# Takes its table into the documentation as well.
+icub-breadths: $(VENV)/.installed-demo
+	$(BIN)/python -m sb3_combrel.experiments.breadths $(ICUB_ARGS)
+	mkdir -p docs/results
+	cp breadths_experiment/summary.csv docs/results/icub_breadths.csv
+	cp breadths_experiment/tables.md docs/results/icub_breadths.md
 
 # ICUB_ARGS="--task arm --look primitives", for instance.
 icub-video: $(VENV)/.installed-all gl

@@ -68,16 +68,24 @@ def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
     return Saving(steps, float(interval.low), float(interval.high), share, float(test.pvalue))
 
 
+def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
+    """
+    Episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
+
+    :param steps: steps of each episode, shape (n_runs, n_episodes)
+    """
+    if steps.shape[1] < window:
+        return np.full(len(steps), np.inf)
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, window, axis=1), axis=-1)
+    good = medians <= threshold
+    return np.where(good.any(axis=1), good.argmax(axis=1) + float(window), np.inf)
+
+
 def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
     """
     Environment steps of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
 
     :param steps: steps of each episode, shape (n_runs, n_episodes)
     """
-    reached = np.full(len(steps), np.inf)
-    if steps.shape[1] >= window:
-        medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, window, axis=1), axis=-1)
-        for n, good in enumerate(medians <= threshold):
-            if good.any():
-                reached[n] = steps[n, : int(good.argmax()) + window].sum()
-    return reached
+    episodes = episodes_to_reach(steps, threshold, window)
+    return np.array([each[: int(n)].sum() if np.isfinite(n) else np.inf for each, n in zip(steps, episodes, strict=True)])
