@@ -70,6 +70,10 @@ def draw_smoothed_curves(steps: Mapping[str, np.ndarray], path: Path, title: str
         episodes = np.arange(window, samples.shape[1] + 1)
         axes.plot(episodes, mean, color=colour, label=f"{method} ({len(samples)} runs)")
         axes.fill_between(episodes, np.maximum(low, 0), high, color=colour, alpha=0.15, linewidth=0)
+    # All that differs happens in the first tenth.
+    axes.set_xscale("log")
+    axes.set_xlim(window, samples.shape[1])
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("episode")
     axes.set_ylabel(f"commands (median of {window} episodes)")
     axes.set_title(title)
