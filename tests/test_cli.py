@@ -180,7 +180,13 @@ class TestDemo:
         folder = tmp_path / "output"
         command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--episodes", "20"]
         process = subprocess.Popen(
-            [*command, "--workers", "2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+            [*command, "--workers", "2"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            # Whoever runs the tests in a shell's background has them, and all they start, ignore the signal.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         deadline = time.monotonic() + 300
         while not list(folder.glob("runs/*.zip")) and process.poll() is None and time.monotonic() < deadline:
