@@ -40,7 +40,7 @@ dashboard: $(VENV)/.installed-demo
 	cp dashboard/custom_scalars.png docs/figures/tensorboard_custom_scalars.png
 	cp dashboard/images.png docs/figures/tensorboard_images.png
 
-# A quarter of an hour on two cores; a later call goes on with what is there. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
+# Half an hour on two cores; a later call goes on with what is there. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
 icub: $(VENV)/.installed-demo
 	$(BIN)/python -m sb3_combrel.experiments.ball_striking $(ICUB_ARGS)
 
