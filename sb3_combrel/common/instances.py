@@ -1,15 +1,14 @@
 """Experience of one task, in unit coordinates, kept by action for compiled code."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled
 
 BLOCK = 8
 
 
-class InstanceArrays(NamedTuple):
+class InstanceArrays(ArrayStruct):
     """Instances by action; those of action ``a`` are the first ``count[a]`` along the second axis.
 
     Experience comes as trajectories, so ``BLOCK`` instances in a row lie close together: the box around each block
@@ -31,7 +30,7 @@ class InstanceArrays(NamedTuple):
     effect: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
-    count: np.ndarray  # type: ignore[assignment]
+    count: np.ndarray
     block_low: np.ndarray
     block_high: np.ndarray
     gap: np.ndarray
@@ -96,7 +95,7 @@ class InstanceArrays(NamedTuple):
         """The same instances with twice the room."""
         n_actions, capacity, n_variables = self.state.shape
         larger = InstanceArrays.empty(n_actions, n_variables, 2 * capacity)
-        for old, new in zip(self, larger, strict=True):
+        for old, new in zip(self.arrays().values(), larger.arrays().values(), strict=True):
             new[tuple(slice(n) for n in old.shape)] = old
         return larger
 

@@ -5,17 +5,16 @@ them empty, few of them long. One slab with slots of doubling size keeps them co
 them without pointers.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import inner
 
 SMALLEST_SLOT = 4
 N_SIZE_CLASSES = 26
 
 
-class Pool(NamedTuple):
+class Pool(ArrayStruct):
     """Lists of (index, weight); list ``p`` is ``index[start[p] : start[p] + length[p]]`` and the same of ``weight``.
 
     :param index: int32, shape (capacity,)
@@ -28,7 +27,7 @@ class Pool(NamedTuple):
     :param full: bool, shape (1,): the slab was too small for what was last asked of it
     """
 
-    index: np.ndarray  # type: ignore[assignment]
+    index: np.ndarray
     weight: np.ndarray
     start: np.ndarray
     length: np.ndarray
@@ -57,7 +56,7 @@ class Pool(NamedTuple):
             return self
         self.full[0] = False
         more = len(self.index)
-        return self._replace(
+        return self.replace(
             index=np.concatenate([self.index, np.empty(more, dtype=np.int32)]),
             weight=np.concatenate([self.weight, np.empty(more, dtype=np.float64)]),
         )

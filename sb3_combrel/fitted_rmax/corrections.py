@@ -10,10 +10,9 @@ Where the agent does make progress nothing is corrected: values that are true al
 beside it would make every other path look better than the one that works.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, compiled_and_inlined, inlined, inner
 from sb3_combrel.common.kernels import interpolate
 
@@ -25,7 +24,7 @@ PATIENCE = 10
 VISIT_TABLE_SIZE = 1 << 14
 
 
-class CorrectionArrays(NamedTuple):
+class CorrectionArrays(ArrayStruct):
     """Remembered states, found by an open-addressing hash table of the cells they lie in.
 
     :param table: int32, shape (power of two,): number of a remembered state, -1 for none
@@ -41,7 +40,7 @@ class CorrectionArrays(NamedTuple):
     key: np.ndarray
     state: np.ndarray
     value: np.ndarray
-    count: np.ndarray  # type: ignore[assignment]
+    count: np.ndarray
     visit_key: np.ndarray
     visits: np.ndarray
 
@@ -80,7 +79,7 @@ class CorrectionArrays(NamedTuple):
         larger = CorrectionArrays.empty(self.state.shape[1], 2 * capacity)
         larger.key[:n], larger.state[:n], larger.value[:n] = self.key, self.state, self.value
         larger.count[0] = n
-        larger = larger._replace(visit_key=self.visit_key, visits=self.visits)
+        larger = larger.replace(visit_key=self.visit_key, visits=self.visits)
         note_all(larger)
         return larger
 

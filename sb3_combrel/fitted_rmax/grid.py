@@ -3,15 +3,14 @@
 import os
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.kernels import interpolate
 
 
-class GridArrays(NamedTuple):
+class GridArrays(ArrayStruct):
     """What compiled code needs to know of a grid.
 
     :param shape: int64, shape (n_variables,): points along each variable

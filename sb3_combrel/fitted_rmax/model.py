@@ -13,8 +13,8 @@ from sb3_combrel.fitted_rmax.grid import StateGrid
 from sb3_combrel.fitted_rmax.model_kernels import (
     ModelArrays,
     Scratch,
+    enter,
     leave_lists,
-    put_and_enter,
     renew_predecessors,
     settle,
     worth_settling,
@@ -90,9 +90,9 @@ class KernelModel:
         self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
         self.scratch = Scratch.for_grid(grid)
         self._worth_settling = SameTypes(worth_settling)
-        self._put_and_enter = SameTypes(put_and_enter)
+        self._enter_lists, self._settle = SameTypes(enter), SameTypes(settle)
         self._progress = np.empty(2, dtype=np.int64)
-        self._no_supply = Supply.none(MOST_PAIRS_AT_ONCE, grid.n_variables)
+        self._no_supply = Supply.empty(MOST_PAIRS_AT_ONCE, grid.n_variables)
         self.list_room = list_room(min_fraction)
 
     @property
@@ -124,7 +124,7 @@ class KernelModel:
             larger = self._of_instances()
             for name, array in larger.items():
                 array[:, :room] = getattr(self.arrays, name)
-            self.arrays = self.arrays._replace(**larger)
+            self.arrays = self.arrays.replace(**larger)
         return count, np.empty(0, dtype=np.int64)
 
     def _of_instances(self) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class KernelModel:
     ) -> np.ndarray:
         """Put an instance into its slot and into the lists it reaches; the pairs whose list has it."""
         self._progress[:] = -1, 0
-        while not self._put_and_enter(
+        while not self._enter_lists(
             self.instances,
             self.arrays,
             self.grid.arrays,
@@ -163,7 +163,7 @@ class KernelModel:
     def make_room(self) -> None:
         """Grow the pools that were too small for what was last asked of them."""
         pools = {name: getattr(self.arrays, name).with_room() for name in ("lists", "rows", "predecessors")}
-        self.arrays = self.arrays._replace(**pools)
+        self.arrays = self.arrays.replace(**pools)
 
     def _leave(self, action: int, slot: int) -> np.ndarray:
         if self.arrays.members[action, slot] == 0:
@@ -202,7 +202,7 @@ class KernelModel:
             supply = self.supply_for(some)
             done = 0
             while done < len(some):
-                done = settle(
+                done = self._settle(
                     self.arrays,
                     self.instances,
                     self.grid.arrays,
@@ -233,7 +233,7 @@ class KernelModel:
         :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
         :param total: the sums of their weights, shape (n_pairs,); used where they differ from the new ones by rounding only
         """
-        self.arrays = self.arrays._replace(**self._of_instances())
+        self.arrays = self.arrays.replace(**self._of_instances())
         note_effects(self.instances, self.arrays, self.grid.arrays)
         scratch = np.empty(self.grid.n_variables), np.empty(self.list_room, np.int32), np.empty(self.list_room)
         search = (

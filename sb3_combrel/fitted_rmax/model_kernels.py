@@ -1,16 +1,15 @@
 """Compiled loops of the kernel model: which instances stand behind each state-action pair, and what they predict."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.instances import put_instance
 from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
 from sb3_combrel.common.pool import Pool, reserve
 
 
-class ModelArrays(NamedTuple):
+class ModelArrays(ArrayStruct):
     """The state of the kernel model; pair ``action * n_points + point`` is one state-action pair of the grid.
 
     :param lists: kept instances of each pair, heaviest first, with their kernel weights
@@ -46,7 +45,7 @@ class ModelArrays(NamedTuple):
     corner_weight: np.ndarray
 
 
-class Scratch(NamedTuple):
+class Scratch(ArrayStruct):
     """Work space of the compiled loops, allocated once.
 
     :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
@@ -140,9 +139,11 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
             return found
 
 
-@inlined
-def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, progress):
-    """Put an instance into the lists of all pairs that it reaches.
+@compiled
+def enter(
+    instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress
+):
+    """Write an instance to its slot, and put it into the lists of all pairs that it reaches.
 
     :param kernel: (breadth, min_weight, min_fraction)
     :param progress: int64, shape (2,): pairs in reach, and how many of them are done; {-1, 0} at first
@@ -152,6 +153,7 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
     n_points = len(arrays.n_optimistic)
     first_pair = action * n_points
     if progress[0] < 0:
+        put_instance(instances, action, slot, state, next_state, reward, terminated)
         note_corners(arrays, instances.effect[action, slot], grid, action, slot)
         entry = arrays.entry[first_pair : first_pair + n_points]
         progress[0] = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, entry, scratch)
@@ -176,16 +178,6 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, pro
             arrays.known[pair] = True
         progress[1] += 1
     return True
-
-
-@compiled
-def put_and_enter(
-    instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress
-):
-    """Write an instance to its slot, unless that was done before, and :func:`enter` it into lists; returns as that does."""
-    if progress[0] < 0:
-        put_instance(instances, action, slot, state, next_state, reward, terminated)
-    return enter(instances, arrays, grid, kernel, threshold, action, slot, scratch, progress)
 
 
 @compiled
@@ -227,7 +219,7 @@ def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch
     return changed
 
 
-@inlined
+@inner
 def note_corners(arrays, effect, grid, action, slot):
     """Work out ``corner_low``, ``corner_offset`` and ``corner_weight`` of an instance: the same for all grid points."""
     low = arrays.corner_low[action, slot]
@@ -287,7 +279,7 @@ def next_power(weight):
     return 2.0 ** np.ceil(np.log2(weight))
 
 
-@inlined
+@inner
 def note_predecessor(predecessors, to, point, weight):
     """Enter ``point`` among those that lead ``to`` a point with a probability of ``weight``; False if the pool must grow.
 
@@ -310,7 +302,7 @@ def note_predecessor(predecessors, to, point, weight):
     return True
 
 
-@inlined
+@inner
 def store_row(arrays, pair, point, n_touched, discount, scratch):
     """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and have predecessors noted.
 
@@ -342,7 +334,7 @@ def store_row(arrays, pair, point, n_touched, discount, scratch):
     return room
 
 
-@inlined
+@inner
 def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
 
@@ -413,12 +405,6 @@ def worth_settling(arrays, pairs, news):
 
 @compiled
 def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
-    """:func:`settle_pairs` for a caller who plans later."""
-    return settle_pairs(arrays, instances, grid, gamma, pairs, done, supply, scratch)
-
-
-@inner
-def settle_pairs(arrays, instances, grid, gamma, pairs, done, supply, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
 
     :return: how many of them are done; fewer than all if a pool must grow first

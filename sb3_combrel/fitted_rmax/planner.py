@@ -1,20 +1,18 @@
 """Dynamic programming on the grid: changes are passed on to predecessors, with a bound on the work of each step."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner
 from sb3_combrel.common.kernels import corners_of
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
-from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel
-from sb3_combrel.fitted_rmax.model_kernels import settle_pairs
+from sb3_combrel.fitted_rmax.model import KernelModel
 
 EXPLOITATION_SWEEPS = 300
 NOWHERE = np.empty(0)
 
 
-class SweepQueue(NamedTuple):
+class SweepQueue(ArrayStruct):
     """Grid points that wait for a backup, in a ring, and what is known of each point's actions without one.
 
     :param ring: int32, shape (n_points,)
@@ -128,7 +126,7 @@ def back_up(values, arrays, queue, point, bounds, tolerance):
     values[point] = min(best, bounds[1])
 
 
-@inlined
+@inner
 def take_over(values, arrays, queue, pair, bounds, tolerance):
     """Bring V of the pair's point up to date when nothing but the pair's row has changed."""
     action = pair // len(values)
@@ -175,8 +173,8 @@ def back_up_around(values, arrays, queue, state, grid, bounds, tolerance, scratc
     return backups
 
 
-@inlined
-def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
+@compiled
+def sweep(values, arrays, queue, changed, grid, bounds, tolerance, max_backups, around, scratch):
     """Take over the pairs ``changed``, then back up the points that wait, in the order of their coming.
 
     With the largest change first, states from which no known way leads on would be backed up again and again, their
@@ -185,13 +183,15 @@ def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
     :param values: float64, shape (n_points,), updated in place
     :param bounds: (min_value, max_value)
     :param max_backups: of those that wait; the rest waits for the next call
+    :param around: a state around which all is backed up, unit coordinates; or nothing, shape (0,)
     :return: backups done
     """
     for c in range(len(changed)):
         take_over(values, arrays, queue, changed[c], bounds, tolerance)
         announce(values, arrays, queue, changed[c] % len(values), tolerance)
-    backups = 0
-    while backups < max_backups:
+    backups = len(changed)
+    most = backups + max_backups
+    while backups < most:
         point = pop(queue)
         if point < 0:
             break
@@ -200,22 +200,6 @@ def sweep(values, arrays, queue, changed, bounds, tolerance, max_backups):
         back_up(values, arrays, queue, point, bounds, tolerance)
         backups += 1
         announce(values, arrays, queue, point, tolerance)
-    return backups + len(changed)
-
-
-@compiled
-def settle_and_sweep(
-    values, arrays, instances, queue, pairs, supply, grid, gamma, bounds, tolerance, max_backups, around, scratch
-):
-    """``settle_pairs`` and :func:`sweep` in one call: handing over arrays takes as long as the work of a common step.
-
-    :param pairs: at most MOST_PAIRS_AT_ONCE
-    :param around: a state around which all is backed up, unit coordinates; or nothing, shape (0,)
-    :return: backups done; -1, and nothing swept, if a pool of the model must grow first
-    """
-    if settle_pairs(arrays, instances, grid, gamma, pairs, np.int64(0), supply, scratch) < len(pairs):
-        return -1
-    backups = sweep(values, arrays, queue, pairs, bounds, tolerance, max_backups)
     if len(around) > 0:
         backups += back_up_around(values, arrays, queue, around, grid, bounds, tolerance, scratch)
     return backups
@@ -270,7 +254,7 @@ class Planner:
         self.bounds = (float(min_value), float(max_value))
         self.values = np.full(model.grid.n_points, float(max_value))
         self.queue = SweepQueue.empty(self.values, model.n_actions)
-        self._settle_and_sweep = SameTypes(settle_and_sweep)
+        self._sweep = SameTypes(sweep)
         self._sweep_all = SameTypes(sweep_all)
         self._exploitation: np.ndarray | None = None
 
@@ -283,34 +267,21 @@ class Planner:
         :return: backups done
         """
         self._exploitation = None
-        backups = 0
-        while len(pairs) > MOST_PAIRS_AT_ONCE:
-            backups += self._update_some(pairs[:MOST_PAIRS_AT_ONCE], 0, NOWHERE)
-            pairs = pairs[MOST_PAIRS_AT_ONCE:]
-        return backups + self._update_some(pairs, max_backups, around)
-
-    def _update_some(self, pairs: np.ndarray, max_backups: int, around: np.ndarray) -> int:
         model = self.model
-        supply = model.supply_for(pairs)
-        while True:
-            backups: int = self._settle_and_sweep(
-                self.values,
-                model.arrays,
-                model.instances,
-                self.queue,
-                pairs,
-                supply,
-                model.grid.arrays,
-                model.gamma,
-                self.bounds,
-                self.tolerance,
-                max_backups,
-                around,
-                model.scratch,
-            )
-            if backups >= 0:
-                return backups
-            model.make_room()
+        model.settle(pairs)
+        backups: int = self._sweep(
+            self.values,
+            model.arrays,
+            self.queue,
+            pairs,
+            model.grid.arrays,
+            self.bounds,
+            self.tolerance,
+            max_backups,
+            around,
+            model.scratch,
+        )
+        return backups
 
     def sweep_all(self, most_passes: int) -> int:
         """Back up all points up to ``most_passes`` times, where most of the model is new; backups done."""

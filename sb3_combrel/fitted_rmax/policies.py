@@ -21,7 +21,7 @@ from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import KernelModel
 from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
-from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, look_and_choose
+from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, find_near
 from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
@@ -86,7 +86,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.max_backups = max(1, CORNERS_A_STEP // 2**self.scaling.n_variables) if max_backups is None else max_backups
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
         self._scale_into_box = SameTypes(scale_into_box)
-        self._choose, self._look_and_choose = SameTypes(choose), SameTypes(look_and_choose)
+        self._find_near, self._choose = SameTypes(find_near), SameTypes(choose)
         self._flat = (-1, self.scaling.n_variables)
         self.n_actions = int(action_space.n)
         self._first_action = int(action_space.start)
@@ -127,7 +127,7 @@ class FittedRMaxPolicy(BasePolicy):
             self._widen(self.transfer.lowest_reward())
         self.corrections = CorrectionArrays.empty(grid.n_variables)
         self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
-        self._no_supply = Supply.none(self.n_actions, grid.n_variables)
+        self._no_supply = Supply.empty(self.n_actions, grid.n_variables)
         self._q = np.empty(self.n_actions)
         self._unsettled: list[np.ndarray] = []
         self._warned_outside = False
@@ -191,16 +191,25 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _choose_at(self, state: np.ndarray, values: np.ndarray, visitor: tuple[int, float, int]) -> int:
         """Work out ``_q`` at a state, and note a visit there (see ``choose``); the best action, -1 if several are."""
-        instances = self.model.instances
-        threshold = self.model.exploration_threshold
-        rest = (threshold, self.gamma, values, self.corrections, self.model.grid.arrays, self.planner.bounds)
-        output = (self._query, self._q, visitor)
-        waits = self.transfer is not None
-        best = int(self._look_and_choose(instances, state, self.kernel, *rest, self._no_supply, *output, waits))
-        if best == -2:
-            assert self.transfer is not None
+        model = self.model
+        least = self._find_near(model.instances, state, self.kernel, self._query)
+        supply = self._no_supply
+        if self.transfer is not None and least < model.exploration_threshold:
             supply = self.transfer.supply_at(state, self._query.total)
-            best = int(self._choose(instances, state, *rest, supply, *output))
+        best: int = self._choose(
+            model.instances,
+            state,
+            model.exploration_threshold,
+            self.gamma,
+            values,
+            self.corrections,
+            model.grid.arrays,
+            self.planner.bounds,
+            supply,
+            self._query,
+            self._q,
+            visitor,
+        )
         return best
 
     def explore(self, state: np.ndarray, episode: int) -> int:

@@ -1,15 +1,14 @@
 """Q at an exact state: from the instances near it, not from the grid's Q."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.kernels import near_instances
 from sb3_combrel.fitted_rmax.corrections import corrected_value, visit
 
 
-class QueryScratch(NamedTuple):
+class QueryScratch(ArrayStruct):
     """Work space and results of a query at one state.
 
     :param index: int32, shape (n_actions, list room): kept instances of each action, nearest first
@@ -19,7 +18,7 @@ class QueryScratch(NamedTuple):
     :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
     """
 
-    index: np.ndarray  # type: ignore[assignment]
+    index: np.ndarray
     weight: np.ndarray
     length: np.ndarray
     total: np.ndarray
@@ -43,13 +42,15 @@ class QueryScratch(NamedTuple):
         )
 
 
-@inner
+@compiled
 def find_near(instances, state, kernel, query):
     """Fill ``query`` with the instances that the kernel keeps at ``state``, for every action.
 
     :param kernel: (breadth, min_weight, min_fraction)
+    :return: the least sum of weights that an action has
     """
     breadth, min_weight, min_fraction = kernel
+    least = np.inf
     for action in range(len(query.length)):
         query.length[action], query.total[action] = near_instances(
             instances,
@@ -62,6 +63,8 @@ def find_near(instances, state, kernel, query):
             query.weight[action],
             query.length[action],
         )
+        least = min(least, query.total[action])
+    return least
 
 
 @inlined
@@ -128,8 +131,8 @@ def q_values(instances, state, threshold, gamma, values, corrections, grid, boun
         q[action] = min(max(value, bounds[0]), bounds[1])
 
 
-@inner
-def find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
+@compiled
+def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
     """Action values at a state, from the lists in ``query``, and what is to be remembered of the visit.
 
     :param visitor: see ``corrections.visit``; an episode of -1: nobody is there, nothing is remembered
@@ -147,26 +150,3 @@ def find_best(instances, state, threshold, gamma, values, corrections, grid, bou
     if visitor[0] >= 0:
         visit(values, corrections, state, q[best], visitor, grid, query)
     return -1 if ties > 0 else best
-
-
-@compiled
-def look_and_choose(
-    instances, state, kernel, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor, waits
-):
-    """:func:`find_near` and :func:`find_best` in one call: handing over arrays takes as long as the work.
-
-    :param waits: whether to leave off after the first, and return -2, where an action's own instances do not reach the
-        threshold: for a caller that has a supply to make before it calls :func:`choose`
-    """
-    find_near(instances, state, kernel, query)
-    if waits:
-        for action in range(len(q)):
-            if query.total[action] < threshold:
-                return -2
-    return find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)
-
-
-@compiled
-def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
-    """:func:`find_best`, for a caller whom :func:`look_and_choose` left waiting."""
-    return find_best(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor)

@@ -82,7 +82,7 @@ class Transfer(ABC):
         :param pairs: shape (n,)
         :param own_weight: sum of the weights of each pair's own instances, shape (n,)
         :param known: pairs that need none, bool, shape (n,)
-        :return: for each pair instances that together with its own reach the threshold, or none
+        :return: for each pair instances that together with its own reach the threshold, or none; good until the next call
         """
 
     @abstractmethod

@@ -253,7 +253,8 @@ class COMBREL(VirtualSourceTransfer):
             return self._nothing_for(len(pairs))
         first = np.maximum(chosen, 0)
         states = self.target.sample_states[pairs % len(self.target.sample_states)]
-        return self._draw(states, own_weight, first, np.where(chosen < 0, first, first + 1))
+        self._supply = self._draw(states, own_weight, first, np.where(chosen < 0, first, first + 1), self._supply)
+        return self._supply
 
     def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
         missing = own_weight < self._rules.threshold

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, compiled_fast, inner
 from sb3_combrel.common.instances import InstanceArrays
 
@@ -28,18 +29,18 @@ class Bandwidths(NamedTuple):
     reward: float
 
 
-class MappingTable(NamedTuple):
+class MappingTable(ArrayStruct):
     """State mappings for compiled code, one a row.
 
     :param index: int64, shape (n_state_mappings, n_target_variables): source variable of each target variable, -1 for none
     :param sign: float64, same shape: -1 where the variable is mirrored
     """
 
-    index: np.ndarray  # type: ignore[assignment]
+    index: np.ndarray
     sign: np.ndarray
 
 
-class ComplianceScratch(NamedTuple):
+class ComplianceScratch(ArrayStruct):
     """Work space, and the state mappings in the form that the inner loop reads.
 
     A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses.

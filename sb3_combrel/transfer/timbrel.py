@@ -140,7 +140,9 @@ class TIMBREL(VirtualSourceTransfer):
             return self._nothing_for(len(pairs))
         n_points = len(self.target.sample_states)
         first, last = self._span(pairs // n_points)
-        return self._draw(self.target.sample_states[pairs % n_points], own_weight, first, np.where(known, first, last))
+        states = self.target.sample_states[pairs % n_points]
+        self._supply = self._draw(states, own_weight, first, np.where(known, first, last), self._supply)
+        return self._supply
 
     def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
         if (own_weight >= self._rules.threshold).all():

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, inner
 
 
-class CandidateArrays(NamedTuple):
+class CandidateArrays(ArrayStruct):
     """The ways to see the source from each target action: candidates ``first[a]`` to ``first[a + 1]`` are of action a.
 
     :param first: int64, shape (n_target_actions + 1,)
@@ -158,7 +159,7 @@ def translate(states, own, first, last, source, ways, mappings, rules, merit, be
         write_row(s, own[s], kept, source, ways, mappings, rules, best, supply)
 
 
-class BestInstances(NamedTuple):
+class BestInstances(ArrayStruct):
     """Work space for the instances needed at one state, best first, with room for one more than are ever needed.
 
     :param index: int64, shape (room,); ``weight``, ``merit``: float64; ``candidate``: int64
@@ -166,7 +167,7 @@ class BestInstances(NamedTuple):
         shape: where the state lies along each
     """
 
-    index: np.ndarray  # type: ignore[assignment]
+    index: np.ndarray
     weight: np.ndarray
     merit: np.ndarray
     candidate: np.ndarray

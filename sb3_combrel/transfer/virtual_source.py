@@ -121,7 +121,8 @@ class VirtualSourceTransfer(Transfer):
         self._most_transferred = min(list_room(target.min_fraction), MOST_TRANSFERRED)
         self._translate = SameTypes(translate)
         self._best = BestInstances.empty(self._most_transferred, target.n_variables)
-        self._nothing = Supply.none(64, target.n_variables)
+        self._nothing = Supply.empty(0, target.n_variables)
+        self._supply = self._supply_at = Supply.empty(0, target.n_variables, self._most_transferred)
 
     def _most_ways_at_once(self) -> int:
         """Candidates from which one pair may draw at the same time."""
@@ -156,17 +157,13 @@ class VirtualSourceTransfer(Transfer):
 
     # ---------------------------------------------------------------- supplying
 
-    def _draw(self, states: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray) -> Supply:
-        """Translate, for each state, instances of the candidates from ``first`` up to ``last``."""
-        n, d = states.shape
-        most = self._most_transferred
-        supply = Supply(
-            count=np.empty(n, dtype=np.int64),
-            weight=np.empty((n, most)),
-            effect=np.empty((n, most, d)),
-            reward=np.empty((n, most)),
-            terminated=np.empty((n, most), dtype=np.bool_),
-        )
+    def _draw(self, states: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray, supply: Supply) -> Supply:
+        """Translate, for each state, instances of the candidates from ``first`` up to ``last``.
+
+        :return: ``supply``, or one with more room
+        """
+        if len(own) > len(supply.count):
+            supply = Supply.empty(2 * len(own), states.shape[1], self._most_transferred)
         self._translate(
             states,
             own,
@@ -185,10 +182,11 @@ class VirtualSourceTransfer(Transfer):
     def _draw_at(self, state: np.ndarray, own: np.ndarray, first: np.ndarray, last: np.ndarray) -> Supply:
         """The same for every action at one state; what is used there is counted."""
         self._states_at[:] = state
-        supply = self._draw(self._states_at, own, first, last)
+        supply = self._supply_at = self._draw(self._states_at, own, first, last, self._supply_at)
+        counts = supply.count[: len(own)]
         if self._most_ways_at_once() == 1:
-            self._uses.update(first[supply.count > 0].tolist())
-        self._instances_used += int(supply.count.sum())
+            self._uses.update(first[counts > 0].tolist())
+        self._instances_used += int(counts.sum())
         return supply
 
     def renewed(self) -> np.ndarray:
@@ -221,8 +219,8 @@ class VirtualSourceTransfer(Transfer):
     def _nothing_for(self, n: int) -> Supply:
         assert self.target is not None
         if n > len(self._nothing.count):
-            self._nothing = Supply.none(2 * n, self.target.n_variables)
-        return Supply(*(array[:n] for array in self._nothing))
+            self._nothing = Supply.empty(2 * n, self.target.n_variables)
+        return self._nothing
 
     def _renew_relevance(self) -> None:
         """Relevance of all instances to the target transitions seen so far."""

@@ -1,13 +1,12 @@
 """Compiled loops of COMBREL's vote: the nearest target transitions choose a candidate by compliance (Algorithm 1)."""
 
-from typing import NamedTuple
-
 import numpy as np
 
+from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, inner
 
 
-class Ballots(NamedTuple):
+class Ballots(ArrayStruct):
     """What the measured target transitions have to say; transition i speaks about the candidates of its action only.
 
     :param compliance: float64, shape (n_transitions, most candidates of an action): with each of them, in their order
@@ -28,7 +27,7 @@ class Ballots(NamedTuple):
         """Itself, or a copy of twice the size if transition ``i`` would not fit."""
         if i < len(self.least):
             return self
-        return self._replace(
+        return self.replace(
             compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
             least=np.concatenate([self.least, np.empty_like(self.least)]),
         )
