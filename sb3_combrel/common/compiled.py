@@ -16,7 +16,10 @@ compiled = _njit(**_options)
 # Calling one from Python would crash; a test compiles its ``py_func`` anew.
 inner = _njit(**_options, no_cpython_wrapper=True)
 
-# The same for functions called in the innermost loops: handing over a handful of arrays costs more than such a function.
+# The same for functions that have one caller: they are compiled as a part of it, not once more for themselves.
+part = _njit(**_options, no_cpython_wrapper=True, inline="always")
+
+# The same for small functions called in the innermost loops: a call costs more than what they do.
 inlined = _njit(**_options, no_cpython_wrapper=True, forceinline=True)
 
 # The same, but callable from Python as well.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import inlined, inner
+from sb3_combrel.common.compiled import inlined, part
 from sb3_combrel.common.instances import BLOCK
 
 
@@ -54,7 +54,7 @@ def squared_distance(state, other):
     return distance
 
 
-@inner
+@part
 def measure_gaps(state, low, high, n_blocks, gap):
     """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers.
 
@@ -73,7 +73,7 @@ def measure_gaps(state, low, high, n_blocks, gap):
             gap[block] += outside * outside
 
 
-@inner
+@part
 def near_instances(instances, action, state, breadth, min_weight, min_fraction, indices, weights, n_before):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first.
 

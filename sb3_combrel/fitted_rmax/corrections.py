@@ -13,7 +13,7 @@ beside it would make every other path look better than the one that works.
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, compiled_and_inlined, inlined, inner
+from sb3_combrel.common.compiled import compiled, compiled_and_inlined, inlined, part
 from sb3_combrel.common.kernels import interpolate
 
 CELLS_PER_GRID_CELL = 3
@@ -123,7 +123,7 @@ def corrected_value(values, corrections, position, grid, scratch):
     return value
 
 
-@inner
+@part
 def cut_value(value, m, values, corrections, grid, scratch):
     """``value`` cut by what is remembered as number ``m``: as much as the value there was too large."""
     for k in range(len(scratch.there)):
@@ -132,7 +132,7 @@ def cut_value(value, m, values, corrections, grid, scratch):
     return value + min(0.0, corrections.value[m] - there)
 
 
-@inner
+@part
 def count_visit(corrections, key, episode):
     """How often the cell was visited in this episode, this visit included.
 
@@ -147,7 +147,7 @@ def count_visit(corrections, key, episode):
     return corrections.visits[at]
 
 
-@inner
+@part
 def visit(values, corrections, state, best_q, visitor, grid, scratch):
     """Count a visit to ``state``; renew what is remembered of its cell, or start to remember it (see the module).
 

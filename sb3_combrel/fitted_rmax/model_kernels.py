@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined, inner, part
 from sb3_combrel.common.instances import put_instance
 from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
 from sb3_combrel.common.pool import Pool, reserve
@@ -92,7 +92,7 @@ class Scratch(ArrayStruct):
         )
 
 
-@inner
+@part
 def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
     """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
 
@@ -219,7 +219,7 @@ def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch
     return changed
 
 
-@inner
+@part
 def note_corners(arrays, effect, grid, action, slot):
     """Work out ``corner_low``, ``corner_offset`` and ``corner_weight`` of an instance: the same for all grid points."""
     low = arrays.corner_low[action, slot]
@@ -240,7 +240,7 @@ def note_corners(arrays, effect, grid, action, slot):
         n_corners *= 2
 
 
-@inlined
+@part
 def scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_touched):
     """Spread probability ``p`` of the effect of an instance from a grid point, at ``scratch.at``, over grid points."""
     for k in range(len(grid.shape)):
@@ -302,7 +302,7 @@ def note_predecessor(predecessors, to, point, weight):
     return True
 
 
-@inner
+@part
 def store_row(arrays, pair, point, n_touched, discount, scratch):
     """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and have predecessors noted.
 
@@ -334,7 +334,7 @@ def store_row(arrays, pair, point, n_touched, discount, scratch):
     return room
 
 
-@inner
+@part
 def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
     """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
 
@@ -435,7 +435,7 @@ def renew_predecessors(arrays):
         if arrays.settled[pair]:
             start = arrays.rows.start[pair]
             for k in range(start, start + arrays.rows.length[pair]):
-                point = pair % n_points
-                if not note_predecessor(arrays.predecessors, arrays.rows.index[k], point, arrays.rows.weight[k]):
+                to = np.int64(arrays.rows.index[k])
+                if not note_predecessor(arrays.predecessors, to, pair % n_points, arrays.rows.weight[k]):
                     return False
     return True

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner
+from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner, part
 from sb3_combrel.common.kernels import corners_of
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
 from sb3_combrel.fitted_rmax.model import KernelModel
@@ -126,7 +126,7 @@ def back_up(values, arrays, queue, point, bounds, tolerance):
     values[point] = min(best, bounds[1])
 
 
-@inner
+@part
 def take_over(values, arrays, queue, pair, bounds, tolerance):
     """Bring V of the pair's point up to date when nothing but the pair's row has changed."""
     action = pair // len(values)
@@ -149,13 +149,13 @@ def announce(values, arrays, queue, point, tolerance):
     queue.announced[point] = values[point]
     start = arrays.predecessors.start[point]
     for k in range(start, start + arrays.predecessors.length[point]):
-        before = arrays.predecessors.index[k]
+        before = np.int64(arrays.predecessors.index[k])
         queue.pending[before] += change * arrays.predecessors.weight[k]
         if queue.pending[before] > tolerance and not queue.waiting[before] and arrays.n_optimistic[before] == 0:
             push(queue, before)
 
 
-@inner
+@part
 def back_up_around(values, arrays, queue, state, grid, bounds, tolerance, scratch):
     """Back up the grid points around ``state`` that have been announced a change; backups done.
 

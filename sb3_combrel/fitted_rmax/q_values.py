@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.kernels import near_instances
 from sb3_combrel.fitted_rmax.corrections import corrected_value, visit
 
@@ -82,7 +82,7 @@ def add_successor(p, state, effect, values, corrections, grid, query):
     return p * corrected_value(values, corrections, query.position, grid, query), 0.0
 
 
-@inner
+@part
 def q_values(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q):
     """Q of every action at ``state``, from the lists in ``query`` and the supply for it.
 

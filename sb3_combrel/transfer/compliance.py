@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, compiled_fast, inner
+from sb3_combrel.common.compiled import compiled, compiled_fast, part
 from sb3_combrel.common.instances import InstanceArrays
 
 
@@ -180,7 +180,7 @@ def _mapping_compliance(m, n, scratch):
     return 0.0 if total < LEAST_EVIDENCE else (transition / total) * (rewarded / total)
 
 
-@inner
+@part
 def _still_factors(effect, mappings, bandwidth, still):
     """Outcome kernel of each mapping's unmapped variables, which are predicted not to change."""
     for m in range(mappings.index.shape[0]):

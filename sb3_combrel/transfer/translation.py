@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inner
+from sb3_combrel.common.compiled import compiled, part
 
 
 class CandidateArrays(ArrayStruct):
@@ -40,7 +40,7 @@ class TransferRules(NamedTuple):
     by_merit: bool
 
 
-@inner
+@part
 def consider(j, candidate, w, merit, own, kept, rules, best):
     """Enter an instance into the list of the best, heaviest (or worthiest) first, and cut what is not needed any more.
 
@@ -73,7 +73,7 @@ def consider(j, candidate, w, merit, own, kept, rules, best):
     return min(kept + 1, most), best.weight[most - 1] if kept + 1 >= most else 0.0
 
 
-@inner
+@part
 def gather(state, source, row, action, mappings, rules, merit, own, kept, best, candidate):
     """Enter the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` into ``best``.
 
@@ -105,7 +105,7 @@ def gather(state, source, row, action, mappings, rules, merit, own, kept, best, 
     return kept
 
 
-@inner
+@part
 def write_row(s, own, kept, source, ways, mappings, rules, best, supply):
     """Write the best instances to row ``s`` of ``supply``, if they and ``own`` reach the threshold."""
     total = own
