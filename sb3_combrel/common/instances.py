@@ -117,3 +117,19 @@ def put_instance(instances, action, slot, state, next_state, reward, terminated)
     instances.terminated[action, slot] = terminated
     if slot == instances.count[action]:
         instances.count[action] += 1
+
+
+def along_curve(states: np.ndarray) -> np.ndarray:
+    """Where each state lies along a curve that fills the space (Morton's): neighbours along it are near each other.
+
+    :param states: unit coordinates, shape (n, n_variables)
+    :return: int64, shape (n,)
+    """
+    d = states.shape[1]
+    n_bits = min(16, 62 // d)
+    cell = (np.clip(states, 0.0, 1.0) * (2**n_bits - 1)).astype(np.int64)
+    key = np.zeros(len(states), dtype=np.int64)
+    for bit in reversed(range(n_bits)):
+        for k in range(d):
+            key = key << 1 | cell[:, k] >> bit & 1
+    return key

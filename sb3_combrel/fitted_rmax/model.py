@@ -219,7 +219,8 @@ class KernelModel:
         """Transferred instances for ``pairs``, at most ``MOST_PAIRS_AT_ONCE``."""
         if self.transfer is None:
             return self._no_supply
-        return self.transfer.supply(pairs, self.arrays.total[pairs], self.arrays.known[pairs])
+        known = self.arrays.known[pairs]
+        return self._no_supply if known.all() else self.transfer.supply(pairs, self.arrays.total[pairs], known)
 
     def renew_predecessors(self) -> None:
         """Forget predecessors that no row needs any more."""

@@ -305,8 +305,8 @@ class FittedRMaxPolicy(BasePolicy):
         passes = 0
         if self.transfer is not None:
             renewed = self.transfer.renewed()
-            renewed = renewed[~self.model.arrays.known[renewed]]
             if len(renewed):
+                renewed = renewed[~self.model.arrays.known[renewed]]
                 self._unsettled.append(renewed)
                 backups = BACKUPS_PER_RENEWED_PAIR * len(renewed)
                 passes = backups // self.model.grid.n_points

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled
-from sb3_combrel.common.instances import InstanceArrays
+from sb3_combrel.common.instances import InstanceArrays, along_curve
 from sb3_combrel.common.kernels import insert_by_weight, near_instances
 from sb3_combrel.common.pool import reserve
 from sb3_combrel.fitted_rmax.model_kernels import note_corners
@@ -55,7 +55,7 @@ def refill_lists(arrays, instances, slots, grid, kernel, threshold, at, index, w
 
 
 def in_neighbourhoods(instances: InstanceArrays, listed: np.ndarray) -> tuple[InstanceArrays, np.ndarray]:
-    """Those instances that stand in any list, along a curve that fills the space (Morton's): a search passes over most blocks.
+    """Those instances that stand in any list, in an order in which a search passes over most blocks.
 
     :param listed: whether each instance does, bool, those of one action after those of another
     :return: they, and the place that each had, int64, shape (n_actions, most instances of an action)
@@ -65,21 +65,10 @@ def in_neighbourhoods(instances: InstanceArrays, listed: np.ndarray) -> tuple[In
     for action, of_action in enumerate(np.split(listed, np.cumsum(instances.count)[:-1])):
         there = np.flatnonzero(of_action)
         n = len(there)
-        slots[action, :n] = order = there[np.argsort(_along_curve(instances.state[action, there]), kind="stable")]
+        slots[action, :n] = order = there[np.argsort(along_curve(instances.state[action, there]), kind="stable")]
         columns = (instances.state, instances.effect, instances.reward, instances.terminated)
         rows.append((np.full(n, action), *(column[action, order] for column in columns)))
     return InstanceArrays.of_rows(len(instances.count), *map(np.concatenate, zip(*rows, strict=True))), slots
-
-
-def _along_curve(states: np.ndarray) -> np.ndarray:
-    d = states.shape[1]
-    n_bits = min(16, 62 // d)
-    cell = (np.clip(states, 0.0, 1.0) * (2**n_bits - 1)).astype(np.int64)
-    key = np.zeros(len(states), dtype=np.int64)
-    for bit in reversed(range(n_bits)):
-        for k in range(d):
-            key = key << 1 | cell[:, k] >> bit & 1
-    return key
 
 
 @compiled

@@ -112,7 +112,7 @@ class COMBREL(VirtualSourceTransfer):
         super().bind(target, rng)
         n_rows, n_actions = len(self._table.index), len(self._instances.count)
         n_points = len(target.sample_states)
-        self._compliance_scratch = ComplianceScratch.for_mappings(self._table, int(self._instances.count.max()))
+        self._compliance_scratch = ComplianceScratch.for_mappings(self._table, self._instances)
         self._table_of_one = np.empty((n_rows, n_actions))
         self._ballots = Ballots.empty(int(np.diff(self._ways.first).max()))
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
@@ -121,6 +121,7 @@ class COMBREL(VirtualSourceTransfer):
         self._distance = np.full((target.n_actions, n_points, self.n_neighbors), self._limit)
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._changed_points = np.empty(n_points, dtype=np.int64)
+        self._coordinates, self._apart = np.ascontiguousarray(target.sample_states.T), np.empty(n_points)
         self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._choose_at = map(
             SameTypes, (transition_compliance, standstill_compliance, note_neighbor, vote, choose_at)
         )
@@ -181,7 +182,8 @@ class COMBREL(VirtualSourceTransfer):
         n = self._note_neighbor(
             i,
             self._seen.states[i],
-            self.target.sample_states,
+            self._coordinates,
+            self._apart,
             self._near[action],
             self._distance[action],
             self._changed_points,

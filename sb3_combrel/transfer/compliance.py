@@ -51,6 +51,8 @@ class ComplianceScratch(ArrayStruct):
     :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are
         ``factors[first[m] : first[m + 1]]``
     :param factors: int64
+    :param state: float64, shape (n_source_actions, n_source_variables, most): the source instances' states, variable by
+        variable: the inner loops read them in a row; ``effect``: the same of their effects
     :param start: float64, shape (n_factors, most): kernel of where a transition and each source instance start
     :param outcome: the same for outcomes
     :param reward: float64, shape (most,): the same for rewards
@@ -63,6 +65,8 @@ class ComplianceScratch(ArrayStruct):
     mirrored: np.ndarray
     first: np.ndarray
     factors: np.ndarray
+    state: np.ndarray
+    effect: np.ndarray
     start: np.ndarray
     outcome: np.ndarray
     reward: np.ndarray
@@ -71,8 +75,9 @@ class ComplianceScratch(ArrayStruct):
     still: np.ndarray
 
     @classmethod
-    def for_mappings(cls, mappings: MappingTable, most: int) -> "ComplianceScratch":
-        """Work space for a table of state mappings and up to ``most`` instances of a source action."""
+    def for_mappings(cls, mappings: MappingTable, source: InstanceArrays) -> "ComplianceScratch":
+        """Work space for a table of state mappings and the instances of a source."""
+        most = int(source.count.max())
         number: dict[tuple[int, int, bool], int] = {}
         first, factors = [0], []
         for index, sign in zip(mappings.index, mappings.sign, strict=True):
@@ -86,6 +91,8 @@ class ComplianceScratch(ArrayStruct):
             mirrored=np.array([m for _, _, m in keys], dtype=np.bool_),
             first=np.array(first, dtype=np.int64),
             factors=np.array(factors, dtype=np.int64),
+            state=np.ascontiguousarray(source.state[:, :most].transpose(0, 2, 1)),
+            effect=np.ascontiguousarray(source.effect[:, :most].transpose(0, 2, 1)),
             start=np.empty((len(keys), most)),
             outcome=np.empty((len(keys), most)),
             reward=np.empty(most),
@@ -136,6 +143,15 @@ def _exponentiate(row, n):
 
 
 @compiled_fast
+def _squares(at, of_source, bandwidth, row, n):
+    """Write to ``row`` the squared distances of ``at`` from what the source instances have, over the bandwidth."""
+    part = 1.0 / bandwidth
+    for j in range(n):
+        apart = at - of_source[j]
+        row[j] = apart * apart * part
+
+
+@compiled_fast
 def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
     """Fill ``scratch.start``, ``outcome`` and ``reward`` for all source instances of ``action``."""
     n = source.count[action]
@@ -144,13 +160,8 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
         k = scratch.source[f]
         side = -1.0 if scratch.mirrored[f] else 1.0
         offset = 1.0 if scratch.mirrored[f] else 0.0
-        at = state[v]
-        moved = effect[v]
-        for j in range(n):
-            apart = at - (offset + side * source.state[action, j, k])
-            missed = moved - side * source.effect[action, j, k]
-            scratch.start[f, j] = apart * apart / bandwidths.start
-            scratch.outcome[f, j] = missed * missed / bandwidths.outcome
+        _squares(side * (state[v] - offset), scratch.state[action, k], bandwidths.start, scratch.start[f], n)
+        _squares(side * effect[v], scratch.effect[action, k], bandwidths.outcome, scratch.outcome[f], n)
         _exponentiate(scratch.start[f], n)
         _exponentiate(scratch.outcome[f], n)
     for j in range(n):

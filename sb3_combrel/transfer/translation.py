@@ -6,6 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, part
+from sb3_combrel.common.instances import BLOCK
 
 
 class CandidateArrays(ArrayStruct):
@@ -91,18 +92,47 @@ def gather(state, source, row, action, mappings, rules, merit, own, kept, best, 
             best.variable[n_mapped] = k
             best.at[n_mapped] = 1.0 - state[v] if mirrored else state[v]
             n_mapped += 1
+    nearest_block = measure_blocks(source, action, n_mapped, best)
     nearest = far
-    for j in range(source.count[action]):
-        apart = 0.0
-        for m in range(n_mapped):
-            along = best.at[m] - source.state[action, j, best.variable[m]]
-            apart += along * along
-        if apart <= nearest:
-            w = np.exp(apart * scale)
-            kept, least = consider(j, candidate, w, merit[j] if rules.by_merit else w, own, kept, rules, best)
-            if least > rules.min_weight and not rules.by_merit:
-                nearest = np.log(least) / scale * (1 + 1e-12)
+    # What is in the nearest block keeps most other blocks out.
+    for turn in range(-1, (source.count[action] + BLOCK - 1) // BLOCK):
+        block = nearest_block if turn < 0 else turn
+        if turn == nearest_block or source.gap[block] > nearest:
+            continue
+        for j in range(block * BLOCK, min(source.count[action], (block + 1) * BLOCK)):
+            apart = 0.0
+            for m in range(n_mapped):
+                along = best.at[m] - source.state[action, j, best.variable[m]]
+                apart += along * along
+            if apart <= nearest:
+                w = np.exp(apart * scale)
+                kept, least = consider(j, candidate, w, merit[j] if rules.by_merit else w, own, kept, rules, best)
+                if least > rules.min_weight and not rules.by_merit:
+                    nearest = np.log(least) / scale * (1 + 1e-12)
     return kept
+
+
+@part
+def measure_blocks(source, action, n_mapped, best):
+    """Write to ``source.gap`` the squared distance of each block's box, in the mapped variables; the nearest block."""
+    n_blocks = (source.count[action] + BLOCK - 1) // BLOCK
+    gap = source.gap
+    gap[:n_blocks] = 0.0
+    for m in range(n_mapped):
+        at = best.at[m]
+        low = source.block_low[action, best.variable[m]]
+        high = source.block_high[action, best.variable[m]]
+        for block in range(n_blocks):
+            below = low[block] - at
+            above = at - high[block]
+            outside = below if below > above else above
+            outside = outside if outside > 0.0 else 0.0
+            gap[block] += outside * outside
+    nearest_block = 0
+    for block in range(1, n_blocks):
+        if gap[block] < gap[nearest_block]:
+            nearest_block = block
+    return nearest_block
 
 
 @part

@@ -35,7 +35,7 @@ def test_compliance_of_3000_transitions_with_every_mapping(benchmark, name):
         instances,
         table,
         default_bandwidths(instances),
-        ComplianceScratch.for_mappings(table, int(instances.count.max())),
+        ComplianceScratch.for_mappings(table, instances),
         np.empty((N_TRANSITIONS, len(table.index), len(instances.count))),
     )
     benchmark.pedantic(compliance_table, args=arguments, rounds=5, warmup_rounds=1)

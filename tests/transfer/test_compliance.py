@@ -35,7 +35,7 @@ def tables_of(transitions, sources, sets, bandwidths):
         instances,
         table,
         bandwidths,
-        ComplianceScratch.for_mappings(table, int(instances.count.max())),
+        ComplianceScratch.for_mappings(table, instances),
         tables,
     )
     return tables
@@ -168,7 +168,7 @@ def test_one_transition_and_many_go_through_the_same_equations():
     bandwidths = Bandwidths(0.1, 0.1, 1.0)
     tables = tables_of(transitions, [source], [mappings], bandwidths)
     table = stacked_table([mappings])
-    scratch = ComplianceScratch.for_mappings(table, 40)
+    scratch = ComplianceScratch.for_mappings(table, stacked_instances([source]))
     for i in reversed(range(5)):
         t, one = transitions[i], np.full(tables[0].shape, np.nan)
         effect = t.next_state - t.state
@@ -252,7 +252,10 @@ def test_relevance_is_that_of_the_equations(seed, sizes, bandwidths, n_transitio
     mapping = naive.random_mapping(rng, *sizes)
     transitions = [naive.random_transition(rng, n_target, n_target_actions, 0.4) for _ in range(n_transitions)]
     for action in range(n_target_actions):
-        numbers = np.flatnonzero(source.actions == mapping.action[action])
+        # The package has instances in an order of its own.
+        instances, units = stacked_instances([source]), source.scaling.to_unit(source.states)
+        in_order = instances.state[mapping.action[action], : instances.count[mapping.action[action]]]
+        numbers = [np.flatnonzero((units == state).all(axis=1))[0] for state in in_order]
         found = relevances(source, mapping.action[action], mapping, action, transitions, bandwidths, mu)
         expected = [naive.relevance(source, j, mapping, action, transitions, bandwidths, mu) for j in numbers]
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
