@@ -6,7 +6,7 @@ from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import SameTypes, compiled, inlined, inner, part
 from sb3_combrel.common.kernels import corners_of
 from sb3_combrel.fitted_rmax.exploitation import exploitation_sweep
-from sb3_combrel.fitted_rmax.model import KernelModel
+from sb3_combrel.fitted_rmax.model import MOST_PAIRS_AT_ONCE, KernelModel
 
 EXPLOITATION_SWEEPS = 300
 NOWHERE = np.empty(0)
@@ -267,6 +267,13 @@ class Planner:
         :return: backups done
         """
         self._exploitation = None
+        backups = 0
+        while len(pairs) > MOST_PAIRS_AT_ONCE:
+            backups += self._settle_and_sweep(pairs[:MOST_PAIRS_AT_ONCE], 0, NOWHERE)
+            pairs = pairs[MOST_PAIRS_AT_ONCE:]
+        return backups + self._settle_and_sweep(pairs, max_backups, around)
+
+    def _settle_and_sweep(self, pairs: np.ndarray, max_backups: int, around: np.ndarray) -> int:
         model = self.model
         model.settle(pairs)
         backups: int = self._sweep(
