@@ -22,11 +22,8 @@ part = _njit(**_options, no_cpython_wrapper=True, inline="always")
 # The same for small functions called in the innermost loops: a call costs more than what they do.
 inlined = _njit(**_options, no_cpython_wrapper=True, forceinline=True)
 
-# The same, but callable from Python as well.
-compiled_and_inlined = _njit(**_options, forceinline=True)
-
-# The same for loops whose sums may be taken in any order, as vector registers do.
-compiled_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
+# ``inner``, for loops whose sums may be taken in any order, as vector registers do.
+inner_fast = _njit(**_options, no_cpython_wrapper=True, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).

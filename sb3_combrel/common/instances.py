@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import part
 
 BLOCK = 8
 
@@ -104,7 +104,7 @@ class InstanceArrays(ArrayStruct):
         return self if self.count[action] < self.capacity else self.grown()
 
 
-@compiled
+@part
 def put_instance(instances, action, slot, state, next_state, reward, terminated):
     """Write one instance of ``action`` to ``slot``, at or before the end of that action's instances."""
     block = slot // BLOCK

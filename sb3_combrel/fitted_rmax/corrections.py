@@ -13,7 +13,7 @@ beside it would make every other path look better than the one that works.
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, compiled_and_inlined, inlined, part
+from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.kernels import interpolate
 
 CELLS_PER_GRID_CELL = 3
@@ -84,7 +84,7 @@ class CorrectionArrays(ArrayStruct):
         return larger
 
 
-@compiled_and_inlined
+@inlined
 def cell_key(position, shape):
     """The number of the small cell around a position in grid coordinates."""
     key = 0
@@ -95,7 +95,7 @@ def cell_key(position, shape):
     return key
 
 
-@compiled_and_inlined
+@inlined
 def find_cell(corrections, key):
     """Where in the table ``key`` stands, or the free place where it would."""
     mask = len(corrections.table) - 1

@@ -121,7 +121,6 @@ class COMBREL(VirtualSourceTransfer):
         self._distance = np.full((target.n_actions, n_points, self.n_neighbors), self._limit)
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._changed_points = np.empty(n_points, dtype=np.int64)
-        self._coordinates, self._apart = np.ascontiguousarray(target.sample_states.T), np.empty(n_points)
         self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._choose_at = map(
             SameTypes, (transition_compliance, standstill_compliance, note_neighbor, vote, choose_at)
         )
@@ -182,8 +181,7 @@ class COMBREL(VirtualSourceTransfer):
         n = self._note_neighbor(
             i,
             self._seen.states[i],
-            self._coordinates,
-            self._apart,
+            self.target.sample_states,
             self._near[action],
             self._distance[action],
             self._changed_points,

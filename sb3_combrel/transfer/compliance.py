@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, compiled_fast, part
+from sb3_combrel.common.compiled import compiled, inner_fast, part
 from sb3_combrel.common.instances import InstanceArrays
 
 
@@ -111,7 +111,7 @@ LEAST_EVIDENCE = 0.1
 FARTHEST = 40.0
 
 
-@compiled_fast
+@inner_fast
 def _exponentiate(row, n):
     """Replace the first ``n`` entries x >= 0 by exp(-min(x, FARTHEST)), to 12 digits.
 
@@ -142,7 +142,7 @@ def _exponentiate(row, n):
         row[j] = value * value
 
 
-@compiled_fast
+@inner_fast
 def _squares(at, of_source, bandwidth, row, n):
     """Write to ``row`` the squared distances of ``at`` from what the source instances have, over the bandwidth."""
     part = 1.0 / bandwidth
@@ -151,7 +151,7 @@ def _squares(at, of_source, bandwidth, row, n):
         row[j] = apart * apart * part
 
 
-@compiled_fast
+@inner_fast
 def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
     """Fill ``scratch.start``, ``outcome`` and ``reward`` for all source instances of ``action``."""
     n = source.count[action]
@@ -170,7 +170,7 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
     _exponentiate(scratch.reward, n)
 
 
-@compiled_fast
+@inner_fast
 def _mapping_compliance(m, n, scratch):
     """Compliance through state mapping ``m``, but for its unmapped variables, with ``n`` instances of one action."""
     for j in range(n):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, part
+from sb3_combrel.common.compiled import compiled, inner, part
 from sb3_combrel.common.instances import BLOCK
 
 
@@ -74,7 +74,7 @@ def consider(j, candidate, w, merit, own, kept, rules, best):
     return min(kept + 1, most), best.weight[most - 1] if kept + 1 >= most else 0.0
 
 
-@part
+@inner
 def gather(state, source, row, action, mappings, rules, merit, own, kept, best, candidate):
     """Enter the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` into ``best``.
 
@@ -115,22 +115,18 @@ def gather(state, source, row, action, mappings, rules, merit, own, kept, best, 
 @part
 def measure_blocks(source, action, n_mapped, best):
     """Write to ``source.gap`` the squared distance of each block's box, in the mapped variables; the nearest block."""
-    n_blocks = (source.count[action] + BLOCK - 1) // BLOCK
-    gap = source.gap
-    gap[:n_blocks] = 0.0
-    for m in range(n_mapped):
-        at = best.at[m]
-        low = source.block_low[action, best.variable[m]]
-        high = source.block_high[action, best.variable[m]]
-        for block in range(n_blocks):
-            below = low[block] - at
-            above = at - high[block]
-            outside = below if below > above else above
-            outside = outside if outside > 0.0 else 0.0
-            gap[block] += outside * outside
     nearest_block = 0
-    for block in range(1, n_blocks):
-        if gap[block] < gap[nearest_block]:
+    for block in range((source.count[action] + BLOCK - 1) // BLOCK):
+        gap = 0.0
+        for m in range(n_mapped):
+            k = best.variable[m]
+            below = source.block_low[action, k, block] - best.at[m]
+            above = best.at[m] - source.block_high[action, k, block]
+            outside = below if below > above else above
+            if outside > 0.0:
+                gap += outside * outside
+        source.gap[block] = gap
+        if gap < source.gap[nearest_block]:
             nearest_block = block
     return nearest_block
 

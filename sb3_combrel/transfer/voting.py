@@ -34,27 +34,24 @@ class Ballots(ArrayStruct):
 
 
 @compiled
-def note_neighbor(i, state, coordinates, apart, near, distance, changed):
+def note_neighbor(i, state, sample_states, near, distance, changed):
     """Enter transition ``i`` at every sample state that has it among its nearest.
 
-    :param coordinates: of the sample states, variable by variable, shape (n_variables, n_points)
-    :param apart: float64 scratch, shape (n_points,)
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
     :param distance: squared distances to them, the limit for none, updated
     :param changed: receives the points at which it entered
     :return: how many
     """
-    d, n_points = coordinates.shape
+    n_points, d = sample_states.shape
     last = near.shape[1] - 1
-    apart[:] = 0.0
-    for v in range(d):
-        for p in range(n_points):
-            along = coordinates[v, p] - state[v]
-            apart[p] += along * along
     n_changed = 0
     for p in range(n_points):
-        if apart[p] < distance[p, last]:
-            insert_neighbor(i, apart[p], near[p], distance[p])
+        apart = 0.0
+        for v in range(d):
+            along = sample_states[p, v] - state[v]
+            apart += along * along
+        if apart < distance[p, last]:
+            insert_neighbor(i, apart, near[p], distance[p])
             changed[n_changed] = p
             n_changed += 1
     return n_changed

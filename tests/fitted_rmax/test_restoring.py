@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import njit
 from test_kernel_model import GRIDS, KERNELS, N_ACTIONS, model_and_definition, random_transitions
 
 from sb3_combrel.common.instances import BLOCK, InstanceArrays, put_instance
@@ -98,7 +99,7 @@ def test_instances_given_at_once_are_as_those_given_one_by_one():
     one_by_one = InstanceArrays.empty(N_ACTIONS, 2)
     for i in range(50):
         a = action[i]
-        put_instance(one_by_one, a, one_by_one.count[a], state[i], state[i] + effect[i], reward[i], terminated[i])
+        put_instance.py_func(one_by_one, a, one_by_one.count[a], state[i], state[i] + effect[i], reward[i], terminated[i])
     at_once = InstanceArrays.of_rows(N_ACTIONS, action, state, effect, reward, terminated)
     np.testing.assert_array_equal(at_once.count, one_by_one.count)
     for a, n in enumerate(one_by_one.count):
@@ -115,8 +116,9 @@ def test_corrections_given_at_once_are_found_by_their_cells():
     key, value, state = rng.permutation(10_000)[:700], rng.normal(size=700), rng.random((700, 2))
     corrections = CorrectionArrays.of_rows(key, value, state)
     assert corrections.count[0] == 700
+    find = njit(find_cell.py_func)
     for m in range(700):
-        assert corrections.table[find_cell(corrections, key[m])] == m
-    assert corrections.table[find_cell(corrections, 10_001)] == -1
+        assert corrections.table[find(corrections, key[m])] == m
+    assert corrections.table[find(corrections, 10_001)] == -1
     np.testing.assert_array_equal(corrections.value[:700], value)
     np.testing.assert_array_equal(corrections.state[:700], state)

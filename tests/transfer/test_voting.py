@@ -55,8 +55,7 @@ def test_at_a_sample_state_the_vote_is_the_same_as_on_the_grid(seed, drawn):
     for action in range(n_actions):
         near, distance = np.full((len(POINTS), 3), -1), np.full((len(POINTS), 3), limit)
         for i in np.flatnonzero(actions == action):
-            scratch = np.empty(len(POINTS)), np.empty(len(POINTS), dtype=np.int64)
-            note_neighbor(i, states[i], POINTS.T.copy(), scratch[0], near, distance, scratch[1])
+            note_neighbor(i, states[i], POINTS, near, distance, np.empty(len(POINTS), dtype=np.int64))
         of_points = np.repeat(draws[action], len(POINTS)) if drawn else draws
         points = np.arange(len(POINTS))
         vote(points, near, ballots, first[action], first[action + 1], of_points, on_grid[action])
