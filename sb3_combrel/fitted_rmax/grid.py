@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Sequence
+
 import numpy as np
 
 from sb3_combrel.common.array_struct import ArrayStruct
