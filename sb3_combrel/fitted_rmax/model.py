@@ -25,7 +25,7 @@ from sb3_combrel.transfer.base import Transfer
 MOST_PAIRS_AT_ONCE = 4096
 # Part of the threshold by which own weight must have grown before a pair that draws on transferred instances is settled
 # anew within an episode.
-NEWS = 0.1
+NEWS = 0.25
 # A time limit reached this often is taken as it comes; each further time the threshold shrinks by the factor.
 EPISODES_OF_PATIENCE = 10
 IMPATIENCE = 0.98

@@ -304,9 +304,8 @@ class FittedRMaxPolicy(BasePolicy):
         """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
         passes = 0
         if self.transfer is not None:
-            renewed = self.transfer.renewed()
+            renewed = self.transfer.renewed(self.model.arrays.known)
             if len(renewed):
-                renewed = renewed[~self.model.arrays.known[renewed]]
                 self._unsettled.append(renewed)
                 backups = BACKUPS_PER_RENEWED_PAIR * len(renewed)
                 passes = backups // self.model.grid.n_points

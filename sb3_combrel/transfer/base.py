@@ -72,8 +72,11 @@ class Transfer(ABC):
         """Take notice that an episode has ended, by its time limit or (not ``truncated``) in a terminal state."""
 
     @abstractmethod
-    def renewed(self) -> np.ndarray:
-        """The pairs for which :meth:`supply` has something else to say than before, since the last call; int64."""
+    def renewed(self, known: np.ndarray) -> np.ndarray:
+        """The pairs for which :meth:`supply` has something else to say than when it was last asked; int64.
+
+        :param known: pairs that need nothing and are left out, bool, shape (n_pairs,)
+        """
 
     @abstractmethod
     def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
@@ -87,7 +90,7 @@ class Transfer(ABC):
 
     @abstractmethod
     def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
-        """The same at an exact state, one row an action.
+        """The same at an exact state, one row an action; good until the next call.
 
         :param state: unit coordinates, shape (n_variables,)
         :param own_weight: shape (n_actions,); actions that reach the threshold need nothing

@@ -16,9 +16,12 @@ from sb3_combrel.transfer.virtual_source import (
     SourceLike,
     VirtualSourceTransfer,
 )
-from sb3_combrel.transfer.voting import Ballots, choose_at, note_neighbor, vote
+from sb3_combrel.transfer.voting import Ballots, find_voters, note_neighbor, vote
 
 RELEVANCE_RENEWAL = 1.2
+# Within an episode votes are held whenever this many times as much has been seen as at the last time: every transition
+# changes some choices, and to plan anew with each would cost more than all the rest.
+RENEWAL_GROWTH = 1.1
 NO_DRAWS = np.empty(0)
 
 
@@ -44,9 +47,9 @@ class COMBREL(VirtualSourceTransfer):
     :param voting_radius: how far, in unit coordinates, a target transition may be and still vote. Where none is near enough
         nothing is transferred: what nobody has seen stays worth exploring, and what has been seen need not be tried with
         every action. None: the nearest vote however far they are, as in the paper.
-    :param measured: when compliance is measured: "online", with every transition (the default, which works best); or
-        "first_episode", once, after the first episode, as in the paper
-    :param max_transitions: target transitions measured at most
+    :param measured: which transitions vote: "online": those of all episodes, from the first step on (the default, which
+        works best); or "first_episode": those of the first episode, after its end, as in the paper
+    :param max_transitions: target transitions that vote, at most
     :param min_compliance: a mapping transfers nothing where its mean compliance does not exceed this many times that of
         the guess that nothing ever changes; so a source that has nothing to do with the target is left alone. 0: any
         mapping that has evidence may transfer, as in the paper.
@@ -120,15 +123,16 @@ class COMBREL(VirtualSourceTransfer):
         self._limit = np.inf if self.voting_radius is None else float(self.voting_radius) ** 2
         self._distance = np.full((target.n_actions, n_points, self.n_neighbors), self._limit)
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
-        self._changed_points = np.empty(n_points, dtype=np.int64)
-        self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._choose_at = map(
-            SameTypes, (transition_compliance, standstill_compliance, note_neighbor, vote, choose_at)
+        self._vote_due = np.zeros(target.n_actions * n_points, dtype=np.bool_)
+        self._renewal_due = 0.0
+        self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._find_voters = map(
+            SameTypes, (transition_compliance, standstill_compliance, note_neighbor, vote, find_voters)
         )
         self._first_episode = True
         self._switches = 0
         self._choice_at = np.empty(target.n_actions, dtype=np.int64)
-        self._near_at = np.empty(self.n_neighbors, dtype=np.int64)
-        self._distance_at = np.empty(self.n_neighbors)
+        self._near_at = np.empty((target.n_actions, self.n_neighbors), dtype=np.int64)
+        self._distance_at = np.empty((target.n_actions, self.n_neighbors))
         # Nothing is asked before the first transition. To draw here would take from the chance of a model that is loaded.
         self._draws_at = np.zeros(target.n_actions) if self.choice == "drawn" else NO_DRAWS
 
@@ -141,93 +145,101 @@ class COMBREL(VirtualSourceTransfer):
             return
         i = self._seen.add(state, action, reward, next_state - state)
         if self.measured == "online":
-            self._measure(i)
+            self._enfranchise(i)
             if self.relevance and self._seen.n >= max(50, RELEVANCE_RENEWAL * self._merit_of):
                 self._renew_relevance()
 
     def end_episode(self, truncated: bool) -> None:
         super().end_episode(truncated)
+        # An episode's end is time to renew what has changed.
+        self._renewal_due = 0.0
         if self._first_episode and self.measured == "first_episode":
             for i in range(self._seen.n):
-                self._measure(i)
+                self._enfranchise(i)
             if self.relevance:
                 self._renew_relevance()
         self._first_episode = False
 
-    def _measure(self, i: int) -> None:
-        """Compliance of transition ``i`` with every mapping, and the votes that it changes (lines 9-13 and 17-20)."""
-        self._vote_at(self._electorate(i), int(self._seen.actions[i]))
-
-    def _electorate(self, i: int) -> np.ndarray:
-        """Compliance of transition ``i`` with every mapping; the sample states that now have it among their nearest."""
+    def _enfranchise(self, i: int) -> None:
+        """Let transition ``i`` vote: a vote is due at the sample states that have it among their nearest (line 18)."""
         assert self.target is not None
         self._ballots = self._ballots.with_room(i)
-        action, reward = int(self._seen.actions[i]), float(self._seen.rewards[i])
-        self._transition_compliance(
-            self._seen.states[i],
-            self._seen.effects[i],
-            reward,
-            self._instances,
-            self._table,
-            self._bandwidths,
-            self._compliance_scratch,
-            self._table_of_one,
-        )
-        of_action = slice(self._ways.first[action], self._ways.first[action + 1])
-        compliance = self._table_of_one[self._ways.row[of_action], self._ways.action[of_action]]
-        self._ballots.compliance[i, : len(compliance)] = compliance
-        standstill = self._standstill_compliance(self._seen.effects[i], reward, self._instances, self._bandwidths)
-        self._ballots.least[i] = self.min_compliance * standstill
-        n = self._note_neighbor(
+        action, n_points = int(self._seen.actions[i]), len(self.target.sample_states)
+        self._note_neighbor(
             i,
             self._seen.states[i],
             self.target.sample_states,
             self._near[action],
             self._distance[action],
-            self._changed_points,
+            self._vote_due[action * n_points : (action + 1) * n_points],
         )
-        return self._changed_points[:n]
 
-    def _vote_at(self, points: np.ndarray, action: int) -> None:
-        """Renew the choices of an action at some sample states (``points`` is overwritten)."""
-        assert self.target is not None
-        n_points = len(self.target.sample_states)
-        changed = self._vote(
-            points,
-            self._near[action],
-            self._ballots,
-            int(self._ways.first[action]),
-            int(self._ways.first[action + 1]),
-            self._draws(len(points)),
-            self._choice[action * n_points : (action + 1) * n_points],
-        )
+    def renewed(self, known: np.ndarray) -> np.ndarray:
+        faded = super().renewed(known)
+        if len(faded) or self._seen.n < self._renewal_due:
+            return faded
+        self._renewal_due = RENEWAL_GROWTH * self._seen.n
+        return self._hold_votes(np.flatnonzero(self._vote_due & ~known))
+
+    def _hold_votes(self, pairs: np.ndarray) -> np.ndarray:
+        """Renew the choices of those of ``pairs`` for which a vote is due (lines 17-20); those that changed."""
+        pairs = pairs[self._vote_due[pairs]]
+        if len(pairs) == 0:
+            return pairs
+        near = self._near.reshape(-1, self.n_neighbors)
+        self._measure(near[pairs])
+        self._vote_due[pairs] = False
+        changed = self._vote(pairs, near, self._ballots, self._ways.first, self._draws(len(pairs)), self._choice)
         self._switches += changed
-        self._renewed.append(points[:changed] + action * n_points)
+        return pairs[:changed]
+
+    def _measure(self, voters: np.ndarray) -> None:
+        """Compliance with every mapping of those of these transitions that have not voted yet (lines 9-13)."""
+        asked = np.zeros_like(self._ballots.measured)
+        asked[voters[voters >= 0]] = True
+        for i in np.flatnonzero(asked & ~self._ballots.measured):
+            action, reward = int(self._seen.actions[i]), float(self._seen.rewards[i])
+            self._transition_compliance(
+                self._seen.states[i],
+                self._seen.effects[i],
+                reward,
+                self._instances,
+                self._table,
+                self._bandwidths,
+                self._compliance_scratch,
+                self._table_of_one,
+            )
+            of_action = slice(self._ways.first[action], self._ways.first[action + 1])
+            compliance = self._table_of_one[self._ways.row[of_action], self._ways.action[of_action]]
+            self._ballots.compliance[i, : len(compliance)] = compliance
+            standstill = self._standstill_compliance(self._seen.effects[i], reward, self._instances, self._bandwidths)
+            self._ballots.least[i] = self.min_compliance * standstill
+            self._ballots.measured[i] = True
 
     def _draws(self, n: int) -> np.ndarray:
         """Random numbers for so many elections, if the choice is drawn."""
         return self._rng.random(n) if self.choice == "drawn" else NO_DRAWS
 
     def saved_arrays(self) -> dict[str, np.ndarray]:
-        own = {"first_episode": np.array([float(self._first_episode)]), "switches": np.array([float(self._switches)])}
-        if self.choice == "drawn":
-            own |= {"choice": self._choice.astype(np.float64), "draws_at": self._draws_at}
-        return {**super().saved_arrays(), **own}
+        own = {
+            "first_episode": np.array([float(self._first_episode)]),
+            "renewal_due": np.array([float(self._renewal_due)]),
+            "switches": np.array([float(self._switches)]),
+            "choice": self._choice.astype(np.float64),
+            "vote_due": self._vote_due.astype(np.float64),
+        }
+        return {**super().saved_arrays(), **own, "draws_at": self._draws_at}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         assert self.target is not None
         self._first_episode = bool(saved["first_episode"][0] > 0.5)
         super().restore(saved)
-        if self.choice == "drawn":
-            first, last = self._ways.first[:-1, None], self._ways.first[1:, None] - 1
-            chosen = saved["choice"].astype(np.int64).reshape(self.target.n_actions, -1)
-            self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
-            self._draws_at = np.clip(saved["draws_at"], 0.0, 1.0)
-        elif self._measures:
-            # Once for all: only the last vote counts.
-            for action in range(self.target.n_actions):
-                self._vote_at(np.arange(len(self.target.sample_states)), action)
-            self._renewed = []
+        first, last = self._ways.first[:-1, None], self._ways.first[1:, None] - 1
+        chosen = saved["choice"].astype(np.int64).reshape(self.target.n_actions, -1)
+        self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
+        self._vote_due[:] = saved["vote_due"] > 0.5
+        self._draws_at = np.clip(saved["draws_at"], 0.0, 1.0)
+        self._renewal_due = float(saved["renewal_due"][0])
         self._switches = int(saved["switches"][0])
         if self.relevance and self._seen.n:
             self._renew_relevance()
@@ -235,7 +247,7 @@ class COMBREL(VirtualSourceTransfer):
     def _note(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> None:
         super()._note(state, action, reward, effect)
         if self._measures:
-            self._electorate(self._seen.n - 1)
+            self._enfranchise(self._seen.n - 1)
 
     @property
     def _measures(self) -> bool:
@@ -246,8 +258,7 @@ class COMBREL(VirtualSourceTransfer):
 
     def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
         assert self.target is not None
-        if known.all():
-            return self._nothing_for(len(pairs))
+        self._hold_votes(pairs[~known])
         chosen = np.where(known, -1, self._choice[pairs])
         if (chosen < 0).all():
             return self._nothing_for(len(pairs))
@@ -260,21 +271,12 @@ class COMBREL(VirtualSourceTransfer):
         missing = own_weight < self._rules.threshold
         if self._seen.n == 0 or not missing.any():
             return self._nothing_for(len(own_weight))
-        n_measured = self._seen.n if self._measures else 0
-        self._choose_at(
-            state,
-            missing,
-            self._seen.states,
-            self._seen.actions,
-            n_measured,
-            self._ballots,
-            self._ways.first,
-            self._limit,
-            self._near_at,
-            self._distance_at,
-            self._draws_at,
-            self._choice_at,
-        )
+        n_voting = self._seen.n if self._measures else 0
+        transitions = self._seen.states, self._seen.actions, n_voting
+        self._find_voters(state, missing, *transitions, self._limit, self._near_at, self._distance_at)
+        self._measure(self._near_at)
+        actions = np.arange(len(own_weight))
+        self._vote(actions, self._near_at, self._ballots, self._ways.first, self._draws_at, self._choice_at)
         first = np.maximum(self._choice_at, 0)
         return self._draw_at(state, own_weight, first, first + (self._choice_at >= 0))
 
@@ -293,6 +295,7 @@ class COMBREL(VirtualSourceTransfer):
         :return: float64, shape (n,); NaN where nothing is chosen
         """
         near = self._near.reshape(-1, self.n_neighbors)[pairs]
+        self._measure(near)
         voting = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
         chosen = np.maximum(self._choice[pairs], 0)[:, None]
         first = self._ways.first[pairs // self._near.shape[1]][:, None]
@@ -310,5 +313,5 @@ class COMBREL(VirtualSourceTransfer):
             "transfer/switches": self._switches,
             "transfer/choice_entropy": float(-(shares * np.log(shares)).sum()),
             "transfer/distinct_mappings": len(shares),
-            "transfer/transitions_measured": self._seen.n,
+            "transfer/target_transitions": self._seen.n,
         }

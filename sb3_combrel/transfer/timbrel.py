@@ -84,7 +84,7 @@ class TIMBREL(VirtualSourceTransfer):
             )
         self._fixed = None if isinstance(given, str) else self._candidate_of_each_action(len(given))
         self._span_at = self._span(np.arange(target.n_actions))
-        self._renew_all()
+        self._all_renewed = True
 
     def _candidate_of_each_action(self, n_given: int) -> np.ndarray:
         """The candidate that the mapping given for each action amounts to there (of the first source)."""
@@ -136,8 +136,6 @@ class TIMBREL(VirtualSourceTransfer):
 
     def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
         assert self.target is not None
-        if known.all():
-            return self._nothing_for(len(pairs))
         n_points = len(self.target.sample_states)
         first, last = self._span(pairs // n_points)
         states = self.target.sample_states[pairs % n_points]

@@ -115,8 +115,7 @@ class VirtualSourceTransfer(Transfer):
         self._uses: Counter[int] = Counter()
         self._instances_used = 0
         self._merit_of = 0
-        self._renewed: list[np.ndarray] = []
-        self._renewal_due = 0.0
+        self._all_renewed = False
         self._states_at = np.empty((target.n_actions, target.n_variables))
         self._most_transferred = min(list_room(target.min_fraction), MOST_TRANSFERRED)
         self._translate = SameTypes(translate)
@@ -189,32 +188,21 @@ class VirtualSourceTransfer(Transfer):
         self._instances_used += int(counts.sum())
         return supply
 
-    def renewed(self) -> np.ndarray:
-        if not self._renewed or self._seen.n < self._renewal_due:
-            return NO_PAIRS
-        self._renewal_due = RENEWAL_GROWTH * self._seen.n
-        renewed = self._renewed[0] if len(self._renewed) == 1 else np.unique(np.concatenate(self._renewed))
-        self._renewed = []
-        return renewed
+    def renewed(self, known: np.ndarray) -> np.ndarray:
+        all_renewed, self._all_renewed = self._all_renewed, False
+        return np.flatnonzero(~known) if all_renewed else NO_PAIRS
 
     def lowest_reward(self) -> float:
         return min(float(source.rewards.min()) for source in self._sources)
 
-    def _renew_all(self) -> None:
-        assert self.target is not None
-        self._renewed = [np.arange(self.target.n_actions * len(self.target.sample_states))]
-
     def end_episode(self, truncated: bool) -> None:
-        """Time to renew what has changed.
-
-        An episode that ran into its time limit speaks against the transferred model: it reaches less far from now on.
+        """An episode that ran into its time limit speaks against the transferred model: it reaches less far from now on.
 
         Where transferred instances settle every pair, wrongly, nothing is optimistic and nothing would ever be tried.
         """
-        self._renewal_due = 0.0
         if truncated and self.fading < 1.0:
             self._rules = self._rules._replace(breadth=self._rules.breadth * self.fading)
-            self._renew_all()
+            self._all_renewed = True
 
     def _nothing_for(self, n: int) -> Supply:
         assert self.target is not None
@@ -306,7 +294,6 @@ class VirtualSourceTransfer(Transfer):
         return {
             "transitions": np.hstack(columns),
             "breadth": np.array([self._rules.breadth]),
-            "renewal_due": np.array([float(self._renewal_due)]),
             "uses": uses,
             "instances_used": np.array([float(self._instances_used)]),
         }
@@ -318,9 +305,8 @@ class VirtualSourceTransfer(Transfer):
         for row in saved["transitions"]:
             action = int(np.clip(row[-1], 0, self.target.n_actions - 1))
             self._note(row[:d], action, float(row[-2]), row[d : 2 * d])
-        # What has changed is known: all pairs are settled anew with what is restored here.
-        self._renewed = []
-        self._renewal_due = float(saved["renewal_due"][0])
+        # All pairs are settled anew with what is restored here.
+        self._all_renewed = False
         used = np.flatnonzero(saved["uses"] >= 1.0)
         self._uses = Counter(dict(zip(used.tolist(), saved["uses"][used].astype(np.int64).tolist(), strict=True)))
         self._instances_used = int(saved["instances_used"][0])
@@ -329,10 +315,6 @@ class VirtualSourceTransfer(Transfer):
         """Take up a saved transition."""
         self._seen.add(state, action, reward, effect)
 
-
-# Within an episode the model is renewed by what transfer has to say whenever it has seen this many times as much as at the
-# last renewal: every transition changes some choices, and to plan anew with each would cost more than all the rest.
-RENEWAL_GROWTH = 1.05
 
 NO_PAIRS = np.empty(0, dtype=np.int64)
 

@@ -11,17 +11,24 @@ class Ballots(ArrayStruct):
 
     :param compliance: float64, shape (n_transitions, most candidates of an action): with each of them, in their order
     :param least: float64, shape (n_transitions,): what the compliances of the voters must exceed in the mean
+    :param measured: bool, shape (n_transitions,): whether this is known of the transition
     :param total: float64 scratch, shape (most candidates of an action,)
     """
 
     compliance: np.ndarray
     least: np.ndarray
+    measured: np.ndarray
     total: np.ndarray
 
     @classmethod
     def empty(cls, most_candidates: int, capacity: int = 64) -> "Ballots":
         """Room for ``capacity`` transitions."""
-        return cls(np.empty((capacity, most_candidates)), np.empty(capacity), np.empty(most_candidates))
+        return cls(
+            compliance=np.empty((capacity, most_candidates)),
+            least=np.empty(capacity),
+            measured=np.zeros(capacity, dtype=np.bool_),
+            total=np.empty(most_candidates),
+        )
 
     def with_room(self, i: int) -> "Ballots":
         """Itself, or a copy of twice the size if transition ``i`` would not fit."""
@@ -30,21 +37,20 @@ class Ballots(ArrayStruct):
         return self.replace(
             compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
             least=np.concatenate([self.least, np.empty_like(self.least)]),
+            measured=np.concatenate([self.measured, np.zeros_like(self.measured)]),
         )
 
 
 @compiled
-def note_neighbor(i, state, sample_states, near, distance, changed):
+def note_neighbor(i, state, sample_states, near, distance, due):
     """Enter transition ``i`` at every sample state that has it among its nearest.
 
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
     :param distance: squared distances to them, the limit for none, updated
-    :param changed: receives the points at which it entered
-    :return: how many
+    :param due: bool, shape (n_points,): becomes True where it entered: a vote is due there
     """
     n_points, d = sample_states.shape
     last = near.shape[1] - 1
-    n_changed = 0
     for p in range(n_points):
         apart = 0.0
         for v in range(d):
@@ -52,9 +58,7 @@ def note_neighbor(i, state, sample_states, near, distance, changed):
             apart += along * along
         if apart < distance[p, last]:
             insert_neighbor(i, apart, near[p], distance[p])
-            changed[n_changed] = p
-            n_changed += 1
-    return n_changed
+            due[p] = True
 
 
 @inner
@@ -108,57 +112,52 @@ def elect(near, compliance, least, n_candidates, draw, total):
 
 
 @compiled
-def vote(points, near, ballots, first, last, draws, choice):
-    """Renew the choice at some sample states; those where it changed are moved to the front of ``points``.
+def vote(pairs, near, ballots, first, draws, choice):
+    """Renew the choice of some pairs; those for which it changed are moved to the front of ``pairs``.
 
-    :param first: first candidate of the action; ``last``: one past its last
-    :param draws: a random number for each of ``points``; or nothing, shape (0,): the best is chosen (see ``elect``)
-    :param choice: int64, shape (n_points,), updated
+    :param pairs: of an action and one of n_points states, ``action * n_points + point``
+    :param near: int64, shape (n_actions * n_points, n_neighbors): the transitions that vote, -1 for none
+    :param first: see ``CandidateArrays``
+    :param draws: a random number for each of ``pairs``; or nothing, shape (0,): the best is chosen (see ``elect``)
+    :param choice: int64, shape (n_actions * n_points,), updated
     :return: how many changed
     """
+    n_points = len(choice) // (len(first) - 1)
     n_changed = 0
-    for f in range(len(points)):
-        p = points[f]
+    for f in range(len(pairs)):
+        pair = pairs[f]
+        action = pair // n_points
         draw = draws[f] if len(draws) > 0 else -1.0
-        chosen = elect(near[p], ballots.compliance, ballots.least, last - first, draw, ballots.total)
+        n_candidates = first[action + 1] - first[action]
+        chosen = elect(near[pair], ballots.compliance, ballots.least, n_candidates, draw, ballots.total)
         if chosen >= 0:
-            chosen += first
-        if chosen != choice[p]:
-            choice[p] = chosen
-            points[n_changed] = p
+            chosen += first[action]
+        if chosen != choice[pair]:
+            choice[pair] = chosen
+            pairs[n_changed] = pair
             n_changed += 1
     return n_changed
 
 
 @compiled
-def choose_at(state, missing, states, actions, n, ballots, first, limit, near, distance, draws, choice):
-    """The candidate for every action with ``missing`` at an exact state, by the same vote; -1 for none.
+def find_voters(state, missing, states, actions, n, limit, near, distance):
+    """The transitions that vote at an exact state, for every action with ``missing``; no one for the others.
 
-    :param states: target transitions' states, of which the first ``n`` are measured; ``actions``: their actions
-    :param first: see ``CandidateArrays``
+    :param states: target transitions' states, of which the first ``n`` may vote; ``actions``: their actions
     :param limit: squared distance from which on a transition does not vote
-    :param near: int64 scratch, shape (n_neighbors,); ``distance``: float64, same shape
-    :param draws: a random number for each action; or nothing, shape (0,)
-    :param choice: receives the candidates, shape (n_actions,)
+    :param near: receives the transitions, the nearest first, -1 for none, shape (n_actions, n_neighbors)
+    :param distance: float64 scratch, same shape
     """
-    last = len(near) - 1
-    for action in range(len(missing)):
-        choice[action] = -1
+    near[:] = -1
+    distance[:] = limit
+    last = near.shape[1] - 1
+    for i in range(n):
+        action = actions[i]
         if not missing[action]:
             continue
-        for k in range(len(near)):
-            near[k] = -1
-            distance[k] = limit
-        for i in range(n):
-            if actions[i] != action:
-                continue
-            apart = 0.0
-            for v in range(len(state)):
-                along = states[i, v] - state[v]
-                apart += along * along
-            if apart < distance[last]:
-                insert_neighbor(i, apart, near, distance)
-        draw = draws[action] if len(draws) > 0 else -1.0
-        n_candidates = first[action + 1] - first[action]
-        chosen = elect(near, ballots.compliance, ballots.least, n_candidates, draw, ballots.total)
-        choice[action] = chosen if chosen < 0 else first[action] + chosen
+        apart = 0.0
+        for v in range(len(state)):
+            along = states[i, v] - state[v]
+            apart += along * along
+        if apart < distance[action, last]:
+            insert_neighbor(i, apart, near[action], distance[action])

@@ -131,9 +131,9 @@ class Pushy(Transfer):
     def lowest_reward(self):
         return -1.0
 
-    def renewed(self):
+    def renewed(self, known):
         news, self.news = self.news, self.news[:0]
-        return news
+        return news[~known[news]]
 
     def _push_all(self, needed):
         n = len(needed)

@@ -43,6 +43,17 @@ def supply_of(method, task):
     ]
 
 
+def choices_of(method, task):
+    """What the method chooses for every pair that is asked for."""
+    supply_of(method, task)
+    return method.choices()
+
+
+def renewed_by(method, task):
+    """The pairs that are renewed if none is known."""
+    return method.renewed(np.zeros(len(pairs_of(task)), dtype=bool))
+
+
 # ------------------------------------------------------------------- the vote
 
 
@@ -97,10 +108,10 @@ def test_every_pair_gets_the_mapping_that_its_nearest_transitions_vote_for(n_nei
         transition = naive.random_transition(rng, 3, 2)
         show(method, transition)
         vote.seen.append(transition)
-    n_chosen = 0
+    n_chosen, choices = 0, choices_of(method, task)
     for pair in pairs_of(task):
         means = vote.means(task.sample_states[pair % n_points], pair // n_points)
-        chosen = method._choice[pair]
+        chosen = choices[pair]
         if chosen < 0:
             assert max(means.values(), default=0.0) == 0.0
         else:
@@ -126,7 +137,7 @@ def test_the_chosen_mapping_translates_at_grid_points_and_at_exact_states():
     own = rng.uniform(0.0, 1.2, len(pairs))
     supply = method.supply(pairs, own, own >= 1.0)
     for pair in pairs:
-        chosen, expected = method._choice[pair], []
+        chosen, expected = method.choices()[pair], []
         if chosen >= 0 and own[pair] < 1.0:
             _, index, sign, source_action = named[chosen]
             state = task.sample_states[pair % len(POINTS)]
@@ -152,25 +163,27 @@ def test_renewed_names_exactly_the_pairs_whose_choice_changed():
     rng = np.random.default_rng(1)
     source, task = naive.random_source(rng, 100, 2, 2), naive.target_task(POINTS, 2)
     method = bound(COMBREL(source, bandwidths=BANDWIDTHS), task)
-    assert len(method.renewed()) == 0
-    choice, supply, n_renewed = method._choice.copy(), supply_of(method, task), 0
+    assert len(renewed_by(method, task)) == 0
+    choice, supply, n_renewed, n_waited = method.choices(), supply_of(method, task), 0, 0
     for n in range(60):
         show(method, naive.random_transition(rng, 3, 2))
-        renewed = method.renewed()
-        if n > 20 and len(renewed) == 0:
-            continue  # the more it has seen, the longer changes wait for each other
-        assert set(renewed) >= set(np.flatnonzero(method._choice != choice))
-        assert n > 20 or renewed.tolist() == np.flatnonzero(method._choice != choice).tolist()
+        renewed = renewed_by(method, task)
+        assert sorted(renewed) == np.flatnonzero(method.choices() != choice).tolist()
+        if n > 10 and len(renewed) == 0:
+            n_waited += 1  # the more it has seen, the longer changes wait for each other
+            continue
         now = supply_of(method, task)
         assert all(now[pair] == supply[pair] for pair in np.setdiff1d(pairs_of(task), renewed))
-        choice, supply, n_renewed = method._choice.copy(), now, n_renewed + len(renewed)
-    assert n_renewed > 40
+        choice, supply, n_renewed = method.choices(), now, n_renewed + len(renewed)
+    assert n_renewed > 40 and n_waited > 20
+    show(method, naive.random_transition(rng, 3, 2))
     method.end_episode(False)
-    assert set(method.renewed()) >= set(np.flatnonzero(method._choice != choice)), "an episode's end waits for nothing"
-    assert len(method.renewed()) == 0
+    renewed = renewed_by(method, task)
+    assert sorted(renewed) == np.flatnonzero(method.choices() != choice).tolist() != [], "an episode's end waits for nothing"
+    assert len(renewed_by(method, task)) == 0
 
 
-def test_renewed_adds_up_what_was_not_asked_for():
+def test_what_changed_and_changed_back_is_not_renewed():
     rng = np.random.default_rng(1)
     task = naive.target_task(POINTS, 2)
     one, other = (bound(COMBREL(naive.random_source(np.random.default_rng(9), 60, 2, 2)), task) for _ in range(2))
@@ -179,8 +192,28 @@ def test_renewed_adds_up_what_was_not_asked_for():
         transition = naive.random_transition(rng, 3, 2)
         show(one, transition)
         show(other, transition)
-        each.append(one.renewed())
-    assert other.renewed().tolist() == np.unique(np.concatenate(each)).tolist()
+        one.end_episode(False)
+        each.append(renewed_by(one, task))
+    at_once = renewed_by(other, task)
+    assert sorted(at_once) == np.flatnonzero(other.choices() >= 0).tolist()
+    assert set(at_once) <= set(np.concatenate(each))
+    np.testing.assert_array_equal(one.choices(), other.choices())
+
+
+def test_known_pairs_wait_until_they_are_asked_for():
+    """And what only they would hear is not measured."""
+    rng = np.random.default_rng(3)
+    task = naive.target_task(POINTS, 2)
+    lazy, eager = (bound(COMBREL(naive.random_source(np.random.default_rng(9), 60, 2, 2)), task) for _ in range(2))
+    known = np.tile(POINTS[:, 0] < 0.9, 2)
+    for _ in range(60):
+        transition = naive.random_transition(rng, 3, 2)
+        show(lazy, transition)
+        show(eager, transition)
+    assert sorted(lazy.renewed(known)) == sorted(set(renewed_by(eager, task)) - set(np.flatnonzero(known)))
+    assert (lazy.choices()[known] == -1).all()
+    assert 0 < lazy._ballots.measured.sum() < eager._ballots.measured.sum()
+    np.testing.assert_array_equal(choices_of(lazy, task), eager.choices())
 
 
 def test_without_transitions_nothing_is_transferred():
@@ -199,28 +232,29 @@ def test_measured_in_the_first_episode_nothing_is_transferred_before_it_ends_and
         transition = naive.random_transition(rng, 3, 2)
         show(paper, transition)
         show(online, transition)
-        assert len(paper.renewed()) == 0
+        assert len(renewed_by(paper, task)) == 0
         assert not paper.supply_at(transition.state, np.zeros(2)).count.any()
     assert not any(weights for weights, _, _ in supply_of(paper, task))
     assert any(weights for weights, _, _ in supply_of(online, task))
     paper.end_episode(False)
-    assert paper.renewed().tolist() == online.renewed().tolist() != []
+    assert len(renewed_by(paper, task)) > 0
     at_its_end = supply_of(paper, task)
     assert at_its_end == supply_of(online, task)
+    np.testing.assert_array_equal(paper.choices(), online.choices())
     for _ in range(20):
         transition = naive.random_transition(rng, 3, 2)
         show(paper, transition)
         show(online, transition)
-    assert len(paper.renewed()) == 0 < len(online.renewed())
+    assert len(renewed_by(paper, task)) == 0 < len(renewed_by(online, task))
     assert supply_of(paper, task) == at_its_end != supply_of(online, task)
 
 
-def test_no_more_transitions_are_measured_than_allowed():
+def test_no_more_transitions_vote_than_allowed():
     rng = np.random.default_rng(2)
     method = bound(COMBREL(naive.random_source(rng, 50), max_transitions=7), naive.target_task(POINTS, 2))
     for _ in range(20):
         show(method, naive.random_transition(rng, 3, 2))
-    assert method.statistics()["transfer/transitions_measured"] == 7
+    assert method.statistics()["transfer/target_transitions"] == 7
 
 
 def test_where_episodes_fail_the_transferred_instances_fade():
@@ -233,14 +267,13 @@ def test_where_episodes_fail_the_transferred_instances_fade():
         for method in (fading, steady, narrow):
             show(method, transition)
     before = supply_of(fading, task)
-    fading.renewed()
     fading.end_episode(False)
-    assert supply_of(fading, task) == before and len(fading.renewed()) == 0
+    assert supply_of(fading, task) == before and len(renewed_by(fading, task)) == 0
     for method in (fading, steady):
         method.end_episode(True)
     assert supply_of(steady, task) == before
     assert supply_of(fading, task) == supply_of(narrow, task) != before
-    assert fading.renewed().tolist() == pairs_of(task).tolist()
+    assert renewed_by(fading, task).tolist() == pairs_of(task).tolist()
 
 
 # ----------------------------------------------------- what it finds by itself
@@ -285,13 +318,13 @@ def choices_after(method, target, resolution=8):
     d = target.n_variables
     axes = [np.linspace(0.05, 0.95, resolution)] * d
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
-    bound(method, naive.target_task(points, target.n_actions))
+    task = naive.target_task(points, target.n_actions)
+    bound(method, task)
     starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
     for i in range(len(target)):
         show(method, naive.Transition(starts[i], int(target.actions[i]), float(target.rewards[i]), ends[i]))
     named = ways_of(method)
-    chosen = [[named[c] for c in row if c >= 0] for row in method._choice.reshape(target.n_actions, -1)]
-    return chosen
+    return [[named[c] for c in row if c >= 0] for row in choices_of(method, task).reshape(target.n_actions, -1)]
 
 
 def share(chosen, fits):
@@ -435,7 +468,7 @@ def test_every_variant_reaches_the_goal_and_transfers(arguments):
     figures = model.policy.statistics()
     assert figures["transfer/uses"] == sum(n for _, n in counts)
     assert 0.0 <= figures["transfer/choice_entropy"] <= np.log(figures["transfer/distinct_mappings"]) + 1e-9
-    assert figures["transfer/transitions_measured"] <= lengths.sum() + 1
+    assert figures["transfer/target_transitions"] <= lengths.sum() + 1
 
 
 def test_with_relevance_the_instances_that_the_target_contradicts_come_last():

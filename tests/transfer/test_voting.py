@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL
-from sb3_combrel.transfer.voting import Ballots, choose_at, note_neighbor, vote
+from sb3_combrel.transfer.voting import Ballots, find_voters, note_neighbor, vote
 
 N_DRAWS = 4000
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -20,12 +20,14 @@ def ballots_of(rng, n_transitions, n_candidates, least=0.4):
     return ballots
 
 
-def shares(near, ballots, n_candidates, first=5):
-    """The part of evenly spread draws that chooses each candidate; the last entry: none."""
+def shares(near, ballots, n_candidates, n_before=5):
+    """The part of evenly spread draws that chooses each candidate of the second of two actions; the last entry: none."""
     draws = (np.arange(N_DRAWS) + 0.5) / N_DRAWS
-    choice = np.full(N_DRAWS, -7)
-    vote(np.arange(N_DRAWS), np.tile(near, (N_DRAWS, 1)), ballots, first, first + n_candidates, draws, choice)
-    chosen = np.where(choice < 0, n_candidates, choice - first)
+    choice = np.full(2 * N_DRAWS, -7)
+    first = np.array([0, n_before, n_before + n_candidates])
+    vote(np.arange(N_DRAWS, 2 * N_DRAWS), np.tile(near, (2 * N_DRAWS, 1)), ballots, first, draws, choice)
+    assert (choice[:N_DRAWS] == -7).all()
+    chosen = np.where(choice[N_DRAWS:] < 0, n_candidates, choice[N_DRAWS:] - n_before)
     return np.bincount(chosen, minlength=n_candidates + 1) / N_DRAWS
 
 
@@ -51,26 +53,28 @@ def test_at_a_sample_state_the_vote_is_the_same_as_on_the_grid(seed, drawn):
     ballots, states, actions = ballots_of(rng, n, n_candidates), rng.random((n, 2)), rng.integers(n_actions, size=n)
     draws = rng.random(n_actions) if drawn else np.empty(0)
     limit = 0.3**2
-    on_grid = np.full((n_actions, len(POINTS)), -1)
-    for action in range(n_actions):
-        near, distance = np.full((len(POINTS), 3), -1), np.full((len(POINTS), 3), limit)
-        for i in np.flatnonzero(actions == action):
-            note_neighbor(i, states[i], POINTS, near, distance, np.empty(len(POINTS), dtype=np.int64))
-        of_points = np.repeat(draws[action], len(POINTS)) if drawn else draws
-        points = np.arange(len(POINTS))
-        vote(points, near, ballots, first[action], first[action + 1], of_points, on_grid[action])
-    near, distance, choice = np.empty(3, dtype=np.int64), np.empty(3), np.empty(n_actions, dtype=np.int64)
+    near, distance = np.full((n_actions, len(POINTS), 3), -1), np.full((n_actions, len(POINTS), 3), limit)
+    due = np.zeros((n_actions, len(POINTS)), dtype=bool)
+    for i, action in enumerate(actions):
+        note_neighbor(i, states[i], POINTS, near[action], distance[action], due[action])
+    np.testing.assert_array_equal(due, near[:, :, 0] >= 0)
+    on_grid = np.full(n_actions * len(POINTS), -1)
+    of_pairs = np.repeat(draws, len(POINTS)) if drawn else draws
+    vote(np.arange(len(on_grid)), near.reshape(-1, 3), ballots, first, of_pairs, on_grid)
+    near, distance, choice = np.empty((n_actions, 3), dtype=np.int64), np.empty((n_actions, 3)), np.full(n_actions, -1)
     for p, state in enumerate(POINTS):
-        missing = np.ones(n_actions, dtype=bool)
-        choose_at(state, missing, states, actions, n, ballots, first, limit, near, distance, draws, choice)
-        np.testing.assert_array_equal(choice, on_grid[:, p])
+        find_voters(state, np.ones(n_actions, dtype=bool), states, actions, n, limit, near, distance)
+        vote(np.arange(n_actions), near, ballots, first, draws, choice)
+        np.testing.assert_array_equal(choice, on_grid.reshape(n_actions, -1)[:, p])
 
 
-def test_an_action_that_needs_nothing_gets_nothing():
-    ballots, choice = ballots_of(np.random.default_rng(0), 3, 2, least=0.0), np.empty(2, dtype=np.int64)
-    scratch = np.empty(3, dtype=np.int64), np.empty(3)
-    states, actions, first = np.zeros((3, 2)), np.array([0, 1, 1]), np.array([0, 2, 4])
-    choose_at(np.zeros(2), np.array([True, False]), states, actions, 3, ballots, first, 1.0, *scratch, np.empty(0), choice)
+def test_an_action_that_needs_nothing_has_no_voters():
+    near, distance = np.empty((2, 3), dtype=np.int64), np.empty((2, 3))
+    states, actions, missing = np.zeros((3, 2)), np.array([0, 1, 1]), np.array([True, False])
+    find_voters(np.zeros(2), missing, states, actions, 3, 1.0, near, distance)
+    assert near.tolist() == [[0, -1, -1], [-1, -1, -1]]
+    choice = np.full(2, 7)
+    vote(np.arange(2), near, ballots_of(np.random.default_rng(0), 3, 2, least=0.0), np.array([0, 2, 4]), np.empty(0), choice)
     assert choice[0] in (0, 1) and choice[1] == -1
 
 
@@ -83,6 +87,7 @@ class TestMethod:
         for _ in range(15):
             t = naive.random_transition(rng, 2, 2)
             method.observe(t.state, t.action, t.reward, t.next_state, False)
+        method.renewed(np.zeros(2 * len(POINTS), dtype=bool))
         return method
 
     def test_the_seed_decides(self):
