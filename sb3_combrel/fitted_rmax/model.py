@@ -17,7 +17,6 @@ from sb3_combrel.fitted_rmax.model_kernels import (
     leave_lists,
     renew_predecessors,
     settle,
-    worth_settling,
 )
 from sb3_combrel.fitted_rmax.restoring import in_neighbourhoods, note_effects, refill_lists
 from sb3_combrel.transfer.base import Transfer
@@ -89,7 +88,6 @@ class KernelModel:
         )
         self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
         self.scratch = Scratch.for_grid(grid)
-        self._worth_settling = SameTypes(worth_settling)
         self._enter_lists, self._settle = SameTypes(enter), SameTypes(settle)
         self._progress = np.empty(2, dtype=np.int64)
         self._no_supply = Supply.empty(MOST_PAIRS_AT_ONCE, grid.n_variables)
@@ -187,8 +185,16 @@ class KernelModel:
         return newly_known
 
     def worth_settling(self, pairs: np.ndarray) -> np.ndarray:
-        """Those of ``pairs`` (which is overwritten) that have news; the others wait for :meth:`waiting`."""
-        return pairs[: self._worth_settling(self.arrays, pairs, NEWS * self.exploration_threshold)]
+        """Those of ``pairs`` that are known, or have news; the others wait for :meth:`waiting`.
+
+        An instance that hardly counts among transferred ones would have hundreds of pairs translated and planned anew.
+        """
+        arrays = self.arrays
+        known = arrays.known[pairs]
+        if known.all():
+            return pairs
+        news = np.abs(arrays.total[pairs] - arrays.heard[pairs]) >= NEWS * self.exploration_threshold
+        return pairs[known | news]
 
     def waiting(self) -> np.ndarray:
         """The pairs that are not known and whose own weight has changed since they were settled."""

@@ -387,21 +387,6 @@ def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
 
 
 @compiled
-def worth_settling(arrays, pairs, news):
-    """Move to the front of ``pairs`` the known ones, and those whose own weight has changed by ``news``; how many.
-
-    An instance that hardly counts among transferred ones would have hundreds of pairs translated and planned anew.
-    """
-    kept = 0
-    for p in range(len(pairs)):
-        pair = pairs[p]
-        if arrays.known[pair] or abs(arrays.total[pair] - arrays.heard[pair]) >= news:
-            pairs[kept] = pair
-            kept += 1
-    return kept
-
-
-@compiled
 def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
     """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
 

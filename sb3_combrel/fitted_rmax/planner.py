@@ -60,13 +60,6 @@ def push(queue, point):
     queue.waiting[point] = True
 
 
-@compiled
-def push_all(queue, points):
-    """Let ``points`` wait for a backup, after all others."""
-    for p in range(len(points)):
-        push(queue, points[p])
-
-
 @inlined
 def pop(queue):
     """The point that has waited longest, -1 if none waits."""
@@ -316,8 +309,11 @@ class Planner:
         """Take over saved values; every point with a row is backed up once more when there is time."""
         self._exploitation = None
         self.values[:] = np.clip(values, *self.bounds)
-        self.queue = SweepQueue.empty(self.values, self.model.n_actions)
-        push_all(self.queue, np.flatnonzero(self.model.arrays.n_optimistic == 0))
+        self.queue = queue = SweepQueue.empty(self.values, self.model.n_actions)
+        points = np.flatnonzero(self.model.arrays.n_optimistic == 0)
+        queue.ring[: len(points)] = points
+        queue.ends[1] = len(points)
+        queue.waiting[points] = True
 
     def start_anew(self) -> None:
         """Forget how the values came about, as if they and the model had been restored."""

@@ -8,7 +8,7 @@ from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.compliance import ComplianceScratch, standstill_compliance, transition_compliance
+from sb3_combrel.transfer.compliance import ComplianceScratch, RewardCounts, standstill_compliance, transition_compliance
 from sb3_combrel.transfer.virtual_source import (
     DEFAULT_BREADTH,
     DEFAULT_FADING,
@@ -117,6 +117,7 @@ class COMBREL(VirtualSourceTransfer):
         n_points = len(target.sample_states)
         self._compliance_scratch = ComplianceScratch.for_mappings(self._table, self._instances)
         self._table_of_one = np.empty((n_rows, n_actions))
+        self._rewards = RewardCounts.of_instances(self._instances)
         self._ballots = Ballots.empty(int(np.diff(self._ways.first).max()))
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
         # An empty place counts as a neighbour at the limit: whoever is farther away does not enter.
@@ -125,8 +126,8 @@ class COMBREL(VirtualSourceTransfer):
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._vote_due = np.zeros(target.n_actions * n_points, dtype=np.bool_)
         self._renewal_due = 0.0
-        self._transition_compliance, self._standstill_compliance, self._note_neighbor, self._vote, self._find_voters = map(
-            SameTypes, (transition_compliance, standstill_compliance, note_neighbor, vote, find_voters)
+        self._transition_compliance, self._note_neighbor, self._vote, self._find_voters = map(
+            SameTypes, (transition_compliance, note_neighbor, vote, find_voters)
         )
         self._first_episode = True
         self._switches = 0
@@ -188,10 +189,11 @@ class COMBREL(VirtualSourceTransfer):
             return pairs
         near = self._near.reshape(-1, self.n_neighbors)
         self._measure(near[pairs])
+        changed = pairs.copy()
+        n_changed = self._vote(changed, near, self._ballots, self._ways.first, self._draws(len(pairs)), self._choice)
         self._vote_due[pairs] = False
-        changed = self._vote(pairs, near, self._ballots, self._ways.first, self._draws(len(pairs)), self._choice)
-        self._switches += changed
-        return pairs[:changed]
+        self._switches += n_changed
+        return changed[:n_changed]
 
     def _measure(self, voters: np.ndarray) -> None:
         """Compliance with every mapping of those of these transitions that have not voted yet (lines 9-13)."""
@@ -212,7 +214,7 @@ class COMBREL(VirtualSourceTransfer):
             of_action = slice(self._ways.first[action], self._ways.first[action + 1])
             compliance = self._table_of_one[self._ways.row[of_action], self._ways.action[of_action]]
             self._ballots.compliance[i, : len(compliance)] = compliance
-            standstill = self._standstill_compliance(self._seen.effects[i], reward, self._instances, self._bandwidths)
+            standstill = standstill_compliance(self._seen.effects[i], reward, self._rewards, self._bandwidths)
             self._ballots.least[i] = self.min_compliance * standstill
             self._ballots.measured[i] = True
 
@@ -246,12 +248,12 @@ class COMBREL(VirtualSourceTransfer):
 
     def _note(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> None:
         super()._note(state, action, reward, effect)
-        if self._measures:
+        if self._may_vote:
             self._enfranchise(self._seen.n - 1)
 
     @property
-    def _measures(self) -> bool:
-        """Whether the transitions seen so far are measured."""
+    def _may_vote(self) -> bool:
+        """Whether the transitions seen so far vote."""
         return self.measured == "online" or not self._first_episode
 
     # ---------------------------------------------------------------- supplying
@@ -271,7 +273,7 @@ class COMBREL(VirtualSourceTransfer):
         missing = own_weight < self._rules.threshold
         if self._seen.n == 0 or not missing.any():
             return self._nothing_for(len(own_weight))
-        n_voting = self._seen.n if self._measures else 0
+        n_voting = self._seen.n if self._may_vote else 0
         transitions = self._seen.states, self._seen.actions, n_voting
         self._find_voters(state, missing, *transitions, self._limit, self._near_at, self._distance_at)
         self._measure(self._near_at)

@@ -29,6 +29,24 @@ class Bandwidths(NamedTuple):
     reward: float
 
 
+class RewardCounts(NamedTuple):
+    """The rewards of source instances.
+
+    :param value: the different ones, raw, shape (n,)
+    :param part: which part of all instances has each of them, same shape
+    """
+
+    value: np.ndarray
+    part: np.ndarray
+
+    @classmethod
+    def of_instances(cls, source: InstanceArrays) -> "RewardCounts":
+        """Those of all source actions."""
+        rewards = [source.reward[action, :n] for action, n in enumerate(source.count)]
+        value, count = np.unique(np.concatenate(rewards), return_counts=True)
+        return cls(value, count / count.sum())
+
+
 class MappingTable(ArrayStruct):
     """State mappings for compiled code, one a row.
 
@@ -224,23 +242,13 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
             table[m, action] = scratch.still[m] * _mapping_compliance(m, source.count[action], scratch)
 
 
-@compiled
-def standstill_compliance(effect, reward, source, bandwidths):
+def standstill_compliance(effect: np.ndarray, reward: float, rewards: RewardCounts, bandwidths: Bandwidths) -> float:
     """Compliance of one target transition with a world in which nothing moves, and rewards are the source's anywhere.
 
     What a mapping is worth: one that predicts worse than this has nothing to say about the target.
     """
-    moved = 0.0
-    for v in range(len(effect)):
-        moved += effect[v] * effect[v]
-    rewarded = 0.0
-    n = 0
-    for action in range(len(source.count)):
-        for j in range(source.count[action]):
-            off = reward - source.reward[action, j]
-            rewarded += 1.0 if off == 0.0 else np.exp(-off * off / bandwidths.reward)
-        n += source.count[action]
-    return np.exp(-moved / bandwidths.outcome) * rewarded / n
+    rewarded = rewards.part @ np.exp(-((reward - rewards.value) ** 2) / bandwidths.reward)
+    return float(np.exp(-(effect @ effect) / bandwidths.outcome) * rewarded)
 
 
 @compiled
