@@ -94,7 +94,8 @@ def _type_of(value: Any, name: str) -> Any:
     if isinstance(value, ArrayStruct):
         return value.compiled_type
     if not (isinstance(value, np.ndarray) and value.flags.carray):
-        raise TypeError(f"{name} must be a C-contiguous, writeable array or an ArrayStruct, got {value!r}")
+        given = f"one of shape {value.shape} that is not" if isinstance(value, np.ndarray) else repr(value)
+        raise TypeError(f"{name} must be a C-contiguous, writeable array or an ArrayStruct, got {given}")
     return types.Array(from_dtype(value.dtype), value.ndim, "C")
 
 

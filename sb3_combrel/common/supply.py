@@ -33,3 +33,25 @@ class Supply(ArrayStruct):
             reward=np.empty((n, most)),
             terminated=np.empty((n, most), dtype=np.bool_),
         )
+
+    def check(self, n: int, n_variables: int, method: object) -> None:
+        """Refuse what compiled code would read beyond its ends.
+
+        :param n: rows that were asked for
+        :param n_variables: of the target
+        :param method: whoever supplied this
+        :raises ValueError: if there are fewer rows, or the arrays do not fit each other
+        """
+        name, places = type(method).__name__, self.weight.shape
+        expected = {"count": places[:1], "effect": (*places, n_variables), "reward": places, "terminated": places}
+        for array, shape in expected.items():
+            if getattr(self, array).shape != shape:
+                raise ValueError(
+                    f"{name} supplied {array} of shape {getattr(self, array).shape} with weight of shape {places}; "
+                    f"with {n_variables} state variables that must be {shape}"
+                )
+        if len(self.count) < n:
+            raise ValueError(f"{name} supplied {len(self.count)} rows, but was asked for {n}")
+        count = self.count[:n]
+        if n > 0 and (count.min() < 0 or count.max() > places[1]):
+            raise ValueError(f"{name} supplied counts from {count.min()} to {count.max()}, with room for {places[1]} instances")

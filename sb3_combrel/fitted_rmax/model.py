@@ -226,7 +226,11 @@ class KernelModel:
         if self.transfer is None:
             return self._no_supply
         known = self.arrays.known[pairs]
-        return self._no_supply if known.all() else self.transfer.supply(pairs, self.arrays.total[pairs], known)
+        if known.all():
+            return self._no_supply
+        supply = self.transfer.supply(pairs, self.arrays.total[pairs], known)
+        supply.check(len(pairs), self.grid.n_variables, self.transfer)
+        return supply
 
     def renew_predecessors(self) -> None:
         """Forget predecessors that no row needs any more."""

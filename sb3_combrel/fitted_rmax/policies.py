@@ -196,6 +196,7 @@ class FittedRMaxPolicy(BasePolicy):
         supply = self._no_supply
         if self.transfer is not None and least < model.exploration_threshold:
             supply = self.transfer.supply_at(state, self._query.total)
+            supply.check(self.n_actions, len(state), self.transfer)
         best: int = self._choose(
             model.instances,
             state,

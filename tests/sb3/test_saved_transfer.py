@@ -167,6 +167,22 @@ def test_a_method_of_the_users_own_is_saved_by_its_arguments(tmp_path, recwarn):
     assert loaded.policy.transfer.n_observed == 40
 
 
+@pytest.mark.parametrize(
+    "broken, message",
+    [
+        (lambda s: s.replace(count=s.count[:1], weight=s.weight[:1], effect=s.effect[:1], reward=s.reward[:1]), "terminated of"),
+        (lambda s: Supply.empty(1, 2, 1), "Pushy supplied 1 rows, but was asked for"),
+        (lambda s: s.replace(effect=s.effect[:, :, :1].copy()), r"state variables that must be \(\d+, 1, 2\)"),
+        (lambda s: s.replace(count=2 * s.count), "counts from 2 to 2, with room for 1 instances"),
+    ],
+)
+def test_a_method_that_supplies_too_little_is_told_so(broken, message, monkeypatch):
+    whole = Pushy._push_all
+    monkeypatch.setattr(Pushy, "_push_all", lambda self, needed: broken(whole(self, needed)))
+    with pytest.raises(ValueError, match=message):
+        small(transfer=Pushy(STRIDE / 2)).learn(30)
+
+
 def test_what_is_not_plain_data_is_not_saved_but_asked_for(tmp_path):
     own = Pushy(STRIDE / 2, schedule=lambda n: n)
     model = small(transfer=own).learn(30)

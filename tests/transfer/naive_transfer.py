@@ -54,6 +54,14 @@ def random_source(rng, n, n_variables=2, n_actions=3, spread=1.0):
     )
 
 
+def places_of(source, instances):
+    """Where the package, which has instances in an order of its own, keeps each of the source's."""
+    units = source.scaling.to_unit(source.states)
+    return np.array(
+        [np.flatnonzero((instances.state[a] == unit).all(axis=1))[0] for a, unit in zip(source.actions, units, strict=True)]
+    )
+
+
 def random_transition(rng, n_variables, n_actions, spread=1.0):
     """A transition without any meaning."""
     state = 0.5 + spread * (rng.random(n_variables) - 0.5)

@@ -251,12 +251,10 @@ def test_relevance_is_that_of_the_equations(seed, sizes, bandwidths, n_transitio
     source = naive.random_source(rng, 15, sizes[0], sizes[2], 0.4)
     mapping = naive.random_mapping(rng, *sizes)
     transitions = [naive.random_transition(rng, n_target, n_target_actions, 0.4) for _ in range(n_transitions)]
+    places = naive.places_of(source, stacked_instances([source]))
     for action in range(n_target_actions):
-        # The package has instances in an order of its own.
-        instances, units = stacked_instances([source]), source.scaling.to_unit(source.states)
-        in_order = instances.state[mapping.action[action], : instances.count[mapping.action[action]]]
-        numbers = [np.flatnonzero((units == state).all(axis=1))[0] for state in in_order]
-        found = relevances(source, mapping.action[action], mapping, action, transitions, bandwidths, mu)
+        numbers = np.flatnonzero(source.actions == mapping.action[action])
+        found = relevances(source, mapping.action[action], mapping, action, transitions, bandwidths, mu)[places[numbers]]
         expected = [naive.relevance(source, j, mapping, action, transitions, bandwidths, mu) for j in numbers]
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
 

@@ -93,12 +93,7 @@ def test_with_relevance_the_most_relevant_come_first_and_light_ones_count_too(se
     states, own = rng.random((4, 3)), rng.uniform(0.0, threshold, 4)
     task = naive.target_task(states, 1, threshold)
     merit = rng.random((2, 60))
-    # The package has instances in an order of its own.
-    instances, units = stacked_instances([source]), source.scaling.to_unit(source.states)
-    within = [
-        np.flatnonzero((instances.state[action] == unit).all(axis=1))[0]
-        for action, unit in zip(source.actions, units, strict=True)
-    ]
+    within = naive.places_of(source, stacked_instances([source]))
     supply, drawn_from = supplied(states, own, mappings, source, task, breadth, merit=merit)
     for row in range(4):
         expected = naive.transferred(
