@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 
@@ -99,7 +100,7 @@ def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
     return model.num_timesteps, time.process_time() - start
 
 
-def measure(number: int, part: float = 1.0) -> tuple[int, float, float]:
+def measure(number: int, part: float = 1.0, seed: int = 0) -> tuple[int, float, float]:
     """Steps, milliseconds a step and MiB beyond the imports of case ``number``, warm, in a process of its own."""
     code = (
         "import torch; torch.set_num_threads(1)\n"
@@ -108,7 +109,7 @@ def measure(number: int, part: float = 1.0) -> tuple[int, float, float]:
         "bench.learn(bench.CASES[0], 1, seed=1)\n"
         "if case.transfers: bench.learn(case, 1, seed=1)\n"
         "before = bench.resident_memory()\n"
-        f"steps, seconds = bench.learn(case, max(1, round({part} * case.n_episodes)))\n"
+        f"steps, seconds = bench.learn(case, max(1, round({part} * case.n_episodes)), {seed})\n"
         "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -116,11 +117,32 @@ def measure(number: int, part: float = 1.0) -> tuple[int, float, float]:
     return int(steps), float(milliseconds), float(memory)
 
 
+def compare(n_pairs: int, part: float) -> None:
+    """Print what COMBREL adds to the mean time of a step, in pairs of runs with the same seed.
+
+    Both runs of a pair go at the same time: whatever else slows the machine slows both.
+    """
+    with_transfer = next(number for number, case in enumerate(CASES) if case.transfers)
+    numbers, added = (with_transfer - 1, with_transfer), []
+    print(f"{CASES[numbers[0]].name}, without transfer and with COMBREL, ms/step")
+    with ThreadPoolExecutor(2) as pool:
+        for seed in range(n_pairs):
+            (_, without, _), (_, transferring, _) = pool.map(measure, numbers, (part, part), (seed, seed))
+            added.append(transferring / without - 1.0)
+            print(f"seed {seed:2}: {without:.3f} {transferring:.3f} {added[-1]:+.0%}", flush=True)
+    print(f"mean {sum(added) / n_pairs:+.0%}, from {min(added):+.0%} to {max(added):+.0%}")
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--part", type=float, default=1.0, help="part of each case's episodes, for a quick look")
-    part = parser.parse_args().part
+    parser.add_argument("--pairs", type=int, default=0, help="instead: what transfer adds to a step, in so many pairs of runs")
+    arguments = parser.parse_args()
+    part = arguments.part
+    if arguments.pairs > 0:
+        compare(arguments.pairs, part)
+        return
     print(f"{'case':45} {'episodes':>8} {'steps':>7} {'ms/step':>8} {'MiB':>6}")
     for number, case in enumerate(CASES):
         steps, milliseconds, memory = measure(number, part)
