@@ -126,6 +126,7 @@ class COMBREL(VirtualSourceTransfer):
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._vote_due = np.zeros(target.n_actions * n_points, dtype=np.bool_)
         self._renewal_due = 0.0
+        self._paused = False
         self._transition_compliance, self._note_neighbor, self._vote, self._find_voters = map(
             SameTypes, (transition_compliance, note_neighbor, vote, find_voters)
         )
@@ -176,6 +177,7 @@ class COMBREL(VirtualSourceTransfer):
         )
 
     def renewed(self, known: np.ndarray) -> np.ndarray:
+        self._paused = False
         faded = super().renewed(known)
         if len(faded) or self._seen.n < self._renewal_due:
             return faded
@@ -240,6 +242,8 @@ class COMBREL(VirtualSourceTransfer):
         chosen = saved["choice"].astype(np.int64).reshape(self.target.n_actions, -1)
         self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
         self._vote_due[:] = saved["vote_due"] > 0.5
+        # Until learning goes on, the choices are those that were saved.
+        self._paused = True
         self._draws_at = np.clip(saved["draws_at"], 0.0, 1.0)
         self._renewal_due = float(saved["renewal_due"][0])
         self._switches = int(saved["switches"][0])
@@ -260,7 +264,8 @@ class COMBREL(VirtualSourceTransfer):
 
     def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
         assert self.target is not None
-        self._hold_votes(pairs[~known])
+        if not self._paused:
+            self._hold_votes(pairs[~known])
         chosen = np.where(known, -1, self._choice[pairs])
         if (chosen < 0).all():
             return self._nothing_for(len(pairs))

@@ -78,6 +78,8 @@ def test_choices_compliance_and_supply_are_the_same_at_once(name, steps, tmp_pat
         np.testing.assert_array_equal(ours.chosen_compliance(pairs), theirs.chosen_compliance(pairs))
         assert (ours.choices() >= 0).any() == (steps == 47 or (steps > 0 and ours.measured == "online"))
     own = np.zeros(len(pairs))
+    for method in (ours, theirs):
+        method.renewed(own > 0)
     supplies = [method.supply(pairs, own, own > 0) for method in (ours, theirs)]
     supplies += [method.supply_at(np.array([0.3, 0.5]), np.zeros(2)) for method in (ours, theirs)]
     for n_rows, (one, other) in ((len(pairs), supplies[:2]), (2, supplies[2:])):
