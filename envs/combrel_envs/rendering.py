@@ -1,5 +1,6 @@
 """dm_control with or without OpenGL: the choice of a rendering backend, and a clear word when there is none."""
 
+import contextlib
 import ctypes
 import importlib
 import os
@@ -33,6 +34,7 @@ def import_dm_control() -> None:
     chosen = os.environ.get("MUJOCO_GL")
     if chosen is None and _is_headless_linux():
         os.environ["MUJOCO_GL"] = _headless_backend()
+    _import_triton()
     try:
         importlib.import_module("dm_control.mujoco")
     except Exception as error:
@@ -64,6 +66,17 @@ def open_gl(physics: Any) -> None:
 
 def _is_headless_linux() -> bool:
     return sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _import_triton() -> None:
+    """Import triton, where it is installed, before Mesa is loaded.
+
+    Both have an LLVM of their own. PyTorch's wheels for CUDA bring triton and import it with the first optimizer; if
+    Mesa was there first, that ends the process with a segmentation fault.
+    """
+    # Most don't have it, and what is wrong with it PyTorch will say.
+    with contextlib.suppress(Exception):
+        importlib.import_module("triton")
 
 
 def _headless_backend() -> str:
