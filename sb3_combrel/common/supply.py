@@ -54,4 +54,6 @@ class Supply(ArrayStruct):
             raise ValueError(f"{name} supplied {len(self.count)} rows, but was asked for {n}")
         count = self.count[:n]
         if n > 0 and (count.min() < 0 or count.max() > places[1]):
-            raise ValueError(f"{name} supplied counts from {count.min()} to {count.max()}, with room for {places[1]} instances")
+            raise ValueError(
+                f"{name} supplied counts from {count.min()} to {count.max()}, with room for {places[1]} instances"
+            )

@@ -172,7 +172,10 @@ def test_a_method_of_the_users_own_is_saved_by_its_arguments(tmp_path, recwarn):
 @pytest.mark.parametrize(
     "broken, message",
     [
-        (lambda s: s.replace(count=s.count[:1], weight=s.weight[:1], effect=s.effect[:1], reward=s.reward[:1]), "terminated of"),
+        (
+            lambda s: s.replace(count=s.count[:1], weight=s.weight[:1], effect=s.effect[:1], reward=s.reward[:1]),
+            "terminated of",
+        ),
         (lambda s: Supply.empty(1, 2, 1), "Pushy supplied 1 rows, but was asked for"),
         (lambda s: s.replace(effect=s.effect[:, :, :1].copy()), r"state variables that must be \(\d+, 1, 2\)"),
         (lambda s: s.replace(count=2 * s.count), "counts from 2 to 2, with room for 1 instances"),
