@@ -22,9 +22,9 @@ from sb3_combrel.fitted_rmax.restoring import in_neighbourhoods, note_effects, r
 from sb3_combrel.transfer.base import Transfer
 
 MOST_PAIRS_AT_ONCE = 4096
-# Part of the threshold by which own weight must have grown before a pair that draws on transferred instances is settled
-# anew within an episode.
-NEWS = 0.25
+# Part of the threshold by which own weight must have changed before a pair that draws on transferred instances is settled
+# anew within an episode: an instance that hardly counts among them would have hundreds of pairs translated and planned.
+NEWS = 0.5
 # A time limit reached this often is taken as it comes; each further time the threshold shrinks by the factor.
 EPISODES_OF_PATIENCE = 10
 IMPATIENCE = 0.98
@@ -89,7 +89,7 @@ class KernelModel:
         self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
         self.scratch = Scratch.for_grid(grid)
         self._enter_lists, self._settle = SameTypes(enter), SameTypes(settle)
-        self._progress = np.empty(2, dtype=np.int64)
+        self._progress = np.empty(3, dtype=np.int64)
         self._no_supply = Supply.empty(MOST_PAIRS_AT_ONCE, grid.n_variables)
         self.list_room = list_room(min_fraction)
 
@@ -104,7 +104,8 @@ class KernelModel:
         :param state: unit coordinates, shape (n_variables,)
         :param next_state: the same
         :param terminated: the episode ended in a terminal state; a time limit is none
-        :return: the pairs whose model changed, int64
+        :return: the pairs to be settled anew, int64: those whose lists changed, but with a transfer method only known ones
+            and those with news; the others may wait (see :meth:`waiting`)
         """
         slot, without = self._slot_for(action)
         changed = self._enter(action, slot, state, next_state, reward, terminated)
@@ -138,14 +139,16 @@ class KernelModel:
     def _enter(
         self, action: int, slot: int, state: np.ndarray, next_state: np.ndarray, reward: float, terminated: bool
     ) -> np.ndarray:
-        """Put an instance into its slot and into the lists it reaches; the pairs whose list has it."""
-        self._progress[:] = -1, 0
+        """Put an instance into its slot and into the lists it reaches; of these pairs, those to be settled anew."""
+        threshold = self.exploration_threshold
+        news = 0.0 if self.transfer is None else NEWS * threshold
+        self._progress[:] = -1, 0, 0
         while not self._enter_lists(
             self.instances,
             self.arrays,
             self.grid.arrays,
             self._kernel,
-            self.exploration_threshold,
+            (threshold, news),
             action,
             slot,
             state,
@@ -156,7 +159,7 @@ class KernelModel:
             self._progress,
         ):
             self.make_room()
-        return self.scratch.point[: self._progress[0]] + action * self.grid.n_points
+        return self.scratch.point[: self._progress[2]] + action * self.grid.n_points
 
     def make_room(self) -> None:
         """Grow the pools that were too small for what was last asked of them."""
@@ -183,18 +186,6 @@ class KernelModel:
         newly_known = np.flatnonzero(~self.arrays.known & (self.arrays.total >= self.exploration_threshold))
         self.arrays.known[newly_known] = True
         return newly_known
-
-    def worth_settling(self, pairs: np.ndarray) -> np.ndarray:
-        """Those of ``pairs`` that are known, or have news; the others wait for :meth:`waiting`.
-
-        An instance that hardly counts among transferred ones would have hundreds of pairs translated and planned anew.
-        """
-        arrays = self.arrays
-        known = arrays.known[pairs]
-        if known.all():
-            return pairs
-        news = np.abs(arrays.total[pairs] - arrays.heard[pairs]) >= NEWS * self.exploration_threshold
-        return pairs[known | news]
 
     def waiting(self) -> np.ndarray:
         """The pairs that are not known and whose own weight has changed since they were settled."""

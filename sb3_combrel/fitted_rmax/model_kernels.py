@@ -140,14 +140,19 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
 
 
 @compiled
-def enter(instances, arrays, grid, kernel, threshold, action, slot, state, next_state, reward, terminated, scratch, progress):
+def enter(
+    instances, arrays, grid, kernel, thresholds, action, slot, state, next_state, reward, terminated, scratch, progress
+):
     """Write an instance to its slot, and put it into the lists of all pairs that it reaches.
 
     :param kernel: (breadth, min_weight, min_fraction)
-    :param progress: int64, shape (2,): pairs in reach, and how many of them are done; {-1, 0} at first
+    :param thresholds: (weight that makes a pair known, change of its weight that makes another one worth settling anew)
+    :param progress: int64, shape (3,): pairs in reach, how many of them are done, and how many of these are worth settling
+        anew, whose points are moved to the front of ``scratch.point``; {-1, 0, 0} at first
     :return: False if the lists' pool must grow before another call goes on
     """
     breadth, min_weight, min_fraction = kernel
+    threshold, news = thresholds
     n_points = len(arrays.n_optimistic)
     first_pair = action * n_points
     if progress[0] < 0:
@@ -157,7 +162,8 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, state, next_
         progress[0] = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, entry, scratch)
     lists = arrays.lists
     while progress[1] < progress[0]:
-        pair = first_pair + scratch.point[progress[1]]
+        point = scratch.point[progress[1]]
+        pair = first_pair + point
         length = np.int64(lists.length[pair])
         if not reserve(lists, pair, length + 1):
             return False
@@ -174,6 +180,9 @@ def enter(instances, arrays, grid, kernel, threshold, action, slot, state, next_
         arrays.entry[pair] = min(lists.weight[start + kept - 1], min_fraction * total)
         if total >= threshold:
             arrays.known[pair] = True
+        if arrays.known[pair] or abs(total - arrays.heard[pair]) >= news:
+            scratch.point[progress[2]] = point
+            progress[2] += 1
         progress[1] += 1
     return True
 

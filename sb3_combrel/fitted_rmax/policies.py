@@ -264,11 +264,8 @@ class FittedRMaxPolicy(BasePolicy):
         :return: backups done
         """
         self._widen(reward)
-        changed = self.model.add(state, action, reward, next_state, terminated)
-        if self.transfer is None:
-            self._unsettled.append(changed)
-        else:
-            self._unsettled.append(self.model.worth_settling(changed))
+        self._unsettled.append(self.model.add(state, action, reward, next_state, terminated))
+        if self.transfer is not None:
             self.transfer.observe(state, action, reward, next_state, terminated)
         return self._plan(self.max_backups, NOWHERE if terminated else next_state)
 

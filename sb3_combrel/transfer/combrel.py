@@ -21,7 +21,7 @@ from sb3_combrel.transfer.voting import Ballots, find_voters, note_neighbor, vot
 RELEVANCE_RENEWAL = 1.2
 # Within an episode votes are held whenever this many times as much has been seen as at the last time: every transition
 # changes some choices, and to plan anew with each would cost more than all the rest.
-RENEWAL_GROWTH = 1.1
+RENEWAL_GROWTH = 1.2
 NO_DRAWS = np.empty(0)
 
 
@@ -126,7 +126,6 @@ class COMBREL(VirtualSourceTransfer):
         self._choice = np.full(target.n_actions * n_points, -1, dtype=np.int64)
         self._vote_due = np.zeros(target.n_actions * n_points, dtype=np.bool_)
         self._renewal_due = 0.0
-        self._paused = False
         self._transition_compliance, self._note_neighbor, self._vote, self._find_voters = map(
             SameTypes, (transition_compliance, note_neighbor, vote, find_voters)
         )
@@ -177,7 +176,6 @@ class COMBREL(VirtualSourceTransfer):
         )
 
     def renewed(self, known: np.ndarray) -> np.ndarray:
-        self._paused = False
         faded = super().renewed(known)
         if len(faded) or self._seen.n < self._renewal_due:
             return faded
@@ -185,10 +183,7 @@ class COMBREL(VirtualSourceTransfer):
         return self._hold_votes(np.flatnonzero(self._vote_due & ~known))
 
     def _hold_votes(self, pairs: np.ndarray) -> np.ndarray:
-        """Renew the choices of those of ``pairs`` for which a vote is due (lines 17-20); those that changed."""
-        pairs = pairs[self._vote_due[pairs]]
-        if len(pairs) == 0:
-            return pairs
+        """Renew the choices of ``pairs`` (lines 17-20); those that changed."""
         near = self._near.reshape(-1, self.n_neighbors)
         self._measure(near[pairs])
         changed = pairs.copy()
@@ -242,8 +237,6 @@ class COMBREL(VirtualSourceTransfer):
         chosen = saved["choice"].astype(np.int64).reshape(self.target.n_actions, -1)
         self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
         self._vote_due[:] = saved["vote_due"] > 0.5
-        # Until learning goes on, the choices are those that were saved.
-        self._paused = True
         self._draws_at = np.clip(saved["draws_at"], 0.0, 1.0)
         self._renewal_due = float(saved["renewal_due"][0])
         self._switches = int(saved["switches"][0])
@@ -264,8 +257,6 @@ class COMBREL(VirtualSourceTransfer):
 
     def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
         assert self.target is not None
-        if not self._paused:
-            self._hold_votes(pairs[~known])
         chosen = np.where(known, -1, self._choice[pairs])
         if (chosen < 0).all():
             return self._nothing_for(len(pairs))

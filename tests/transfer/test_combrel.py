@@ -44,8 +44,8 @@ def supply_of(method, task):
 
 
 def choices_of(method, task):
-    """What the method chooses for every pair that is asked for."""
-    supply_of(method, task)
+    """What the method chooses for every pair if none is known."""
+    renewed_by(method, task)
     return method.choices()
 
 
@@ -135,6 +135,7 @@ def test_the_chosen_mapping_translates_at_grid_points_and_at_exact_states():
         show(method, naive.random_transition(rng, 3, 2))
     named, pairs, n_transferred = ways_of(method), pairs_of(task), 0
     own = rng.uniform(0.0, 1.2, len(pairs))
+    method.renewed(own >= 1.0)
     supply = method.supply(pairs, own, own >= 1.0)
     for pair in pairs:
         chosen, expected = method.choices()[pair], []
@@ -150,6 +151,8 @@ def test_the_chosen_mapping_translates_at_grid_points_and_at_exact_states():
         n_transferred += n > 0
     assert n_transferred > 20
     # At a sample state itself, the vote and the supply are those of the grid point.
+    method.end_episode(False)
+    renewed_by(method, task)
     for point in range(len(POINTS)):
         at = method.supply_at(POINTS[point], np.zeros(2))
         on_grid = method.supply(point + len(POINTS) * np.arange(2), np.zeros(2), np.zeros(2, dtype=bool))
@@ -200,8 +203,8 @@ def test_what_changed_and_changed_back_is_not_renewed():
     np.testing.assert_array_equal(one.choices(), other.choices())
 
 
-def test_known_pairs_wait_until_they_are_asked_for():
-    """And what only they would hear is not measured."""
+def test_for_known_pairs_no_vote_is_held():
+    """And what only they would hear is not measured. An instance that gives way can make a pair unknown again."""
     rng = np.random.default_rng(3)
     task = naive.target_task(POINTS, 2)
     lazy, eager = (bound(COMBREL(naive.random_source(np.random.default_rng(9), 60, 2, 2)), task) for _ in range(2))
@@ -213,6 +216,7 @@ def test_known_pairs_wait_until_they_are_asked_for():
     assert sorted(lazy.renewed(known)) == sorted(set(renewed_by(eager, task)) - set(np.flatnonzero(known)))
     assert (lazy.choices()[known] == -1).all()
     assert 0 < lazy._ballots.measured.sum() < eager._ballots.measured.sum()
+    lazy.end_episode(False)
     np.testing.assert_array_equal(choices_of(lazy, task), eager.choices())
 
 
@@ -235,6 +239,7 @@ def test_measured_in_the_first_episode_nothing_is_transferred_before_it_ends_and
         assert len(renewed_by(paper, task)) == 0
         assert not paper.supply_at(transition.state, np.zeros(2)).count.any()
     assert not any(weights for weights, _, _ in supply_of(paper, task))
+    assert len(renewed_by(online, task)) > 0
     assert any(weights for weights, _, _ in supply_of(online, task))
     paper.end_episode(False)
     assert len(renewed_by(paper, task)) > 0
@@ -266,6 +271,8 @@ def test_where_episodes_fail_the_transferred_instances_fade():
         transition = naive.random_transition(rng, 3, 2)
         for method in (fading, steady, narrow):
             show(method, transition)
+    for method in (fading, steady, narrow):
+        renewed_by(method, task)
     before = supply_of(fading, task)
     fading.end_episode(False)
     assert supply_of(fading, task) == before and len(renewed_by(fading, task)) == 0
@@ -492,6 +499,7 @@ def test_with_relevance_the_instances_that_the_target_contradicts_come_last():
         starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
         for i in range(len(target)):
             show(method, naive.Transition(starts[i], int(target.actions[i]), -1.0, ends[i]))
+        renewed_by(method, task)
         effects = np.array([effect for _, of_pair, _ in supply_of(method, task) for effect in of_pair])
         stillness[by_relevance] = np.mean(np.abs(effects).max(axis=1) == 0.0)
     assert stillness[False] > 0.4
