@@ -231,13 +231,17 @@ class FittedRMaxPolicy(BasePolicy):
 
     def exploit(self, state: np.ndarray) -> int:
         """
-        The best action of those that have a model: an evaluation must not depend on trying things out.
+        The best action of those that are known; where none is, of those that have a model, from transferred instances.
+
+        An evaluation must not depend on trying things out, and what a wrong mapping promises it would try for ever.
 
         :param state: unit coordinates, shape (n_variables,)
         """
         q = self.q_values(state, self.planner.exploitation_values())
-        modelled = q < self.planner.bounds[1]
-        return int(np.where(modelled, q, -np.inf).argmax()) if modelled.any() else 0
+        eligible = self._query.total >= self.model.exploration_threshold
+        if not eligible.any():
+            eligible = q < self.planner.bounds[1]
+        return int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)

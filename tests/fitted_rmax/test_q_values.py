@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_fitted_rmax import Instance, NaiveFittedRMax
 
+from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
 N_ACTIONS = 3
@@ -185,3 +186,38 @@ def test_what_was_near_before_has_no_part_in_the_result():
         np.testing.assert_array_equal(policy.q_values(queries[number]), first[number])
         policy._query.length[:] = 0
         np.testing.assert_array_equal(policy.q_values(queries[number]), first[number])
+
+
+def line_policy(transfer=None):
+    """On a line, with actions 0 and 1."""
+    line, actions = spaces.Box(0.0, 1.0, (1,), dtype=np.float64), spaces.Discrete(2)
+    narrow = dict(model_breadth=0.05, resolution=4, rng=np.random.default_rng(0))
+    return FittedRMaxPolicy(line, actions, transfer=transfer, **narrow)
+
+
+def test_an_evaluation_trusts_known_actions_first():
+    """By the source action 1 ends the episode anywhere; what the target itself has shown comes first, where it has."""
+    at = np.linspace(0.0, 1.0, 201)
+    states, ends = np.tile(at, 2)[:, None], np.append(np.clip(at + 0.1, 0.0, 1.0), at)[:, None]
+    actions = np.repeat([0, 1], 201)
+    source = SourceInstances(states, actions, -np.ones(402), ends, actions == 1, [0.0], [1.0], 2)
+    policy = line_policy(TIMBREL(source, InterTaskMapping([0], [0, 1])))
+    policy.prepare()
+    state, elsewhere = np.array([0.3]), np.array([0.7])
+    for _ in range(3):
+        policy.learn_from(state, 0, -1.0, np.array([0.32]), False)
+    best, second = policy.q_values(state)[::-1]
+    assert best > second and policy.explore(state, 0) == 1
+    assert policy.exploit(state) == 0
+    assert policy.exploit(elsewhere) == 1, "where nothing is known, the best of what was transferred"
+
+
+def test_an_evaluation_takes_an_end_that_is_worth_as_much_as_optimism():
+    policy, state = line_policy(), np.array([0.3])
+    for _ in range(3):
+        policy.learn_from(state, 0, -1.0, np.array([0.32]), False)
+    assert policy.exploit(state) == 0, "action 1 is optimistic: nobody knows where it leads"
+    for _ in range(3):
+        policy.learn_from(state, 1, 0.0, np.array([0.32]), True)
+    assert policy.q_values(state)[1] == 0.0 == policy.planner.bounds[1]
+    assert policy.exploit(state) == 1

@@ -1,0 +1,21 @@
+import re
+import sys
+
+import pytest
+
+from sb3_combrel.experiments import bench
+
+
+def test_what_transfer_adds_is_printed_pair_by_pair_and_in_the_mean(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["bench", "--pairs", "2", "--part", "0.005"])
+    bench.main()
+    pairs = re.findall(r"seed +(\d+): ([\d.]+) ([\d.]+) ([+-]\d+)%", capsys.readouterr().out.split("mean ")[0])
+    assert [int(seed) for seed, *_ in pairs] == [0, 1]
+    for _, without, transferring, added in pairs:
+        assert float(without) > 0.0
+        assert int(added) == pytest.approx(100 * (float(transferring) / float(without) - 1.0), abs=2)
+
+
+def test_a_case_is_learnt_as_often_as_it_says_with_the_same_steps_each_time():
+    steps, milliseconds, memory = bench.measure(0, part=0.04)
+    assert (steps, milliseconds > 0.0, memory > 0.0) == (bench.learn(bench.CASES[0], 2)[0], True, True)
