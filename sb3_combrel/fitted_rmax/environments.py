@@ -34,13 +34,18 @@ def refuse_normalized_observations(env: VecEnv) -> None:
         )
 
 
-def true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each step led, before an environment reset itself, and whether that was a terminal state."""
-    if not dones.any():
+def true_outcomes(
+    new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]], ended: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each step led, before an environment reset itself, and whether that was a terminal state.
+
+    :param ended: the environments that are done
+    """
+    if not ended:
         return np.asarray(new_obs), dones
     next_obs = np.array(new_obs)
     terminated = np.array(dones, dtype=bool)
-    for e in np.flatnonzero(dones):
+    for e in ended:
         next_obs[e] = infos[e]["terminal_observation"]
         terminated[e] = not infos[e].get("TimeLimit.truncated", False)
     return next_obs, terminated

@@ -73,8 +73,8 @@ class FittedRMax(BaseAlgorithm):
     - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%: with a narrow
       kernel all that is within reach cannot become known, and exploration would not end.
 
-    ``predict(obs, deterministic=True)`` takes the best action that has a model, ``deterministic=False`` the optimistic
-    ones first, as in learning.
+    ``predict(obs, deterministic=True)`` takes the best known action, or, where none is known, the best of those that have a
+    model from transferred instances; ``deterministic=False`` takes the optimistic ones first, as in learning.
 
     Cost: a step's time grows with the instances near it and in a slow line with all instances (a look at one box for
     every 8 of them); memory is about 400 bytes an instance, and per state-action pair of the grid, once known, some
@@ -285,19 +285,20 @@ class FittedRMax(BaseAlgorithm):
         self.num_timesteps += self.env.num_envs
         self._update_info_buffer(infos, dones)
         raw_rewards = self._raw_rewards(rewards)
-        next_obs, terminated = true_outcomes(new_obs, dones, infos)
+        ended = [e for e, done in enumerate(dones.tolist()) if done]
+        next_obs, terminated = true_outcomes(new_obs, dones, infos, ended)
         next_states = self.policy.to_unit(next_obs)
         for e, choice in enumerate(choices):
             self._backups += self.policy.learn_from(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]))
             self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if dones.any() else next_states
+        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if ended else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         # An episode that ended is ended, and planned through, whether or not a callback stops at this very step.
         going_on = callback.on_step()
-        for ended in np.flatnonzero(dones) if dones.any() else ():
-            self._end_episode(int(ended), bool(terminated[ended]))
+        for e in ended:
+            self._end_episode(e, bool(terminated[e]))
             if log_interval is not None and self._episode_num % log_interval == 0:
                 callback.on_rollout_end()
                 self.dump_logs()

@@ -22,6 +22,7 @@ from sb3_combrel.fitted_rmax.restoring import in_neighbourhoods, note_effects, r
 from sb3_combrel.transfer.base import Transfer
 
 MOST_PAIRS_AT_ONCE = 4096
+NO_PAIRS = np.empty(0, dtype=np.int64)
 # Part of the threshold by which own weight must have changed before a pair that draws on transferred instances is settled
 # anew within an episode: an instance that hardly counts among them would have hundreds of pairs translated and planned.
 NEWS = 0.5
@@ -124,7 +125,7 @@ class KernelModel:
             for name, array in larger.items():
                 array[:, :room] = getattr(self.arrays, name)
             self.arrays = self.arrays.replace(**larger)
-        return count, np.empty(0, dtype=np.int64)
+        return count, NO_PAIRS
 
     def _of_instances(self) -> dict[str, Any]:
         """Those of the model's arrays that have a place for each instance, empty."""
@@ -168,7 +169,7 @@ class KernelModel:
 
     def _leave(self, action: int, slot: int) -> np.ndarray:
         if self.arrays.members[action, slot] == 0:
-            return np.empty(0, dtype=np.int64)
+            return NO_PAIRS
         rest = (self._kernel, action, slot, np.zeros(self.grid.n_points), self.scratch)
         changed = leave_lists(self.instances, self.arrays, self.grid.arrays, *rest)
         return self.scratch.point[:changed] + action * self.grid.n_points

@@ -19,7 +19,7 @@ from sb3_combrel.common.scaling import StateScaling, scale_into_box
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
-from sb3_combrel.fitted_rmax.model import KernelModel
+from sb3_combrel.fitted_rmax.model import NO_PAIRS, KernelModel
 from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, find_near
 from sb3_combrel.fitted_rmax.saving import misfit
@@ -36,7 +36,6 @@ CORNERS_A_STEP = 400
 AT_EPISODE_END = 400
 BEFORE_THE_FIRST_STEP = 300
 BACKUPS_PER_RENEWED_PAIR = 2
-NO_PAIRS = np.empty(0, dtype=np.int64)
 NOBODY = (-1, 0.0, 0)
 
 
