@@ -22,6 +22,8 @@ class Supply(ArrayStruct):
     effect: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
+    # Number of state variables for which the shapes have been checked: they stay what they are.
+    _fits = -1
 
     @classmethod
     def empty(cls, n: int, n_variables: int, most: int = 0) -> "Supply":
@@ -42,7 +44,19 @@ class Supply(ArrayStruct):
         :param method: whoever supplied this
         :raises ValueError: if there are fewer rows, or the arrays do not fit each other
         """
-        name, places = type(method).__name__, self.weight.shape
+        if self._fits != n_variables:
+            self._check_shapes(n_variables, type(method).__name__)
+        if len(self.count) < n:
+            raise ValueError(f"{type(method).__name__} supplied {len(self.count)} rows, but was asked for {n}")
+        count, most = self.count[:n], self.weight.shape[1]
+        # What is below 0 is large without a sign.
+        if n > 0 and np.maximum.reduce(count.view(np.uint64)) > most:
+            raise ValueError(
+                f"{type(method).__name__} supplied counts from {count.min()} to {count.max()}, with room for {most} instances"
+            )
+
+    def _check_shapes(self, n_variables: int, name: str) -> None:
+        places = self.weight.shape
         expected = {"count": places[:1], "effect": (*places, n_variables), "reward": places, "terminated": places}
         for array, shape in expected.items():
             if getattr(self, array).shape != shape:
@@ -50,10 +64,4 @@ class Supply(ArrayStruct):
                     f"{name} supplied {array} of shape {getattr(self, array).shape} with weight of shape {places}; "
                     f"with {n_variables} state variables that must be {shape}"
                 )
-        if len(self.count) < n:
-            raise ValueError(f"{name} supplied {len(self.count)} rows, but was asked for {n}")
-        count = self.count[:n]
-        if n > 0 and (count.min() < 0 or count.max() > places[1]):
-            raise ValueError(
-                f"{name} supplied counts from {count.min()} to {count.max()}, with room for {places[1]} instances"
-            )
+        vars(self)["_fits"] = n_variables

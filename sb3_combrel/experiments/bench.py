@@ -33,6 +33,8 @@ class Case(NamedTuple):
 
 
 _BROAD: dict[str, Any] = dict(model_breadth=0.4, resolution=3, min_fraction=0.1)
+_NARROW: dict[str, Any] = dict(_BROAD, model_breadth=0.1)
+_SHORT: dict[str, Any] = dict(max_episode_steps=2000)
 CASES = (
     Case(
         "Mountain Car 2D, breadth 1/16, resolution 4",
@@ -50,6 +52,8 @@ CASES = (
         dict(model_breadth=0.2, resolution=3, min_fraction=0.1),
         60,
     ),
+    Case("Mountain Car 4D, breadth 0.1, resolution 3", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12),
+    Case("the same with COMBREL", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12, transfers=True),
 )
 
 _FIRST_USE = """

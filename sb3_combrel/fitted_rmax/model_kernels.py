@@ -140,9 +140,7 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
 
 
 @compiled
-def enter(
-    instances, arrays, grid, kernel, thresholds, action, slot, state, next_state, reward, terminated, scratch, progress
-):
+def enter(instances, arrays, grid, kernel, thresholds, action, slot, state, next_state, reward, terminated, scratch, progress):
     """Write an instance to its slot, and put it into the lists of all pairs that it reaches.
 
     :param kernel: (breadth, min_weight, min_fraction)

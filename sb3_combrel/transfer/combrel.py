@@ -117,6 +117,9 @@ class COMBREL(VirtualSourceTransfer):
         n_points = len(target.sample_states)
         self._compliance_scratch = ComplianceScratch.for_mappings(self._table, self._instances)
         self._table_of_one = np.empty((n_rows, n_actions))
+        # Where in that table the candidates of each action stand.
+        places = self._ways.row * n_actions + self._ways.action
+        self._places = np.split(places, self._ways.first[1:-1])
         self._rewards = RewardCounts.of_instances(self._instances)
         self._ballots = Ballots.empty(int(np.diff(self._ways.first).max()))
         self._near = np.full((target.n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
@@ -194,9 +197,8 @@ class COMBREL(VirtualSourceTransfer):
 
     def _measure(self, voters: np.ndarray) -> None:
         """Compliance with every mapping of those of these transitions that have not voted yet (lines 9-13)."""
-        asked = np.zeros_like(self._ballots.measured)
-        asked[voters[voters >= 0]] = True
-        for i in np.flatnonzero(asked & ~self._ballots.measured):
+        voters = voters[voters >= 0]
+        for i in set(voters[~self._ballots.measured[voters]].tolist()):
             action, reward = int(self._seen.actions[i]), float(self._seen.rewards[i])
             self._transition_compliance(
                 self._seen.states[i],
@@ -208,8 +210,7 @@ class COMBREL(VirtualSourceTransfer):
                 self._compliance_scratch,
                 self._table_of_one,
             )
-            of_action = slice(self._ways.first[action], self._ways.first[action + 1])
-            compliance = self._table_of_one[self._ways.row[of_action], self._ways.action[of_action]]
+            compliance = self._table_of_one.ravel()[self._places[action]]
             self._ballots.compliance[i, : len(compliance)] = compliance
             standstill = standstill_compliance(self._seen.effects[i], reward, self._rewards, self._bandwidths)
             self._ballots.least[i] = self.min_compliance * standstill
@@ -267,7 +268,7 @@ class COMBREL(VirtualSourceTransfer):
 
     def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
         missing = own_weight < self._rules.threshold
-        if self._seen.n == 0 or not missing.any():
+        if self._seen.n == 0:
             return self._nothing_for(len(own_weight))
         n_voting = self._seen.n if self._may_vote else 0
         transitions = self._seen.states, self._seen.actions, n_voting

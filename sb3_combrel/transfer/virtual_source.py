@@ -182,10 +182,11 @@ class VirtualSourceTransfer(Transfer):
         """The same for every action at one state; what is used there is counted."""
         self._states_at[:] = state
         supply = self._supply_at = self._draw(self._states_at, own, first, last, self._supply_at)
-        counts = supply.count[: len(own)]
-        if self._most_ways_at_once() == 1:
-            self._uses.update(first[counts > 0].tolist())
-        self._instances_used += int(counts.sum())
+        one_way = self._most_ways_at_once() == 1
+        for way, n in zip(first.tolist(), supply.count.tolist(), strict=False):
+            if n > 0 and one_way:
+                self._uses[way] += 1
+            self._instances_used += n
         return supply
 
     def renewed(self, known: np.ndarray) -> np.ndarray:
