@@ -126,7 +126,7 @@ class FittedRMaxPolicy(BasePolicy):
             self._widen(self.transfer.lowest_reward())
         self.corrections = CorrectionArrays.empty(grid.n_variables)
         self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
-        self._no_supply = Supply.empty(self.n_actions, grid.n_variables)
+        self._no_supply = self._supply = Supply.empty(self.n_actions, grid.n_variables)
         self._q = np.empty(self.n_actions)
         self._unsettled: list[np.ndarray] = []
         self._warned_outside = False
@@ -196,6 +196,8 @@ class FittedRMaxPolicy(BasePolicy):
         if self.transfer is not None and least < model.exploration_threshold:
             supply = self.transfer.supply_at(state, self._query.total)
             supply.check(self.n_actions, len(state), self.transfer)
+        # For whoever asks what stands behind ``_q``.
+        self._supply = supply
         best: int = self._choose(
             model.instances,
             state,
@@ -239,7 +241,7 @@ class FittedRMaxPolicy(BasePolicy):
         q = self.q_values(state, self.planner.exploitation_values())
         eligible = self._query.total >= self.model.exploration_threshold
         if not eligible.any():
-            eligible = q < self.planner.bounds[1]
+            eligible = self._supply.count[: self.n_actions] > 0
         return int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:

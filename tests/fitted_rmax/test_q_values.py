@@ -195,13 +195,19 @@ def line_policy(transfer=None):
     return FittedRMaxPolicy(line, actions, transfer=transfer, **narrow)
 
 
-def test_an_evaluation_trusts_known_actions_first():
-    """By the source action 1 ends the episode anywhere; what the target itself has shown comes first, where it has."""
+def ends_anywhere(reward):
+    """Transfer from a source in which action 1 ends the episode anywhere, with a reward; action 0 moves a little, for -1."""
     at = np.linspace(0.0, 1.0, 201)
     states, ends = np.tile(at, 2)[:, None], np.append(np.clip(at + 0.1, 0.0, 1.0), at)[:, None]
     actions = np.repeat([0, 1], 201)
-    source = SourceInstances(states, actions, -np.ones(402), ends, actions == 1, [0.0], [1.0], 2)
-    policy = line_policy(TIMBREL(source, InterTaskMapping([0], [0, 1])))
+    rewards = np.where(actions == 1, reward, -1.0)
+    source = SourceInstances(states, actions, rewards, ends, actions == 1, [0.0], [1.0], 2)
+    return TIMBREL(source, InterTaskMapping([0], [0, 1]))
+
+
+def test_an_evaluation_trusts_known_actions_first():
+    """Whatever the source promises; what the target itself has shown comes first, where it has."""
+    policy = line_policy(ends_anywhere(-1.0))
     policy.prepare()
     state, elsewhere = np.array([0.3]), np.array([0.7])
     for _ in range(3):
@@ -210,6 +216,14 @@ def test_an_evaluation_trusts_known_actions_first():
     assert best > second and policy.explore(state, 0) == 1
     assert policy.exploit(state) == 0
     assert policy.exploit(elsewhere) == 1, "where nothing is known, the best of what was transferred"
+
+
+def test_an_evaluation_takes_a_transferred_end_that_is_worth_as_much_as_optimism():
+    policy = line_policy(ends_anywhere(0.0))
+    policy.prepare()
+    state = np.array([0.3])
+    assert policy.q_values(state)[1] == policy.planner.bounds[1] > policy.q_values(state)[0]
+    assert policy.exploit(state) == 1
 
 
 def test_an_evaluation_takes_an_end_that_is_worth_as_much_as_optimism():
