@@ -55,6 +55,7 @@ CASES = (
     Case("Mountain Car 4D, breadth 0.1, resolution 3", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12),
     Case("the same with COMBREL", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12, transfers=True),
 )
+COMPARED_EPISODES = 200
 
 _FIRST_USE = """
 import time
@@ -122,19 +123,20 @@ def measure(number: int, part: float = 1.0, seed: int = 0) -> tuple[int, float, 
 
 
 def compare(n_pairs: int, part: float) -> None:
-    """Print what COMBREL adds to the mean time of a step, in pairs of runs with the same seed.
+    """Print what COMBREL adds to the mean time of a step with each kernel, in pairs of runs with the same seed.
 
     Both runs of a pair go at the same time: whatever else slows the machine slows both.
     """
-    with_transfer = next(number for number, case in enumerate(CASES) if case.transfers)
-    numbers, added = (with_transfer - 1, with_transfer), []
-    print(f"{CASES[numbers[0]].name}, without transfer and with COMBREL, ms/step")
-    with ThreadPoolExecutor(2) as pool:
-        for seed in range(n_pairs):
-            (_, without, _), (_, transferring, _) = pool.map(measure, numbers, (part, part), (seed, seed))
-            added.append(transferring / without - 1.0)
-            print(f"seed {seed:2}: {without:.3f} {transferring:.3f} {added[-1]:+.0%}", flush=True)
-    print(f"mean {sum(added) / n_pairs:+.0%}, from {min(added):+.0%} to {max(added):+.0%}")
+    for number in (number for number, case in enumerate(CASES) if case.transfers):
+        numbers, added = (number - 1, number), []
+        print(f"{CASES[number - 1].name}, without transfer and with COMBREL, {COMPARED_EPISODES} episodes, ms/step")
+        parts = [part * COMPARED_EPISODES / CASES[n].n_episodes for n in numbers]
+        with ThreadPoolExecutor(2) as pool:
+            for seed in range(n_pairs):
+                (_, without, _), (_, transferring, _) = pool.map(measure, numbers, parts, (seed, seed))
+                added.append(transferring / without - 1.0)
+                print(f"seed {seed:2}: {without:.3f} {transferring:.3f} {added[-1]:+.0%}", flush=True)
+        print(f"mean {sum(added) / n_pairs:+.0%}, from {min(added):+.0%} to {max(added):+.0%}")
 
 
 def main() -> None:

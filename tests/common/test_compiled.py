@@ -1,9 +1,13 @@
 """A compiled function called with the same types every time."""
 
 import copy
+import gc
 import pickle
 
 import numpy as np
+import pytest
+from numba import njit
+from numba.core.errors import TypingError
 
 from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
@@ -28,3 +32,44 @@ def test_states_are_scaled_as_by_the_scaling_and_moved_into_the_box():
     inside = scaling.to_raw(np.full((1, 3), 0.5))
     assert not scale_into_box(inside, scaling.low, scaling.high - scaling.low, units[:1])
     assert scale_into_box(np.full((1, 3), np.nan), scaling.low, scaling.high - scaling.low, units[:1])
+
+
+@pytest.fixture
+def collecting():
+    """Garbage collection as tests expect it, whatever happens."""
+    yield
+    gc.enable()
+
+
+@pytest.mark.parametrize("before", (True, False))
+def test_no_garbage_is_collected_while_ours_is_compiled_and_then_as_before(collecting, monkeypatch, before):
+    seen = []
+    called = gc.disable
+    monkeypatch.setattr(gc, "disable", lambda: (called(), seen.append(gc.isenabled())))
+    if not before:
+        called()
+
+    def inner(x):
+        return x + 1
+
+    inner.__module__ = "sb3_combrel.inner"
+    inner = njit(inner)
+
+    def outer(x):
+        return inner(x) * 2
+
+    assert njit(outer)(1) == 4  # not ours, but what it calls is
+    assert seen == [False] and gc.isenabled() == before
+    outer.__module__ = "sb3_combrel.outer"
+    assert njit(outer)(1.0) == 4.0
+    assert seen == [False, False] and gc.isenabled() == before
+
+
+def test_garbage_is_collected_again_when_ours_does_not_compile(collecting):
+    def wrong(x):
+        return x.nothing
+
+    wrong.__module__ = "sb3_combrel.wrong"
+    with pytest.raises(TypingError, match="nothing"):
+        njit(wrong)(1)
+    assert gc.isenabled()
