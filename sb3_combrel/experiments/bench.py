@@ -1,4 +1,4 @@
-"""What Fitted R-Max costs: time of an environment step, memory, and the compilation on first use.
+"""What Fitted R-Max costs: time of an environment step, memory, the import, and the compilation on first use.
 
 Run as ``python -m sb3_combrel.experiments.bench``.
 """
@@ -57,6 +57,14 @@ CASES = (
 )
 COMPARED_EPISODES = 200
 
+_IMPORT = """
+import time
+import stable_baselines3
+start = time.perf_counter()
+import sb3_combrel
+print(time.perf_counter() - start)
+"""
+
 _FIRST_USE = """
 import time
 import gymnasium
@@ -78,6 +86,12 @@ def resident_memory() -> float:
         import resource
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def import_seconds() -> float:
+    """Seconds that the import takes on top of that of Stable-Baselines3, in a fresh process."""
+    done = subprocess.run([sys.executable, "-c", _IMPORT], capture_output=True, text=True, check=True)
+    return float(done.stdout)
 
 
 def first_use_seconds() -> float:
@@ -154,6 +168,7 @@ def main() -> None:
         steps, milliseconds, memory = measure(number, part)
         n_episodes = max(1, round(part * case.n_episodes))
         print(f"{case.name:45} {n_episodes:8} {steps:7} {milliseconds:8.2f} {memory:6.0f}", flush=True)
+    print(f"import, beyond that of Stable-Baselines3: {import_seconds():.2f} s")
     print(f"first use, nothing compiled: {first_use_seconds():.1f} s")
 
 

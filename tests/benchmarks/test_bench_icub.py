@@ -1,4 +1,4 @@
-"""Steps of the iCub: a round is 1000 steps, so 8 rounds a second are 8,000 steps a second."""
+"""The iCub: how long it takes to make, and its steps (a round is 1000: 8 rounds a second are 8,000 steps a second)."""
 
 import gymnasium
 import pytest
@@ -6,9 +6,15 @@ import pytest
 import combrel_envs
 
 N_STEPS = 1000
+IDS = ["combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0", "combrel/ICubArmStrikeNoisy-v0"]
 
 
-@pytest.mark.parametrize("env_id", ["combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0", "combrel/ICubArmStrikeNoisy-v0"])
+@pytest.mark.parametrize("env_id", IDS)
+def test_making(benchmark, env_id):
+    benchmark(lambda: gymnasium.make(env_id).reset())
+
+
+@pytest.mark.parametrize("env_id", IDS)
 def test_1000_steps_through_gymnasium(benchmark, env_id):
     env = gymnasium.make(env_id, max_episode_steps=N_STEPS)
 

@@ -1,9 +1,8 @@
-"""The iCub's ball-striking tasks: known plans, spaces, noise, starts, conventions, speed and bad input."""
+"""The iCub's ball-striking tasks: known plans, spaces, noise, starts, conventions and bad input."""
 
 import math
 import subprocess
 import sys
-import time
 import warnings
 
 import gymnasium
@@ -284,31 +283,6 @@ class TestDmControlFace:
         for task, n in (("torso_strike", 2), ("arm_strike", 4)):
             model = combrel_envs.load("icub", task).physics.model
             assert (model.nu, model.nv) == (n, n + 6)
-
-
-class TestSpeed:
-    @pytest.mark.parametrize("env_id", IDS)
-    def test_an_environment_is_made_in_a_fifth_of_a_second(self, env_id):
-        gymnasium.make(env_id)
-        times = []
-        for _ in range(5):
-            begun = time.process_time()
-            gymnasium.make(env_id).reset()
-            times.append(time.process_time() - begun)
-        assert min(times) < 0.2
-
-    @pytest.mark.parametrize("env_id", IDS)
-    def test_it_makes_8000_steps_a_second(self, env_id):
-        env = gymnasium.make(env_id, max_episode_steps=10**9)
-        env.reset()
-        rates = []
-        # The best of several: other processes disturb.
-        for _ in range(10):
-            begun = time.process_time()
-            for step in range(1000):
-                env.step(step % 2)
-            rates.append(1000 / (time.process_time() - begun))
-        assert max(rates) > 8000
 
 
 class TestBadInput:

@@ -1,9 +1,8 @@
-"""The files of saved models: safe, whole or not at all, as small and as fast as can be expected."""
+"""The files of saved models: safe, whole or not at all, and small (``tests/benchmarks`` measures how fast)."""
 
 import base64
 import json
 import os
-import time
 import zipfile
 
 import numpy as np
@@ -226,7 +225,7 @@ def _umask():
     return umask
 
 
-# -------------------------------------------------------------------- size and speed
+# ------------------------------------------------------------------------------ size
 
 
 class Untouched(Env):
@@ -246,26 +245,12 @@ def long_walks(d, n_actions, n):
     return np.column_stack([action, state, effect, np.full(n, -1.0), np.zeros(n), rng.random(n) < 0.4])
 
 
-def save_and_load(model, path):
-    """Seconds of three rounds, of the processor: others may be at work, too."""
-    saving, loading = [], []
-    for _ in range(3):
-        began = time.process_time()
-        model.save(path)
-        saving.append(time.process_time() - began)
-        began = time.process_time()
-        FittedRMax.load(path)
-        loading.append(time.process_time() - began)
-    return saving, loading
-
-
 @pytest.mark.parametrize(("d", "n_actions", "settings"), [(2, 3, {}), (4, 5, dict(model_breadth=0.4, resolution=3))])
-def test_fifty_thousand_instances_are_saved_and_loaded_within_a_second(d, n_actions, settings, tmp_path):
+def test_a_file_of_fifty_thousand_instances_is_no_larger_than_their_states_and_effects(d, n_actions, settings, tmp_path):
     model = FittedRMax(Untouched(d, n_actions), min_fraction=0.1, max_instances=None, seed=0, **settings)
     parameters = model.get_parameters()["policy"]
     model.set_parameters({"policy": {**parameters, "instances": th.as_tensor(long_walks(d, n_actions, 50_000))}})
-    saving, loading = save_and_load(model, tmp_path / "model")
-    assert min(saving) < 1.0 and min(loading) < 1.0, (saving, loading)
+    model.save(tmp_path / "model")
     assert FittedRMax.load(tmp_path / "model").policy.model.n_instances == 50_000
     # State and effect have all their digits; reward, action and the rest cost nothing to speak of.
     model_size = 8 * (2 * d * 50_000 + 2 * model.policy.model.grid.n_points * (1 + n_actions))
@@ -281,10 +266,9 @@ def test_fifty_thousand_instances_are_saved_and_loaded_within_a_second(d, n_acti
         ("combrel/MountainCar4D-v0", dict(model_breadth=0.4, resolution=3, min_fraction=0.1)),
     ],
 )
-def test_fifty_thousand_steps_of_mountain_car_are_saved_and_loaded_within_a_second(env, settings, tmp_path):
+def test_fifty_thousand_steps_of_mountain_car_make_a_small_file_that_holds_all(env, settings, tmp_path):
     model = FittedRMax(env, seed=0, **settings).learn(50_000)
-    saving, loading = save_and_load(model, tmp_path / "model")
-    assert min(saving) < 1.0 and min(loading) < 1.0, (saving, loading)
+    model.save(tmp_path / "model")
     assert (tmp_path / "model.zip").stat().st_size < 70 * model.policy.model.n_instances
     assert same_parameters(FittedRMax.load(tmp_path / "model"), model)
 
