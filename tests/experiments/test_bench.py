@@ -15,7 +15,7 @@ def test_what_transfer_adds_is_printed_pair_by_pair_and_in_the_mean(monkeypatch,
     assert [int(seed) for seed, *_ in pairs] == [0, 1, 0, 1]
     for _, without, transferring, added in pairs:
         assert float(without) > 0.0
-        assert int(added) == pytest.approx(100 * (float(transferring) / float(without) - 1.0), abs=2)
+        assert int(added) == pytest.approx(100 * (float(transferring) / float(without) - 1.0), rel=0.02, abs=2)
 
 
 def test_a_case_is_learnt_as_often_as_it_says_with_the_same_steps_each_time():
