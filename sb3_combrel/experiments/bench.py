@@ -67,13 +67,14 @@ print(time.perf_counter() - start)
 
 _FIRST_USE = """
 import time
-import gymnasium
-from sb3_combrel import FittedRMax
-model = FittedRMax("MountainCar-v0", seed=0)
-start = time.perf_counter()
-model.learn(5)
-model.predict(model.observation_space.sample(), deterministic=True)
-print(time.perf_counter() - start)
+from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+source = SourceInstances.record(None, "MountainCar-v0", n_instances=200, seed=0)
+for transfer, n_steps in ((None, 5), (COMBREL(source), 200)):
+    model = FittedRMax("MountainCar-v0", transfer=transfer, seed=0)
+    start = time.perf_counter()
+    model.learn(n_steps)
+    model.predict(model.observation_space.sample(), deterministic=True)
+    print(time.perf_counter() - start)
 """
 
 
@@ -94,12 +95,16 @@ def import_seconds() -> float:
     return float(done.stdout)
 
 
-def first_use_seconds() -> float:
-    """Seconds until the first steps and the first prediction are done, in a fresh process with nothing compiled."""
+def first_use_seconds() -> tuple[float, float]:
+    """Seconds until the first steps and the first prediction are done, in a fresh process with nothing compiled.
+
+    :return: without transfer, and after that with COMBREL
+    """
     with tempfile.TemporaryDirectory() as empty:
         environment = {**os.environ, "NUMBA_CACHE_DIR": empty}
         done = subprocess.run([sys.executable, "-c", _FIRST_USE], env=environment, capture_output=True, text=True, check=True)
-    return float(done.stdout.split()[-1])
+    without, transferring = done.stdout.split()
+    return float(without), float(transferring)
 
 
 def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
@@ -169,7 +174,8 @@ def main() -> None:
         n_episodes = max(1, round(part * case.n_episodes))
         print(f"{case.name:45} {n_episodes:8} {steps:7} {milliseconds:8.2f} {memory:6.0f}", flush=True)
     print(f"import, beyond that of Stable-Baselines3: {import_seconds():.2f} s")
-    print(f"first use, nothing compiled: {first_use_seconds():.1f} s")
+    without, transferring = first_use_seconds()
+    print(f"first use, nothing compiled: {without:.1f} s, and the first use of COMBREL {transferring:.1f} s more")
 
 
 if __name__ == "__main__":
