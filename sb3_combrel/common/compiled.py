@@ -58,7 +58,7 @@ class _FirstUse(event.Listener):
     """Accompanies the compilation of our loops: says once, on stderr, what goes on, and holds garbage collection back.
 
     A compiler makes millions of objects that stay for a while. To look through them, and through all that PyTorch has
-    loaded, again and again takes a sixth of the time; to let them lie takes 70 MB until the compilation is over.
+    loaded, again and again takes a tenth of the time or more; to let them lie takes 10 MB.
     """
 
     def __init__(self) -> None:
