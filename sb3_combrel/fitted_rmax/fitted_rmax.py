@@ -254,6 +254,8 @@ class FittedRMax(BaseAlgorithm):
         :param progress_bar: display a progress bar using tqdm and rich
         :raises ValueError: if ``total_timesteps`` is below 1 or the environment returns something that is not finite
         """
+        if isinstance(total_timesteps, float) and float(total_timesteps).is_integer():
+            total_timesteps = int(total_timesteps)  # 1e5, as many write it
         check_count("total_timesteps", total_timesteps)
         if self.env is None:
             raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")

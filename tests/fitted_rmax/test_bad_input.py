@@ -166,7 +166,7 @@ def test_an_argument_out_of_its_range_is_refused_at_once_by_name_and_value(name,
     assert repr(value) in str(error.value)
 
 
-@pytest.mark.parametrize("steps", [0, -5, 2.5, None])
+@pytest.mark.parametrize("steps", [0, -5, 2.5, 0.0, float("inf"), float("nan"), None])
 def test_total_timesteps_must_be_at_least_1(steps):
     model = FittedRMax(Scripted(), seed=0)
     with pytest.raises(ValueError, match="total_timesteps must be a whole number of at least 1"):

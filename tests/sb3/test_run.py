@@ -72,6 +72,7 @@ def test_learning_counts_steps_and_episodes(make):
     model.learn(30)
     assert model.num_timesteps == 30, "the count starts anew"
     assert model.policy.model.n_instances == 130, "what was learned stays"
+    assert model.learn(1e1).num_timesteps == 10, "as it is often written"
 
 
 def test_what_was_learned_is_the_way_to_the_goal(make):
