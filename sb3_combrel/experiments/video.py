@@ -21,9 +21,9 @@ def greedy_episode(model: BaseAlgorithm, env: Any, seed: int | None = None) -> I
     :return: after each step its number, from 1 on, and whether the episode is over
     """
     observation, _ = env.reset(seed=seed)
-    step, over = 0, False
+    step, over, state = 0, False, None
     while not over:
-        action, _ = model.predict(observation, deterministic=True)
+        action, state = model.predict(observation, state, deterministic=True)
         observation, _, terminated, truncated, _ = env.step(action)
         step, over = step + 1, terminated or truncated
         yield step, over

@@ -74,7 +74,8 @@ class FittedRMax(BaseAlgorithm):
       kernel all that is within reach cannot become known, and exploration would not end.
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where none is known, the best of those that have a
-    model from transferred instances; ``deterministic=False`` takes the optimistic ones first, as in learning.
+    model from transferred instances; ``deterministic=False`` takes the optimistic ones first, as in learning. Hand the state
+    that it returns to the next call, as ``evaluate_policy`` does, and it notices when it goes round in circles.
 
     Cost: a step's time grows with the instances near it and in a slow line with all instances (a look at one box for
     every 8 of them); memory is about 400 bytes an instance, and per state-action pair of the grid, once known, some

@@ -1,4 +1,4 @@
-"""The policy of Fitted R-Max: Q at a state, the greedy action, and what of it is saved."""
+"""The policy of Fitted R-Max: Q at a state, the greedy action, and how it learns."""
 
 from __future__ import annotations
 
@@ -10,19 +10,26 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.compiled import SameTypes
-from sb3_combrel.common.instances import InstanceArrays
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 from sb3_combrel.common.supply import Supply
 from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
+from sb3_combrel.fitted_rmax.evaluation import (
+    HOPEFUL,
+    TRUSTING,
+    TRYING,
+    EpisodeMemory,
+    memories,
+    predicted_reward,
+    small_cell,
+)
 from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
 from sb3_combrel.fitted_rmax.model import NO_PAIRS, KernelModel
 from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
 from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, find_near
-from sb3_combrel.fitted_rmax.saving import misfit
+from sb3_combrel.fitted_rmax.restorable_policy import RestorablePolicy
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
 
@@ -39,12 +46,9 @@ BACKUPS_PER_RENEWED_PAIR = 2
 NOBODY = (-1, 0.0, 0)
 
 
-class FittedRMaxPolicy(BasePolicy):
+class FittedRMaxPolicy(RestorablePolicy):
     """
     Acts greedily on the action values of a kernel model (see :class:`FittedRMax` for the parameters).
-
-    Its ``state_dict`` holds float64 tensors made from the arrays of the compiled code: the instances, the values of the
-    grid points, which pairs are known, and the corrections. Everything else is rebuilt from these.
 
     :param observation_space: a one-dimensional Box
     :param action_space: Discrete
@@ -128,6 +132,8 @@ class FittedRMaxPolicy(BasePolicy):
         self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
         self._no_supply = self._supply = Supply.empty(self.n_actions, grid.n_variables)
         self._q = np.empty(self.n_actions)
+        self._handed_on: tuple[Any, Any] = (None, None)
+        self._episodes: list[EpisodeMemory] = []
         self._unsettled: list[np.ndarray] = []
         self._warned_outside = False
         self.timed, self.reporting = False, True
@@ -230,26 +236,65 @@ class FittedRMaxPolicy(BasePolicy):
         ties = np.flatnonzero(self._q == self._q.max())
         return int(ties[self.rng.integers(len(ties))])
 
-    def exploit(self, state: np.ndarray) -> int:
+    def exploit(self, state: np.ndarray, episode: EpisodeMemory | None = None) -> int:
         """
         The best action of those that are known; where none is, of those that have a model, from transferred instances.
 
         An evaluation must not depend on trying things out, and what a wrong mapping promises it would try for ever.
 
         :param state: unit coordinates, shape (n_variables,)
+        :param episode: what is remembered of the episode so far; where it goes round in circles, things are tried out
         """
-        q = self.q_values(state, self.planner.exploitation_values())
+        mode = TRUSTING if episode is None else episode.mode
+        q = self.q_values(state, self.planner.exploitation_values() if mode == TRUSTING else None)
         eligible = self._query.total >= self.model.exploration_threshold
         if not eligible.any():
             eligible = self._supply.count[: self.n_actions] > 0
-        return int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
+        if mode == TRYING or (mode == HOPEFUL and not eligible.any()):
+            eligible = np.ones(self.n_actions, dtype=np.bool_)
+        action = int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
+        if episode is not None:
+            of_model = self.model.instances, self._query, self._supply, self.model.exploration_threshold
+            reward = predicted_reward(action, *of_model)
+            episode.note(small_cell(state, self.model.grid), float(q[action]), reward, self.gamma)
+        return action
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Actions for observations.
+
+        :param observation: one, or a batch of them
+        :param state: what the last call returned, of the same environments. Who hands it on, as ``evaluate_policy`` and
+            RL-Zoo do, gets a deterministic policy that notices when it goes round in circles; who doesn't, one that
+            depends on the observation alone.
+        :param episode_start: bool, one for each observation: whether an episode begins with it
+        :param deterministic: the best known action; otherwise optimistic actions first, as in learning
+        :return: actions, and the state for the next call (None if not deterministic)
+        :raises ValueError: if ``state`` is not what a call for as many observations returned
+        """
+        self._handed_on = (state, episode_start)
+        try:
+            actions, _ = super().predict(observation, None, None, deterministic)
+        finally:
+            self._handed_on = (None, None)
+        return actions, (np.array(self._episodes, dtype=object),) if deterministic else None
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         states = self.to_unit(np.asarray(observation.cpu().numpy(), dtype=np.float64))  # type: ignore[union-attr]
-        actions = [self.exploit(state) if deterministic else self._sample(state) for state in states]
+        if deterministic:
+            self._episodes = memories(*self._handed_on, len(states))
+            actions = list(map(self.exploit, states, self._episodes))
+        else:
+            actions = [self._sample(state) for state in states]
         return th.as_tensor(np.array(actions) + self._first_action, device=observation.device)  # type: ignore[union-attr]
 
     def _sample(self, state: np.ndarray) -> int:
@@ -343,113 +388,3 @@ class FittedRMaxPolicy(BasePolicy):
             "planner/corrections": int(self.corrections.count[0]),
         }
         return figures if self.transfer is None else {**figures, **self.transfer.statistics()}
-
-    # ------------------------------------------------------- what is saved of it
-
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name, array in self._saved_arrays().items():
-            # Column by column: a file of it becomes a tenth smaller.
-            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
-
-    def _saved_arrays(self) -> dict[str, np.ndarray]:
-        instances = self.model.instances
-        by_action = []
-        for action, count in enumerate(instances.count):
-            columns = [
-                np.full((count, 1), action),
-                instances.state[action, :count],
-                instances.effect[action, :count],
-                instances.reward[action, :count, None],
-                instances.terminated[action, :count, None],
-                self.model.arrays.members[action, :count, None] > 0,
-            ]
-            by_action.append(np.hstack(columns))
-        n = int(self.corrections.count[0])
-        of_transfer = {} if self.transfer is None else self.transfer.saved_arrays()
-        return {
-            **{f"transfer_{name}": array for name, array in of_transfer.items()},
-            "instances": np.vstack(by_action),
-            "values": self.planner.values,
-            "known": self.model.arrays.known,
-            "total": self.model.arrays.total,
-            "lowest_value": np.array([self.planner.bounds[0]]),
-            "n_truncated": np.array([float(self.n_truncated)]),
-            "corrections": np.column_stack([self.corrections.key[:n], self.corrections.value[:n], self.corrections.state[:n]]),
-        }
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        local_metadata: dict[str, Any],
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        saved = {}
-        ours = self._saved_shapes().keys()
-        for name in ours:
-            if prefix + name in state_dict:
-                saved[name] = state_dict[prefix + name].detach().cpu().numpy().astype(np.float64)
-            else:
-                missing_keys.append(prefix + name)
-        unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in ours)
-        if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
-            error_msgs.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
-        if len(saved) == len(ours):
-            problem = misfit(saved, self._saved_shapes())
-            if problem:
-                error_msgs.append(problem)
-            else:
-                self._restore(saved)
-
-    def _saved_shapes(self) -> dict[str, tuple[int | None, ...]]:
-        """Shapes that saved arrays must have; None for any number of rows."""
-        d, n_points = self.scaling.n_variables, self.model.grid.n_points
-        n_pairs = n_points * self.n_actions
-        of_transfer = {} if self.transfer is None else self.transfer.saved_arrays()
-        return {
-            **{f"transfer_{k}": (None, *a.shape[1:]) if a.ndim > 1 else a.shape for k, a in of_transfer.items()},
-            "instances": (None, 2 * d + 4),
-            "corrections": (None, d + 2),
-            "values": (n_points,),
-            "known": (n_pairs,),
-            "total": (n_pairs,),
-            "lowest_value": (1,),
-            "n_truncated": (1,),
-        }
-
-    def _restore(self, saved: dict[str, np.ndarray]) -> None:
-        model, d = self.model, self.scaling.n_variables
-        self.n_truncated = int(saved["n_truncated"][0])
-        rows = saved["instances"]
-        actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
-        order = np.argsort(actions, kind="stable")
-        rows, actions = rows[order], actions[order]
-        fresh = KernelModel(
-            model.grid,
-            self.n_actions,
-            model_breadth=model.model_breadth,
-            min_weight=model.min_weight,
-            min_fraction=model.min_fraction,
-            exploration_threshold=model.full_threshold,
-            gamma=model.gamma,
-            transfer=model.transfer,
-            max_instances=model.max_instances,
-        )
-        if self.transfer is not None:
-            self.transfer.bind(self._task, self.rng)
-            prefix = "transfer_"
-            self.transfer.restore({name.removeprefix(prefix): a for name, a in saved.items() if name.startswith(prefix)})
-        fresh.instances = InstanceArrays.of_rows(
-            self.n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -3], rows[:, -2] > 0.5
-        )
-        fresh.lower_threshold(self.n_truncated)
-        fresh.restore(rows[:, -1] > 0.5, saved["known"] > 0.5, saved["total"])
-        self.model = self.planner.model = fresh
-        self.planner.bounds = (float(saved["lowest_value"][0]), self.planner.bounds[1])
-        self.planner.restore(saved["values"])
-        corrections = saved["corrections"]
-        self.corrections = CorrectionArrays.of_rows(corrections[:, 0].astype(np.int64), corrections[:, 1], corrections[:, 2:])
