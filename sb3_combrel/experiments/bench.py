@@ -146,7 +146,9 @@ def compare(n_pairs: int, part: float) -> None:
 
     Both runs of a pair go at the same time: whatever else slows the machine slows both.
     """
-    for number in (number for number, case in enumerate(CASES) if case.transfers):
+    for number, case in enumerate(CASES):
+        if not case.transfers:
+            continue
         numbers, added = (number - 1, number), []
         print(f"{CASES[number - 1].name}, without transfer and with COMBREL, {COMPARED_EPISODES} episodes, ms/step")
         parts = [part * COMPARED_EPISODES / CASES[n].n_episodes for n in numbers]

@@ -78,14 +78,16 @@ def memories(state: Sequence[Any] | None, episode_start: np.ndarray | None, n: i
 
 def small_cell(state: np.ndarray, grid: StateGrid) -> Hashable:
     """The small cell around a state (unit coordinates), of the size of those of the corrections."""
-    return tuple(np.floor(state * grid.arrays.cells * CELLS_PER_GRID_CELL + CELL_OFFSET).tolist())
+    return (state * grid.arrays.cells * CELLS_PER_GRID_CELL + CELL_OFFSET).astype(np.int64).tobytes()
 
 
 def predicted_reward(action: int, instances: InstanceArrays, query: QueryScratch, supply: Supply, threshold: float) -> float:
     """What the instances in ``query``, and those of ``supply`` if they are needed, predict for an action; 0 without any."""
-    n = query.length[action]
-    total = query.total[action]
-    n_supplied = supply.count[action] if total < threshold else 0
-    weights = np.append(query.weight[action, :n], supply.weight[action, :n_supplied])
-    rewards = np.append(instances.reward[action, query.index[action, :n]], supply.reward[action, :n_supplied])
-    return float(weights @ rewards / weights.sum()) if len(weights) else 0.0
+    n, total = query.length[action], query.total[action]
+    reward = query.weight[action, :n] @ instances.reward[action, query.index[action, :n]]
+    if total < threshold:
+        n_supplied = supply.count[action]
+        weights = supply.weight[action, :n_supplied]
+        total += weights.sum()
+        reward += weights @ supply.reward[action, :n_supplied]
+    return float(reward / total) if total > 0.0 else 0.0

@@ -292,7 +292,9 @@ class FittedRMaxPolicy(RestorablePolicy):
         states = self.to_unit(np.asarray(observation.cpu().numpy(), dtype=np.float64))  # type: ignore[union-attr]
         if deterministic:
             self._episodes = memories(*self._handed_on, len(states))
-            actions = list(map(self.exploit, states, self._episodes))
+            # With no state handed on there may be nobody who will: what costs time begins with the next call.
+            remembered = self._episodes if self._handed_on[0] is not None else [None] * len(states)
+            actions = list(map(self.exploit, states, remembered))
         else:
             actions = [self._sample(state) for state in states]
         return th.as_tensor(np.array(actions) + self._first_action, device=observation.device)  # type: ignore[union-attr]
