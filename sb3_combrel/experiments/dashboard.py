@@ -95,9 +95,9 @@ def learn_three_ways(logs: Path, total_timesteps: int) -> None:
     :param total_timesteps: environment steps of each run
     """
     from sb3_combrel import FittedRMax
-    from sb3_combrel.callbacks import DashboardCallback
     from sb3_combrel.experiments import mountain_car
     from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+    from sb3_combrel.tensorboard.callback import DashboardCallback
 
     source = mountain_car.learn_source()
     for method, transfer in mountain_car.methods(source).items():

@@ -22,15 +22,15 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_combrel.callbacks import with_dashboard
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.fitted_rmax.environments import names_of, refuse_normalized_observations, true_outcomes
+from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.saving import read_model, write_model
+from sb3_combrel.fitted_rmax.vec_envs import names_of, refuse_normalized_observations, true_outcomes
+from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.plain import to_plain
-from sb3_combrel.transfer.registry import describe_transfer, make_transfer, restore_transfer
+from sb3_combrel.transfer.by_name import describe_transfer, make_transfer, restore_transfer
 
 SelfFittedRMax = TypeVar("SelfFittedRMax", bound="FittedRMax")
 
@@ -69,7 +69,7 @@ class FittedRMax(BaseAlgorithm):
     - Planning is bounded by ``max_backups`` a step, what is around the agent first; the rest is done as time comes, most
       of it at an episode's end. Staying in a grid point is summed in closed form.
     - Where the agent comes back to the same place again and again, a wrong promise of the interpolated value is
-      corrected (see ``sb3_combrel.fitted_rmax.corrections``): a plain implementation can stick there for ever.
+      corrected (see ``sb3_combrel.planning.corrections``): a plain implementation can stick there for ever.
     - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%: with a narrow
       kernel all that is within reach cannot become known, and exploration would not end.
 

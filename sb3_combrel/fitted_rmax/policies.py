@@ -14,9 +14,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.compiled import SameTypes
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
-from sb3_combrel.common.supply import Supply
-from sb3_combrel.fitted_rmax.corrections import PATIENCE, CorrectionArrays
-from sb3_combrel.fitted_rmax.evaluation import (
+from sb3_combrel.common.transferred import Supply
+from sb3_combrel.fitted_rmax.loop_detection import (
     HOPEFUL,
     TRUSTING,
     TRYING,
@@ -25,13 +24,14 @@ from sb3_combrel.fitted_rmax.evaluation import (
     predicted_reward,
     small_cell,
 )
-from sb3_combrel.fitted_rmax.grid import StateGrid, fitting_grid
-from sb3_combrel.fitted_rmax.model import NO_PAIRS, KernelModel
-from sb3_combrel.fitted_rmax.planner import NOWHERE, Planner
-from sb3_combrel.fitted_rmax.q_values import QueryScratch, choose, find_near
 from sb3_combrel.fitted_rmax.restorable_policy import RestorablePolicy
+from sb3_combrel.models.kernel_average import NO_PAIRS, KernelModel
+from sb3_combrel.planning.corrections import PATIENCE, CorrectionArrays
+from sb3_combrel.planning.grid import StateGrid, fitting_grid
+from sb3_combrel.planning.q_values import QueryScratch, choose, find_near
+from sb3_combrel.planning.sweeping import NOWHERE, Planner
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.registry import describe_transfer, restore_transfer
+from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
 
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
 # enough that one hopeless grid point does not drown its neighbours' interpolated values for long.

@@ -10,10 +10,10 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_combrel.common.instances import InstanceArrays
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.fitted_rmax.corrections import CorrectionArrays
-from sb3_combrel.fitted_rmax.model import KernelModel
-from sb3_combrel.fitted_rmax.planner import Planner
 from sb3_combrel.fitted_rmax.saving import misfit
+from sb3_combrel.models.kernel_average import KernelModel
+from sb3_combrel.planning.corrections import CorrectionArrays
+from sb3_combrel.planning.sweeping import Planner
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 
-from sb3_combrel.transfer.virtual_source import VirtualSourceTransfer
+from sb3_combrel.transfer.mapping_transfer import VirtualSourceTransfer
 
 ROWS = 9
 """As many as the paper shows; the others are added up."""

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.plane import Plane
 from sb3_combrel.tensorboard.readings import action_values
-from sb3_combrel.transfer.virtual_source import VirtualSourceTransfer
+from sb3_combrel.transfer.mapping_transfer import VirtualSourceTransfer
 
 if TYPE_CHECKING:
     from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.fitted_rmax.grid import StateGrid
+from sb3_combrel.planning.grid import StateGrid
 
 VariablePair = tuple[int | str, int | str]
 

@@ -12,7 +12,7 @@ import numpy as np
 from sb3_combrel.common.scaling import StateScaling
 
 if TYPE_CHECKING:
-    from sb3_combrel.common.supply import Supply
+    from sb3_combrel.common.transferred import Supply
 
 
 @dataclass(frozen=True)

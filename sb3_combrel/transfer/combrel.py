@@ -6,17 +6,17 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.common.compiled import SameTypes
-from sb3_combrel.common.supply import Supply
+from sb3_combrel.common.transferred import Supply
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.compliance import ComplianceScratch, RewardCounts, standstill_compliance, transition_compliance
-from sb3_combrel.transfer.virtual_source import (
+from sb3_combrel.transfer.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_FADING,
     MappingsLike,
     SourceLike,
     VirtualSourceTransfer,
 )
-from sb3_combrel.transfer.voting import Ballots, find_voters, note_neighbor, vote
+from sb3_combrel.transfer.nearest_transitions import Ballots, find_voters, note_neighbor, vote
 
 RELEVANCE_RENEWAL = 1.2
 # Within an episode votes are held whenever this many times as much has been seen as at the last time: every transition

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.supply import Supply
+from sb3_combrel.common.transferred import Supply
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.virtual_source import (
+from sb3_combrel.transfer.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_FADING,
     MappingsLike,

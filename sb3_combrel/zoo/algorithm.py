@@ -10,9 +10,9 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
-from sb3_combrel.fitted_rmax.grid import fitting_grid
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
-from sb3_combrel.transfer.registry import make_transfer, restore_transfer
+from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 from sb3_combrel.zoo.sources import with_arguments, with_sources
 
 MOST_PAIRS = 2_000_000

@@ -12,8 +12,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.source import SourceInstances
 
 CACHE_VARIABLE = "SB3_COMBREL_CACHE"
 FITTED_RMAX = "fitted_rmax"

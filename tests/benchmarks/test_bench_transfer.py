@@ -5,10 +5,10 @@ import time
 import numpy as np
 import pytest
 
+from sb3_combrel.mappings.named_sets import MappingSet
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.compliance import ComplianceScratch, compliance_table, default_bandwidths
-from sb3_combrel.transfer.mappings import MappingSet
-from sb3_combrel.transfer.source import SourceInstances
-from sb3_combrel.transfer.virtual_source import stacked_instances, stacked_table
+from sb3_combrel.transfer.mapping_transfer import stacked_instances, stacked_table
 
 N_TRANSITIONS = 3000
 SETS = {"injective (12 x 243)": (MappingSet.injective, 12), "all (50 x 243)": (MappingSet.all, 50)}

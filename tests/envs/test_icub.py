@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
-from icub_plans import ARM, IDS, LENGTHS, NOISY, TASKS, TORSO, observations, plan_of, replay
+from helpers.icub_plans import ARM, IDS, LENGTHS, NOISY, TASKS, TORSO, observations, plan_of, replay
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
 import combrel_envs

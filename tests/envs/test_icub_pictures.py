@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
-from icub_plans import ARM, IDS, TASKS, TORSO, observations, plan_of
+from helpers.icub_plans import ARM, IDS, TASKS, TORSO, observations, plan_of
 
 import combrel_envs
 from combrel_envs import icub_tasks

@@ -7,7 +7,7 @@ from test_learning import SEEDS, lengths_of_episodes
 
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
-from sb3_combrel.fitted_rmax.model import EPISODES_OF_PATIENCE
+from sb3_combrel.models.kernel_average import EPISODES_OF_PATIENCE
 
 TORSO, ARM = "combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0"
 

@@ -1,7 +1,7 @@
 """Every test that takes ``make`` runs without transfer, with TIMBREL and with COMBREL."""
 
 import pytest
-from walk import METHODS, small
+from helpers.walk import METHODS, small
 
 
 @pytest.fixture(params=METHODS)

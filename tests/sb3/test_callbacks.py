@@ -1,6 +1,7 @@
 """Callbacks: what they are shown, how they stop the learning, and SB3's own."""
 
 import pytest
+from helpers.walk import Recorder, Walk, same_parameters
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
@@ -9,7 +10,6 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.monitor import Monitor
-from walk import Recorder, Walk, same_parameters
 
 from sb3_combrel import FittedRMax
 

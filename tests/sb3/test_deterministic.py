@@ -1,7 +1,7 @@
 """Seeds: the same run to the last bit."""
 
 import numpy as np
-from walk import same_parameters, small
+from helpers.walk import same_parameters, small
 
 
 def test_the_same_seed_gives_the_same_run_to_the_last_bit(make):

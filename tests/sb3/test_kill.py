@@ -10,14 +10,14 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from walk import Walk
+from helpers.walk import Walk
 
 from sb3_combrel import FittedRMax
 
 SCRIPT = """
 import sys
 from stable_baselines3.common.callbacks import CheckpointCallback
-from walk import METHODS, small
+from helpers.walk import METHODS, small
 small(transfer=METHODS[sys.argv[1]]()).learn(10**9, callback=CheckpointCallback(40, sys.argv[2], "at"))
 """
 

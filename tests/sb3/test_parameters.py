@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
-from walk import OBSERVATIONS, same_parameters
+from helpers.walk import OBSERVATIONS, same_parameters
 
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 

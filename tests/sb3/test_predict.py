@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.walk import GOAL, OBSERVATIONS, STRIDE, Walk, same_parameters
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
-from walk import GOAL, OBSERVATIONS, STRIDE, Walk, same_parameters
 
 
 @pytest.mark.parametrize("deterministic", [True, False])

@@ -6,10 +6,10 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.walk import OBSERVATIONS, Walk
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_checker import check_env
-from walk import OBSERVATIONS, Walk
 
 from sb3_combrel import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy

@@ -5,10 +5,10 @@ import pathlib
 
 import numpy as np
 import pytest
+from helpers.walk import METHODS, OBSERVATIONS, Walk, same_parameters, small, stored
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv
-from walk import METHODS, OBSERVATIONS, Walk, same_parameters, small, stored
 
 from sb3_combrel import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import Env, spaces
+from helpers.walk import METHODS, Walk, same_parameters, small
 from stable_baselines3 import DQN
-from walk import METHODS, Walk, same_parameters, small
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import FittedRMax

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers.walk import METHODS, STRIDE, Walk, same_parameters, small, stored, walk_source
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
-from walk import METHODS, STRIDE, Walk, same_parameters, small, stored, walk_source
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
-from sb3_combrel.common.supply import Supply
+from sb3_combrel.common.transferred import Supply
 from sb3_combrel.transfer.base import Transfer
 
 MAPPING = InterTaskMapping([0, 1], [0, 1])

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from walk import OBSERVATIONS, Walk, small
+from helpers.walk import OBSERVATIONS, Walk, small
 
 from sb3_combrel import FittedRMax
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.walk import Recorder, Walk, stored
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
-from walk import Recorder, Walk, stored
 
 from sb3_combrel import FittedRMax
 

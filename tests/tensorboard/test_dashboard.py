@@ -18,7 +18,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances
-from sb3_combrel.callbacks import DashboardCallback
+from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.tensorboard.history import MOST_COLUMNS, ChoiceHistory
 from sb3_combrel.tensorboard.layout import LAYOUT
 from sb3_combrel.tensorboard.mapping_table import mapping_table
@@ -245,8 +245,8 @@ def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(tran
 
     shown = []
     monkeypatch.setattr(DashboardCallback, "_write_pictures", slowly)
-    monkeypatch.setattr("sb3_combrel.callbacks.FIRST_PICTURES_SECONDS", 0.01)
-    monkeypatch.setattr("sb3_combrel.callbacks.DEFAULT_PICTURE_FREQ", 10)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.FIRST_PICTURES_SECONDS", 0.01)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.DEFAULT_PICTURE_FREQ", 10)
     began = time.perf_counter()
     walker(tmp_path, transfers["COMBREL"]).learn(3000)
     took = time.perf_counter() - began
@@ -262,7 +262,7 @@ def test_a_short_run_has_no_pictures_unless_they_are_asked_for(tmp_path):
 
 def test_no_pictures_without_a_frequency(tmp_path):
     command = (
-        "import sys; from sb3_combrel import FittedRMax; from sb3_combrel.callbacks import DashboardCallback;"
+        "import sys; from sb3_combrel import FittedRMax; from sb3_combrel.tensorboard.callback import DashboardCallback;"
         "model = FittedRMax('MountainCar-v0', seed=0, tensorboard_log=sys.argv[1]);"
         "model.learn(300, DashboardCallback(picture_freq=None)); print('matplotlib' in sys.modules)"
     )
@@ -272,7 +272,7 @@ def test_no_pictures_without_a_frequency(tmp_path):
 
 
 def test_without_matplotlib_there_are_no_pictures_but_all_else(tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_combrel.callbacks.find_spec", lambda name: None)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.find_spec", lambda name: None)
     walker(tmp_path).learn(150)
     found = events(tmp_path / "FittedRMax_1")
     assert not found.Tags()["images"] and "model/known" in found.Tags()["scalars"]
@@ -423,7 +423,7 @@ def test_without_a_log_nothing_is_worked_out(transfers, monkeypatch):
         raise AssertionError("this was for a log that nobody writes")
 
     monkeypatch.setattr("sb3_combrel.fitted_rmax.policies.FittedRMaxPolicy.statistics", refuse)
-    monkeypatch.setattr("sb3_combrel.callbacks.DashboardCallback._on_training_start", refuse)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.DashboardCallback._on_training_start", refuse)
     monkeypatch.setattr("sb3_combrel.transfer.combrel.COMBREL.choices", refuse)
     model = walker(transfer=transfers["COMBREL"]).learn(200)
     assert model._episode_num > 4 and model.policy.planning_seconds == 0.0
@@ -435,7 +435,7 @@ def test_without_a_log_nothing_is_worked_out(transfers, monkeypatch):
 def test_no_part_of_it_is_imported_without_a_log():
     command = (
         "import sys; from sb3_combrel import FittedRMax; FittedRMax('MountainCar-v0', seed=0).learn(300);"
-        "print([m for m in sys.modules if m.startswith(('matplotlib', 'sb3_combrel.tensorboard'))])"
+        "print([m for m in sys.modules if m.startswith(('matplotlib', 'torch.utils.tensorboard'))])"
     )
     result = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

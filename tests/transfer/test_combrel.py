@@ -3,18 +3,18 @@
 from collections import Counter
 from functools import cache
 
-import naive_transfer as naive
 import numpy as np
 import pytest
+from helpers import naive_transfer as naive
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from combrel_envs.mountain_car_dynamics import PUSHES, step_axis
 from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.compliance import Bandwidths
-from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.source import SourceInstances
 
 BANDWIDTHS = Bandwidths(0.05, 0.05, 1.0)
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

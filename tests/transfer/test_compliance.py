@@ -1,11 +1,13 @@
 """Compliance and relevance against loops written from the paper's equations, and that they say what they are for."""
 
-import naive_transfer as naive
 import numpy as np
 import pytest
+from helpers import naive_transfer as naive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.compliance import (
     Bandwidths,
     ComplianceScratch,
@@ -14,10 +16,8 @@ from sb3_combrel.transfer.compliance import (
     task_compliance,
     transition_compliance,
 )
-from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.transfer.mapping_transfer import stacked_instances, stacked_table
 from sb3_combrel.transfer.relevance import relevance
-from sb3_combrel.transfer.source import SourceInstances
-from sb3_combrel.transfer.virtual_source import stacked_instances, stacked_table
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))

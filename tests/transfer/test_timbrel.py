@@ -2,14 +2,14 @@
 
 import copy
 
-import naive_transfer as naive
 import numpy as np
 import pytest
+from helpers import naive_transfer as naive
 from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
-from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 ONE = InterTaskMapping([0, None, 1], [1, 0])

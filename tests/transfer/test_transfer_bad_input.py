@@ -1,12 +1,12 @@
 """Sources, mappings and arguments of transfer that cannot work: an error when the model is made, that says what to change."""
 
-import naive_transfer as naive
 import numpy as np
 import pytest
 from gymnasium import Env, spaces
+from helpers import naive_transfer as naive
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
-from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 
 
 class Untouched(Env):

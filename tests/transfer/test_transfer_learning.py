@@ -9,8 +9,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
-from sb3_combrel.transfer.mappings import InterTaskMapping
-from sb3_combrel.transfer.source import SourceInstances
+from sb3_combrel.mappings.named_sets import InterTaskMapping
+from sb3_combrel.sources.source_instances import SourceInstances
 
 SEEDS = range(3)
 N_EPISODES = 12

@@ -1,18 +1,18 @@
 """Which source instances are transferred to a pair, and as what, against a naive implementation of the rules."""
 
-import naive_transfer as naive
 import numpy as np
 import pytest
+from helpers import naive_transfer as naive
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import TIMBREL
 from sb3_combrel.common.kernels import list_room
-from sb3_combrel.common.supply import Supply
-from sb3_combrel.transfer.mappings import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.source import SourceInstances
+from sb3_combrel.common.transferred import Supply
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.mapping_transfer import stacked_instances, stacked_table
 from sb3_combrel.transfer.translation import BestInstances, CandidateArrays, TransferRules, translate
-from sb3_combrel.transfer.virtual_source import stacked_instances, stacked_table
 
 seeds = st.integers(0, 2**32 - 1)
 

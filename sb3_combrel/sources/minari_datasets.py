@@ -1,0 +1,84 @@
+"""Source instances from and to Minari datasets."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.sources.recording import TransitionLog
+from sb3_combrel.sources.source_instances import SourceInstances, count_actions
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+
+_METADATA_KEY = "sb3_combrel"
+
+
+def from_minari(dataset: str | MinariDataset, bounds: Bounds | None = None) -> SourceInstances:
+    """All transitions of a Minari dataset; see :meth:`SourceInstances.from_minari`."""
+    minari = _import_minari()
+    data = minari.load_dataset(dataset) if isinstance(dataset, str) else dataset
+    action_space = data.action_space
+    scaling = StateScaling.from_space(data.observation_space, bounds)
+    n_actions = count_actions(action_space)
+    log = TransitionLog()
+    for episode in data.iterate_episodes():
+        states = np.asarray(episode.observations)
+        for i, action in enumerate(episode.actions):
+            log.add(
+                states[i], int(action) - int(action_space.start), episode.rewards[i], states[i + 1], episode.terminations[i]
+            )
+    kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
+    env_spec = data.env_spec
+    unnamed = {"env": None if env_spec is None else env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
+    return log.instances(scaling, n_actions, kept.get("names", {}), kept.get("origin", unnamed))
+
+
+def to_minari(source: SourceInstances, dataset_id: str, **metadata: Any) -> MinariDataset:
+    """Store source instances as a local Minari dataset; see :meth:`SourceInstances.to_minari`."""
+    minari = _import_minari()
+    from minari.data_collector import EpisodeBuffer
+
+    # An episode ends at a terminal state and wherever the next instance does not go on from this one.
+    goes_on = (source.next_states[:-1] == source.states[1:]).all(axis=1) & ~source.terminated[:-1]
+    episodes = []
+    for rows in np.split(np.arange(len(source)), np.flatnonzero(~goes_on) + 1):
+        truncated = np.zeros(len(rows), dtype=bool)
+        truncated[-1] = not source.terminated[rows[-1]]
+        episodes.append(
+            EpisodeBuffer(
+                observations=np.vstack([source.states[rows], source.next_states[rows[-1:]]]),
+                actions=source.actions[rows],
+                rewards=source.rewards[rows],
+                terminations=source.terminated[rows],
+                truncations=truncated,
+            )
+        )
+    with warnings.catch_warnings():
+        # Minari warns of every piece of metadata that is not given; which ones to give is the caller's choice.
+        warnings.simplefilter("ignore", UserWarning)
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id,
+            episodes,
+            observation_space=spaces.Box(source.low, source.high, dtype=np.float64),
+            action_space=spaces.Discrete(source.n_actions),
+            **metadata,
+        )
+    names = {"state_names": source.state_names, "action_names": source.action_names}
+    dataset.storage.update_metadata({_METADATA_KEY: json.dumps({"names": names, "origin": source.origin})})
+    return dataset
+
+
+def _import_minari() -> ModuleType:
+    try:
+        import h5py  # noqa: F401  Minari's usual file format; without it the error would come from deep inside
+        import minari
+    except ImportError as error:
+        raise ImportError('Minari datasets need Minari with HDF5: pip install "sb3-combrel[minari]"') from error
+    return minari

@@ -1,0 +1,217 @@
+"""Q-learning with tile coding: solves small source tasks in seconds, and its experience makes good source instances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.sources.recording import TransitionLog, describe_origin, make_env, task_names
+from sb3_combrel.sources.source_instances import SourceInstances, count_actions
+
+Transition = Callable[[NDArray[Any], int, float, NDArray[Any], bool], object]
+"""Told of each step: state, action (from 0 on), reward, next state (raw units), and whether that is terminal."""
+
+_MAX_TILES = 10_000_000
+
+
+class TileCoding:
+    """
+    Overlapping grids over the unit cube; each state lies in one tile of each grid (Sutton and Barto, Section 9.5.4).
+
+    :param n_variables: number of state variables
+    :param n_tilings: number of grids, each shifted against the others
+    :param n_tiles: tiles along each variable of a grid
+    :raises ValueError: if a number is below 1, or if there would be too many tiles to hold
+    """
+
+    def __init__(self, n_variables: int, n_tilings: int = 8, n_tiles: int = 8) -> None:
+        for name, number in (("n_tilings", n_tilings), ("n_tiles", n_tiles)):
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1, got {number}")
+        # One more tile along each variable than asked for, as the grids are shifted.
+        self.n_features = n_tilings * (n_tiles + 1) ** n_variables
+        if self.n_features > _MAX_TILES:
+            raise ValueError(
+                f"n_tiles={n_tiles} makes {self.n_features:,} tiles for {n_variables} state variables, more than "
+                f"{_MAX_TILES:,}; choose a smaller n_tiles or n_tilings"
+            )
+        self.n_tilings = n_tilings
+        self.n_tiles = n_tiles
+        # Odd multiples 1, 3, 5, ... of the unit shift keep the tiles of different grids from lining up on diagonals.
+        self._offsets = (np.arange(n_tilings)[:, None] * (2 * np.arange(n_variables) + 1) % n_tilings) / n_tilings
+        self._strides = (n_tiles + 1) ** np.arange(n_variables)
+        self._first = np.arange(n_tilings) * (n_tiles + 1) ** n_variables
+
+    def tiles(self, unit_state: NDArray[np.float64]) -> NDArray[np.int64]:
+        """
+        The tiles in which a state lies.
+
+        :param unit_state: unit coordinates, shape (n_variables,); what is outside the cube counts as its border
+        :return: feature numbers, one for each grid, shape (n_tilings,)
+        """
+        inside = np.minimum(np.maximum(unit_state, 0.0), 1.0) * self.n_tiles
+        return self._first + (inside + self._offsets).astype(np.int64) @ self._strides
+
+
+class QLearning:
+    """
+    Watkins's Q(lambda) on tile-coded states: one-step Q-learning with eligibility traces that a random action cuts.
+
+    Values begin at ``initial_value``; where rewards are negative, 0 is optimistic and makes the learner explore.
+
+    :param env: a task with a Box of a few state variables and a Discrete action space, or its id
+    :param learning_rate: share of the error that one update corrects
+    :param gamma: discount factor
+    :param trace_decay: lambda, the decay of the traces; 0 for one-step Q-learning
+    :param epsilon: probability of a random action while learning
+    :param initial_value: value of every state and action at first
+    :param n_tilings: number of grids, see :class:`TileCoding`
+    :param n_tiles: tiles along each variable
+    :param bounds: ``(low, high)`` of the states if the observation space has none
+    :param seed: seed of the learner and its environment
+    :raises ValueError: if the spaces are of another kind or an argument is out of range
+    """
+
+    def __init__(
+        self,
+        env: str | gym.Env[Any, Any],
+        *,
+        learning_rate: float = 0.3,
+        gamma: float = 1.0,
+        trace_decay: float = 0.9,
+        epsilon: float = 0.01,
+        initial_value: float = 0.0,
+        n_tilings: int = 8,
+        n_tiles: int = 8,
+        bounds: Bounds | None = None,
+        seed: int | None = None,
+    ) -> None:
+        shares = (("learning_rate", learning_rate), ("gamma", gamma), ("trace_decay", trace_decay), ("epsilon", epsilon))
+        for name, value in shares:
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must be between 0 and 1, got {value}")
+        self.env = make_env(env)
+        self.observation_space = self.env.observation_space
+        self.action_space = self.env.action_space
+        self.scaling = StateScaling.from_space(self.observation_space, bounds)
+        self.n_actions = count_actions(self.action_space)
+        self.learning_rate = learning_rate
+        self.gamma = gamma
+        self.trace_decay = trace_decay
+        self.epsilon = epsilon
+        self.seed = seed
+        self.coding = TileCoding(self.scaling.n_variables, n_tilings, n_tiles)
+        self.weights = np.full((self.coding.n_features, self.n_actions), initial_value / n_tilings)
+        self.episode_lengths: list[int] = []
+        self._first_action = int(self.action_space.start)  # type: ignore[attr-defined]
+        self._rng = np.random.default_rng(seed)
+
+    def learn(self, total_timesteps: int, callback: Transition | None = None) -> QLearning:
+        """
+        Act and learn. Each call begins with a new episode; the last one may stay unfinished.
+
+        :param total_timesteps: number of steps in the environment
+        :param callback: called with every transition
+        :raises ValueError: if ``total_timesteps`` is below 1
+        """
+        if total_timesteps < 1:
+            raise ValueError(f"total_timesteps must be at least 1, got {total_timesteps}")
+        steps, seed = 0, self.seed if not self.episode_lengths else None
+        while steps < total_timesteps:
+            steps += self._episode(total_timesteps - steps, callback, seed)
+            seed = None
+        return self
+
+    def _episode(self, most_steps: int, callback: Transition | None, seed: int | None) -> int:
+        """Run one episode of at most ``most_steps``; returns its number of steps."""
+        state, _ = self.env.reset(seed=seed)
+        tiles = self._tiles(state)
+        # Dense: for the few variables that tile coding is good for this is quicker than a list of visited tiles.
+        traces = np.zeros_like(self.weights)
+        for step in range(1, most_steps + 1):
+            values = self._values(tiles)
+            greedy = self._argmax(values)
+            explore = self._rng.random() < self.epsilon
+            action = int(self._rng.integers(self.n_actions)) if explore else greedy
+            if values[action] < values[greedy]:
+                # What follows a worse action says nothing of the best way on from the states before it.
+                traces[:] = 0.0
+            following, reward, terminated, truncated, _ = self.env.step(action + self._first_action)
+            if callback is not None:
+                callback(state, action, float(reward), following, bool(terminated))
+            next_tiles = self._tiles(following)
+            best = 0.0 if terminated else float(self._values(next_tiles).max())
+            error = float(reward) + self.gamma * best - values[action]
+            traces *= self.gamma * self.trace_decay
+            traces[tiles] = 0.0
+            traces[tiles, action] = 1.0
+            self.weights += (self.learning_rate / self.coding.n_tilings * error) * traces
+            state, tiles = following, next_tiles
+            if terminated or truncated:
+                self.episode_lengths.append(step)
+                return step
+        return most_steps
+
+    def predict(
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.int64], Any]:
+        """
+        Actions in SB3's manner: greedy ones, or with ``deterministic=False`` a random one with probability ``epsilon``.
+
+        :param observation: raw units, shape (n_variables,) or (n_states, n_variables)
+        :param state: no use, the learner is not recurrent
+        :param episode_start: no use
+        :param deterministic: whether to take greedy actions only
+        :return: the action or actions, and ``state``
+        """
+        states = np.asarray(observation)
+        actions = np.array([self._argmax(self._values(self._tiles(each))) for each in np.atleast_2d(states)])
+        if not deterministic:
+            explore = self._rng.random(len(actions)) < self.epsilon
+            actions = np.where(explore, self._rng.integers(self.n_actions, size=len(actions)), actions)
+        actions = actions + self._first_action
+        return (actions[0] if states.ndim == 1 else actions), state
+
+    def _tiles(self, state: NDArray[Any]) -> NDArray[np.int64]:
+        return self.coding.tiles(self.scaling.to_unit(state))
+
+    def _values(self, tiles: NDArray[np.int64]) -> NDArray[np.float64]:
+        return self.weights[tiles].sum(axis=0)
+
+    def _argmax(self, values: NDArray[np.float64]) -> int:
+        best = np.flatnonzero(values == values.max())
+        return int(best[0] if len(best) == 1 else self._rng.choice(best))
+
+
+def learn_source(
+    env: str | gym.Env[Any, Any],
+    n_instances: int = 1000,
+    seed: int | None = None,
+    *,
+    total_timesteps: int = 30_000,
+    method: str = "random",
+    **q_learning: Any,
+) -> SourceInstances:
+    """Learn a source task and keep a sample of all experience; see :meth:`SourceInstances.from_q_learning`."""
+    if not 1 <= n_instances <= total_timesteps:
+        raise ValueError(f"n_instances must be between 1 and total_timesteps={total_timesteps}, got {n_instances}")
+    learner = QLearning(env, seed=seed, **q_learning)
+    try:
+        log = TransitionLog()
+        learner.learn(total_timesteps, log.add)
+        origin = describe_origin(learner.env, type(learner).__name__, seed)
+        origin |= {"recorded_while_learning": True, "total_timesteps": total_timesteps}
+        experience = log.instances(learner.scaling, learner.n_actions, task_names(learner.env), origin)
+        return experience.subset(n_instances, method, seed)
+    finally:
+        if isinstance(env, str):
+            learner.env.close()

@@ -1,0 +1,391 @@
+"""Source instances: transitions of a source task, with all that a transfer method must know of that task."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.sources.source_file import ARRAY_NAMES, DAMAGE, read_source, source_from_bytes, source_to_bytes, write_source
+from sb3_combrel.sources.subsets import covering_rows, random_rows
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from stable_baselines3.common.vec_env import VecEnv
+
+    from sb3_combrel.sources.recording import Behaviour
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SourceInstances:
+    """
+    Instances <s, a, r, s'> of a source task (Section 3), in raw units, and the spaces they come from.
+
+    The arrays cannot be written to: one source may serve several transfer methods.
+
+    :param states: where each transition starts, raw units, shape (n_instances, n_variables)
+    :param actions: its action, from 0 on, shape (n_instances,)
+    :param rewards: its reward, shape (n_instances,)
+    :param next_states: where it ends, raw units, shape (n_instances, n_variables); of an episode's last transition too
+    :param terminated: whether it reached a terminal state, shape (n_instances,); a time limit is no such state
+    :param low: lower bound of each state variable, raw units, shape (n_variables,)
+    :param high: upper bound of each state variable, raw units, shape (n_variables,)
+    :param n_actions: number of actions of the task, also of those that no instance has
+    :param state_names: name of each state variable; by default s0, s1, ...
+    :param action_names: name of each action; by default a0, a1, ...
+    :param origin: where the instances came from, a dict that JSON can hold
+    :raises ValueError: if there are no instances, or if an argument does not fit the others or is not finite
+    """
+
+    states: Floats
+    actions: NDArray[np.int64]
+    rewards: Floats
+    next_states: Floats
+    terminated: NDArray[np.bool_]
+    low: Floats
+    high: Floats
+    n_actions: int
+    state_names: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
+    origin: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        scaling = StateScaling(self.low, self.high)
+        n, d = len(np.atleast_1d(self.states)), scaling.n_variables
+        if n == 0:
+            raise ValueError("states must hold at least one instance, got none: there is nothing to transfer")
+        arrays: dict[str, NDArray[Any]] = {
+            "states": _finite("states", self.states, (n, d)),
+            "actions": _whole_numbers(self.actions, n, self.n_actions),
+            "rewards": _finite("rewards", self.rewards, (n,)),
+            "next_states": _finite("next_states", self.next_states, (n, d)),
+            "terminated": _flags(self.terminated, n),
+            "low": scaling.low,
+            "high": scaling.high,
+        }
+        for name, array in arrays.items():
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "n_actions", int(self.n_actions))
+        object.__setattr__(self, "state_names", _names("state_names", self.state_names, d, "s"))
+        object.__setattr__(self, "action_names", _names("action_names", self.action_names, self.n_actions, "a"))
+        try:
+            object.__setattr__(self, "origin", json.loads(json.dumps(dict(self.origin))))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"origin must be a dict that JSON can hold, got {self.origin!r}") from error
+
+    @classmethod
+    def record(
+        cls,
+        model: Behaviour | None,
+        env: str | gym.Env[Any, Any] | VecEnv,
+        n_instances: int = 1000,
+        seed: int | None = None,
+        *,
+        deterministic: bool = False,
+        bounds: Bounds | None = None,
+    ) -> SourceInstances:
+        """
+        Let a behaviour act in the source task and record what happens, from a reset on, through as many episodes as needed.
+
+        Where the instances should cover more of the task than one behaviour visits, record more and take a
+        :meth:`subset`, or record with :class:`~sb3_combrel.sources.recording.SourceRecorder` while a model learns.
+
+        :param model: an SB3 model or policy (anything with its ``predict``), a function from one state, raw units, shape
+            (n_variables,), to an action, or None for random actions
+        :param env: an environment, a vectorised one, or an id; one that was given is left open. Under ``VecNormalize``
+            the model sees normalised states and the original ones are recorded; those at the end of an episode are
+            computed back from normalised ones, so what ``clip_obs`` has cut off stays cut off.
+        :param n_instances: number of transitions to record
+        :param seed: seed of the environment, the random actions and the model's own randomness; None for none
+        :param deterministic: whether an SB3 model takes its deterministic actions
+        :param bounds: ``(low, high)`` of the states if the observation space has none
+        :raises ValueError: if the spaces are not a Box of shape (n_variables,) and a Discrete, if the observation space is
+            unbounded and ``bounds`` is not given, or if ``n_instances`` is below 1
+        """
+        from sb3_combrel.sources.recording import record
+
+        return record(model, env, n_instances, seed, deterministic=deterministic, bounds=bounds)
+
+    @classmethod
+    def from_q_learning(
+        cls,
+        env: str | gym.Env[Any, Any],
+        n_instances: int = 1000,
+        seed: int | None = None,
+        *,
+        total_timesteps: int = 30_000,
+        method: str = "random",
+        **q_learning: Any,
+    ) -> SourceInstances:
+        """
+        Learn the source task with Q-learning and keep a sample of all its experience, as in Section 5.1 of the paper.
+
+        :param env: a small task, or its id, e.g. "combrel/MountainCar2D-v0"
+        :param n_instances: number of instances to keep
+        :param seed: seed of the learner, its environment and the sample
+        :param total_timesteps: steps of learning
+        :param method: how to choose the instances, see :meth:`subset`
+        :param q_learning: further arguments of :class:`~sb3_combrel.sources.q_learning.QLearning`
+        :raises ValueError: if the spaces do not fit, or if ``n_instances`` exceeds ``total_timesteps``
+        """
+        from sb3_combrel.sources.q_learning import learn_source
+
+        return learn_source(env, n_instances, seed, total_timesteps=total_timesteps, method=method, **q_learning)
+
+    @classmethod
+    def from_fitted_rmax(
+        cls,
+        env: str | gym.Env[Any, Any],
+        n_instances: int = 1000,
+        seed: int | None = None,
+        *,
+        n_episodes: int = 100,
+        method: str = "covering",
+        **learner: Any,
+    ) -> SourceInstances:
+        """
+        Learn the source task with Fitted R-Max and keep a choice of all its experience, as in Section 5.2 of the paper.
+
+        :param env: a task, or its id, e.g. "combrel/ICubTorsoStrike-v0"
+        :param n_instances: number of instances to keep
+        :param seed: seed of the learner, its environment and the choice
+        :param n_episodes: episodes of learning
+        :param method: how to choose the instances, see :meth:`subset`; most of the experience is of one path, so by default
+            those that cover most
+        :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, such as ``max_value``
+        :raises ValueError: if the spaces do not fit, or if a number is below 1
+        """
+        from sb3_combrel.sources.fitted_rmax_learning import learn_source
+
+        return learn_source(env, n_instances, seed, n_episodes=n_episodes, method=method, **learner)
+
+    @classmethod
+    def from_minari(
+        cls,
+        dataset: str | MinariDataset,
+        n_instances: int | None = None,
+        seed: int | None = None,
+        *,
+        bounds: Bounds | None = None,
+    ) -> SourceInstances:
+        """
+        Take the transitions of a Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
+
+        :param dataset: a dataset, or the id of one that has been downloaded
+        :param n_instances: size of a random sample of them; None for all
+        :param seed: seed of the sample
+        :param bounds: ``(low, high)`` of the states if the dataset's observation space has none
+        :raises ImportError: if Minari is missing
+        :raises ValueError: if the dataset's spaces are not a Box of shape (n_variables,) and a Discrete
+        """
+        from sb3_combrel.sources.minari_datasets import from_minari
+
+        source = from_minari(dataset, bounds)
+        return source if n_instances is None else source.subset(n_instances, seed=seed)
+
+    def to_minari(self, dataset_id: str, **metadata: Any) -> MinariDataset:
+        """
+        Store the instances as a local Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
+
+        Instances that follow one another become one Minari episode. Names and origin are kept in the metadata.
+
+        :param dataset_id: id of the new dataset, e.g. "mountaincar2d/q-learning-v0"
+        :param metadata: arguments of ``minari.create_dataset_from_buffers`` such as ``author``
+        :raises ImportError: if Minari is missing
+        """
+        from sb3_combrel.sources.minari_datasets import to_minari
+
+        return to_minari(self, dataset_id, **metadata)
+
+    @property
+    def scaling(self) -> StateScaling:
+        """The map from the task's states to unit coordinates."""
+        return StateScaling(self.low, self.high)
+
+    @property
+    def n_variables(self) -> int:
+        """Number of state variables."""
+        return int(self.states.shape[1])
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __repr__(self) -> str:
+        return (
+            f"<{len(self)} source instances of {self.origin.get('env', 'an unnamed task')}: states "
+            f"({', '.join(self.state_names)}), actions ({', '.join(self.action_names)}), "
+            f"{int(self.terminated.sum())} of them terminal>"
+        )
+
+    def subset(self, n_instances: int, method: str = "random", seed: int | None = None) -> SourceInstances:
+        """
+        A choice of the instances, in their order. If any instance is terminal, so is at least one of the choice.
+
+        :param n_instances: number of instances to choose; all are taken if there are no more
+        :param method: "random", or "covering" for instances of each action that lie as far apart as possible
+        :param seed: seed of the choice
+        :raises ValueError: if ``n_instances`` is below 1 or ``method`` is another
+        """
+        if n_instances < 1:
+            raise ValueError(f"n_instances must be at least 1, got {n_instances}")
+        rng = np.random.default_rng(seed)
+        if method == "random":
+            rows = random_rows(self.terminated, n_instances, rng)
+        elif method == "covering":
+            rows = covering_rows(self.scaling.to_unit(self.states), self.actions, self.terminated, n_instances, rng)
+        else:
+            raise ValueError(f"method must be 'random' or 'covering', got {method!r}")
+        chosen = {"method": method, "seed": seed, "chosen_from": len(self)}
+        return self._with_rows(rows, {**self.origin, "subset": chosen})
+
+    def check_spaces(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+        """
+        Check that the instances come from a task with these spaces.
+
+        :param observation_space: observation space of the task
+        :param action_space: action space of the task
+        :raises ValueError: if the numbers of variables or actions differ, or if the bounds of the variables do
+        """
+        n_actions = count_actions(action_space)
+        if observation_space.shape != (self.n_variables,) or n_actions != self.n_actions:
+            raise ValueError(
+                f"the source instances have {self.n_variables} state variables {self.state_names} and {self.n_actions} "
+                f"actions {self.action_names}, the task has {observation_space} and {action_space}; record them in this task"
+            )
+        low, high = observation_space.low, observation_space.high  # type: ignore[attr-defined]
+        bounded = np.isfinite(low) & np.isfinite(high)
+        # Spaces are often float32: compare to that precision.
+        if not (np.allclose(self.low[bounded], low[bounded]) and np.allclose(self.high[bounded], high[bounded])):
+            raise ValueError(
+                f"the source instances are of states between {self.low.tolist()} and {self.high.tolist()}, "
+                f"the task has {observation_space}; record them in this task"
+            )
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """
+        Write a compressed npz file without pickled objects. The file appears complete or not at all.
+
+        :param path: path of the file; the suffix .npz is added if there is none
+        :return: the path written to
+        :raises OSError: if the file cannot be written
+        """
+        return write_source(path, *self._content())
+
+    def to_bytes(self) -> bytes:
+        """The content of the file that :meth:`save` writes."""
+        return source_to_bytes(*self._content())
+
+    def _content(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        header = {
+            "n_actions": self.n_actions,
+            "state_names": self.state_names,
+            "action_names": self.action_names,
+            "origin": self.origin,
+        }
+        return {name: getattr(self, name) for name in ARRAY_NAMES}, header
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SourceInstances:
+        """
+        Read a file written by :meth:`save`.
+
+        :param path: path of the file; the suffix .npz may be left out
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if the file is damaged, of another kind or of another version of the format
+        """
+        return read_source(path, cls._of_content)
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> SourceInstances:
+        """
+        What :meth:`to_bytes` wrote.
+
+        :raises ValueError: if the bytes are damaged, of another kind or of another version of the format
+        """
+        try:
+            return source_from_bytes(content, cls._of_content)
+        except DAMAGE as error:
+            raise ValueError(f"the source instances are damaged ({error})") from error
+
+    @classmethod
+    def _of_content(cls, arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> SourceInstances:
+        return cls(
+            **arrays,
+            n_actions=header["n_actions"],
+            state_names=tuple(header["state_names"]),
+            action_names=tuple(header["action_names"]),
+            origin=header["origin"],
+        )
+
+    def _with_rows(self, rows: NDArray[np.int64], origin: Mapping[str, Any]) -> SourceInstances:
+        return SourceInstances(
+            self.states[rows],
+            self.actions[rows],
+            self.rewards[rows],
+            self.next_states[rows],
+            self.terminated[rows],
+            self.low,
+            self.high,
+            self.n_actions,
+            self.state_names,
+            self.action_names,
+            origin,
+        )
+
+
+def count_actions(space: spaces.Space[Any]) -> int:
+    """
+    Number of actions of a discrete action space.
+
+    :param space: the action space
+    :raises ValueError: if it is not a ``Discrete``
+    """
+    if not isinstance(space, spaces.Discrete):
+        raise ValueError(f"the action space must be Discrete, got {space}")
+    return int(space.n)
+
+
+def _finite(name: str, values: object, shape: tuple[int, ...]) -> Floats:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have the shape {shape}, got {array.shape}")
+    wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
+    if wrong.size:
+        raise ValueError(f"{name} must be finite, got {array[wrong[0]]} for instance {wrong[0]}")
+    return array
+
+
+def _whole_numbers(actions: object, n: int, n_actions: int) -> NDArray[np.int64]:
+    array = np.array(actions)
+    if array.shape != (n,) or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"actions must be integers of shape ({n},), got {array.dtype} of shape {array.shape}")
+    if array.min() < 0 or array.max() >= n_actions:
+        raise ValueError(f"actions must lie between 0 and n_actions - 1 = {n_actions - 1}, got {array.min()} to {array.max()}")
+    return array.astype(np.int64)
+
+
+def _flags(terminated: object, n: int) -> NDArray[np.bool_]:
+    array = np.array(terminated)
+    if array.shape != (n,) or array.dtype != np.bool_:
+        raise ValueError(f"terminated must be booleans of shape ({n},), got {array.dtype} of shape {array.shape}")
+    return array
+
+
+def _names(name: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
+    if len(names) == 0:
+        return tuple(f"{letter}{i}" for i in range(n))
+    if len(names) != n:
+        raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
+    return tuple(str(each) for each in names)

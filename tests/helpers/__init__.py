@@ -1,0 +1,1 @@
+"""What tests share: slow, independent computations, and small environments."""
