@@ -1,6 +1,7 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
-# make test    all tests, the slow ones too
-# make bench   speed and memory                make lint, type, format, commit-checks    as in Stable-Baselines3
+# make test    all tests, the slow ones too    make test-fast    unit tests, in a minute
+# make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
+# make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
 # make icub    the arm of the iCub with and without transfer from its torso; tables and figure in icub_experiment/
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
@@ -16,6 +17,9 @@ PYTEST_WORKERS ?= 2
 DEMO_ARGS ?=
 ICUB_ARGS ?=
 LINTED := sb3_combrel envs tests
+CONSTRAINTS ?= constraints.txt
+# The oldest Numba allowed has no wheel for Python 3.13.
+OLDEST_PYTHON ?= python3.11
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python; do \
@@ -24,7 +28,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard icub icub-figures icub-breadths icub-video test pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard icub icub-figures icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -68,12 +72,26 @@ test: $(VENV)/.installed-all gl
 
 pytest: test
 
+FAST := -n $(PYTEST_WORKERS) --dist worksteal -m "not slow and not integration"
+
+test-fast: $(VENV)/.installed-all
+	$(BIN)/python -m pytest $(FAST)
+
+# In an environment, and with a cache of compiled code, of its own.
+test-oldest: $(VENV)-oldest.txt
+	NUMBA_CACHE_DIR=$(abspath $(VENV)-oldest/numba-cache) \
+		$(MAKE) test-fast VENV=$(VENV)-oldest CONSTRAINTS=$(VENV)-oldest.txt PYTHON=$(OLDEST_PYTHON)
+
+$(VENV)-oldest.txt: constraints.txt constraints-oldest.txt
+	{ grep -vE '^(llvmlite|numba|numpy)==' constraints.txt; cat constraints-oldest.txt; } > $@
+
 bench: $(VENV)/.installed-all
 	$(BIN)/python -m sb3_combrel.experiments.bench
-	$(BIN)/python -m pytest tests/benchmarks -o addopts="--strict-markers" --benchmark-only
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-only
 
 lint: $(VENV)/.installed-all
 	$(BIN)/ruff check $(LINTED)
+	$(BIN)/lint-imports
 
 type: $(VENV)/.installed-all
 	$(BIN)/mypy
@@ -92,15 +110,15 @@ build: $(VENV)/.installed-all
 	$(BIN)/python -m build
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) $(VENV)-oldest* build dist *.egg-info
 
 # An installation that was interrupted leaves no stamp and is done again; a changed pin or dependency renews it.
-$(VENV)/.installed-demo: pyproject.toml constraints.txt
+$(VENV)/.installed-demo: pyproject.toml $(CONSTRAINTS)
 	$(call make_venv)
 	$(call install,experiments)
 	@touch $@
 
-$(VENV)/.installed-all: pyproject.toml constraints.txt
+$(VENV)/.installed-all: pyproject.toml $(CONSTRAINTS)
 	$(call make_venv)
 	$(call install,all$(comma)dev)
 	@touch $(VENV)/.installed-demo $@
@@ -116,8 +134,8 @@ endef
 
 # labmaze, which dm_control's locomotion tasks alone use, has no wheel for Python 3.13: there dm_control goes in without it.
 define install
-$(PIP) install -c constraints.txt -e ".[$(1)]"
-@$(BIN)/python -c 'import importlib.util as u; exit(u.find_spec("dm_control") is None)' || $(PIP) install -c constraints.txt --no-deps dm_control
+$(PIP) install -c $(CONSTRAINTS) -e ".[$(1)]"
+@$(BIN)/python -c 'import importlib.util as u; exit(u.find_spec("dm_control") is None)' || $(PIP) install -c $(CONSTRAINTS) --no-deps dm_control
 endef
 
 # Tests that draw need OpenGL; where it cannot be installed here they say what is missing.

@@ -11,9 +11,9 @@ from typing import Any
 MOVED = {
     "transfer.inter_task_mapping": "mappings.inter_task_mapping",
     "transfer.mapping_set": "mappings.mapping_set",
-    "transfer.mappings": "mappings.named_sets",
+    "transfer.mappings": "mappings",
     "transfer.source": "sources.source_instances",
-    "transfer.recording": "sources.recording",
+    "transfer.recording": "sources.source_recorder",
     "transfer.q_learning": "sources.q_learning",
     "fitted_rmax.grid": "planning.grid",
 }
@@ -21,7 +21,7 @@ MOVED = {
 
 
 class _MovedModule(ModuleType):
-    """Stands for a module that has moved, which is imported when something of it is asked for."""
+    """Represents a module that has moved, which is imported when something of it is asked for."""
 
     def __init__(self, old: str, new: str):
         super().__init__(old)
@@ -39,4 +39,8 @@ def keep_old_names() -> None:
     """Make the old names importable."""
     for old, new in MOVED.items():
         name = f"sb3_combrel.{old}"
-        sys.modules.setdefault(name, _MovedModule(name, f"sb3_combrel.{new}"))
+        moved = sys.modules.setdefault(name, _MovedModule(name, f"sb3_combrel.{new}"))
+        package, _, module = name.rpartition(".")
+        # The import system does this for modules that it loads: `import sb3_combrel.transfer.source` needs it.
+        if package in sys.modules:
+            setattr(sys.modules[package], module, moved)

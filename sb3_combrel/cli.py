@@ -22,7 +22,7 @@ def demo(
     """
     Learn 4D Mountain Car without transfer, with TIMBREL and with COMBREL from the 2D one, and compare.
 
-    Stop it at any time: the same command goes on where it was.
+    It can be stopped at any time; the same command continues from there.
 
     :param output: folder for the figure, the tables, the video, the models and the logs
     :param seeds: runs of each method
@@ -30,7 +30,7 @@ def demo(
     :param max_episode_steps: steps after which an episode is cut off
     :param model_breadth: breadth of the learner's kernel; with 0.4 there is little for transfer to gain
     :param workers: processes at a time; one a core by default
-    :param fresh: delete earlier results in the folder and begin anew
+    :param fresh: delete earlier results in the folder first
     """
     from sb3_combrel.experiments.demo import run_demo
 

@@ -65,8 +65,9 @@ def no_film(monkeypatch):
     monkeypatch.setattr(demo, "_film", lambda *args: None)
 
 
+@pytest.mark.integration
 class TestDemo:
-    def test_it_leaves_all_that_it_promises(self, first_call):
+    def test_the_demo_writes_all_listed_outputs(self, first_call):
         folder, status, written = first_call
         assert status == 0, written
         assert sorted(path.name for path in folder.iterdir()) == sorted(OUTPUTS)
@@ -89,9 +90,9 @@ class TestDemo:
     def test_the_tables_are_shown_and_kept(self, first_call):
         folder, _, written = first_call
         tables = (folder / "tables.md").read_text()
-        for words in ("Steps to goal", "steps saved", "no transfer", "East<-Right", "x<-x, vx<-v"):
-            assert words in tables
-            assert words in written
+        for text in ("Steps to goal", "steps saved", "no transfer", "East<-Right", "x<-x, vx<-v"):
+            assert text in tables
+            assert text in written
 
     def test_the_model_drives(self, first_call):
         model = FittedRMax.load(first_call[0] / "car.zip")
@@ -105,7 +106,7 @@ class TestDemo:
         # 60 steps: each fourth from the first on, and the last.
         assert len(frames) == 16
 
-    def test_it_ends_with_where_everything_is_and_what_to_try_next(self, first_call):
+    def test_the_demo_ends_with_the_paths_of_its_outputs_and_further_commands(self, first_call):
         folder, _, written = first_call
         ending = written[written.index("Everything is in") :]
         assert str(folder) in ending
@@ -143,7 +144,7 @@ class TestDemo:
         assert "max_episode_steps was 60 and is 50" in written
         assert "--fresh" in written
 
-    def test_fresh_begins_anew_and_deletes_nothing_of_the_users(self, folder, no_film):
+    def test_fresh_deletes_earlier_results_and_nothing_of_the_users(self, folder, no_film):
         (folder / "notes.txt").write_text("mine")
         status, written = run_tiny_demo(folder, "--fresh", "--max-episode-steps", "50")
         assert status == 0
@@ -166,7 +167,7 @@ class TestDemo:
         assert "must be at least 1, got 0" in written
         assert not (tmp_path / "new").exists()
 
-    def test_without_opengl_it_says_what_to_install_and_does_all_the_rest(self, tmp_path):
+    def test_without_opengl_the_demo_names_what_to_install_and_does_all_the_rest(self, tmp_path):
         folder = tmp_path / "output"
         command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--seeds", "1"]
         environment = {**os.environ, "MUJOCO_GL": "disable"}
@@ -176,7 +177,7 @@ class TestDemo:
         assert sorted(path.name for path in folder.iterdir()) == sorted(set(OUTPUTS) - {"car.mp4"})
 
     @pytest.mark.skipif(sys.platform == "win32", reason="no process groups")
-    def test_it_can_be_stopped_and_goes_on(self, tmp_path):
+    def test_an_interrupted_demo_continues_where_it_stopped(self, tmp_path):
         folder = tmp_path / "output"
         command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--episodes", "20"]
         process = subprocess.Popen(
@@ -207,7 +208,7 @@ class TestDemo:
 class TestRecord:
     SHORT = ("combrel/MountainCar2D-v0", "--n-instances", "20", "--total-timesteps", "50")
 
-    def test_it_writes_source_instances(self, tmp_path):
+    def test_record_writes_source_instances(self, tmp_path):
         status, written = call("record", *self.SHORT, "--output", tmp_path / "car", "--seed", "3")
         assert status == 0
         source = SourceInstances.load(tmp_path / "car.npz")
@@ -226,13 +227,13 @@ class TestRecord:
         assert len(SourceInstances.load(file)) == 20
 
     @pytest.mark.parametrize(
-        ("env_id", "words"),
+        ("env_id", "message"),
         [("Nowhere-v0", "Nowhere"), ("no_such_package:Task-v0", "no_such_package"), ("Pendulum-v1", "Discrete")],
     )
-    def test_a_task_that_will_not_do_is_named_without_a_traceback(self, tmp_path, env_id, words):
+    def test_a_task_that_cannot_be_learned_is_named_without_a_traceback(self, tmp_path, env_id, message):
         status, written = call("record", env_id, "--output", tmp_path / "none.npz")
         assert status == 1
-        assert words in written
+        assert message in written
         assert "Traceback" not in written
         assert not list(tmp_path.iterdir())
 
@@ -246,7 +247,7 @@ class TestCommandLine:
     def test_an_unknown_command_is_refused(self):
         assert call("dance")[0] == 2
 
-    def test_without_tyro_it_says_what_to_install(self, monkeypatch):
+    def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "tyro", None)
         status, written = call("demo")
         assert status == 1

@@ -67,7 +67,8 @@ def test_every_folder_with_modules_is_a_package():
             assert (module.parent / "__init__.py").exists(), f"{package}: {module.parent} has no __init__.py"
 
 
-def test_the_wheel_holds_both_packages_with_their_data(wheel):
+@pytest.mark.integration
+def test_the_wheel_contains_both_packages_with_their_data(wheel):
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert names == files_on_disk("sb3_combrel") | files_on_disk("combrel_envs")
     assert {"sb3_combrel/py.typed", "combrel_envs/py.typed", "sb3_combrel/version.txt"} <= names
@@ -75,6 +76,7 @@ def test_the_wheel_holds_both_packages_with_their_data(wheel):
     assert {"combrel_envs/assets/icub_upper.xml", "combrel_envs/assets/icub_upper.LICENSE.md"} <= names
 
 
+@pytest.mark.integration
 def test_the_wheel_works_where_it_is_unpacked(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
     code = f"""
@@ -90,6 +92,7 @@ def test_the_wheel_works_where_it_is_unpacked(wheel, tmp_path):
     assert run_python("\n".join(line.strip() for line in code.splitlines())).strip() == sb3_combrel.__version__
 
 
+@pytest.mark.integration
 def test_versions_agree(wheel):
     assert re.fullmatch(r"\d+\.\d+\.\d+\w*", sb3_combrel.__version__)
     assert f"-{sb3_combrel.__version__}-" in wheel.name
@@ -125,6 +128,7 @@ def normal(name):
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+@pytest.mark.integration
 class TestImport:
     def test_it_works_without_mujoco_and_without_the_zoo(self):
         code = """

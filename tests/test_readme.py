@@ -1,4 +1,4 @@
-"""What the README says can be done as it says."""
+"""The examples of the README run as they are written."""
 
 import re
 from pathlib import Path
@@ -11,12 +11,13 @@ README = (ROOT / "README.md").read_text()
 PYTHON = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
+@pytest.mark.integration
 def test_the_examples_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names = {}
     for example in PYTHON:
         short, n_changes = re.subn(r"total_timesteps=[\d_]+", "total_timesteps=100", example)
-        assert n_changes == 1
+        assert n_changes <= 1
         exec(compile(short, "README.md", "exec"), names)
     assert (tmp_path / "source.npz").exists()
     assert (tmp_path / "car.zip").exists()

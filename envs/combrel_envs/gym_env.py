@@ -1,4 +1,4 @@
-"""The Gymnasium face: what all environments share, the adapter for a dm_control environment, and the registration."""
+"""Gymnasium environments: the common base class, the adapter for dm_control environments, and the registration."""
 
 from typing import TYPE_CHECKING, Any, ClassVar, SupportsIndex
 
@@ -85,7 +85,9 @@ class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """
-        :return: the present state as an array of shape (height, width, 3), uint8; None without a render mode
+        Draw the present state.
+
+        :return: a picture as an array of shape (height, width, 3), uint8; None without a render mode
         :raises RenderingError: when OpenGL is missing; the message says what to install
         """
         if self.render_mode is None:
@@ -98,7 +100,7 @@ class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
         return physics.render(height=self._height, width=self._width, camera_id=self._camera)
 
     def _drawn_physics(self) -> "mujoco.Physics":
-        """The physics, in the state that is to be drawn."""
+        """Give the physics in the state to be drawn."""
         raise NotImplementedError
 
 
@@ -108,7 +110,7 @@ class DmControlEnv(RenderedEnv):
 
     The observations, in the order of the environment's specification, become one flat float32 vector. The episode terminates
     when the task gives a discount of 0 and is truncated at the environment's time limit; a task that ends on the very last
-    step is terminated. ``info["is_success"]`` says whether the task was solved.
+    step is terminated. ``info["is_success"]`` is True if the task was solved.
 
     :param environment: the environment; its actions must be discrete
     :param low: least value of each entry of the observation; None takes the specification's
@@ -149,7 +151,9 @@ class DmControlEnv(RenderedEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        :param seed: seed of the episodes to come; None goes on with the present random state
+        Begin an episode.
+
+        :param seed: seed of this and the following episodes; None continues with the present random state
         :param options: see :meth:`_apply_options`
         :return: the first observation, and an empty dictionary
         """
@@ -162,6 +166,8 @@ class DmControlEnv(RenderedEnv):
 
     def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
         """
+        Take an action.
+
         :param action: number of an action
         :return: observation, reward, terminated, truncated and info
         """
@@ -188,12 +194,12 @@ class DmControlEnv(RenderedEnv):
         return self._environment.physics
 
     def _apply_options(self, options: dict[str, Any]) -> None:
-        """Prepare the task for the options of a reset; an environment that has some overrides this."""
+        """Prepare the task for the options of a reset; environments with options override this."""
         if options:
             raise ValueError(f"options of reset must be empty, got {options!r}")
 
     def _is_success(self, terminated: bool) -> bool:
-        """Whether the task is solved now; an environment that can terminate without success overrides this."""
+        """Decide whether the task is solved; environments that can terminate without success override this."""
         return terminated
 
     def _flatten(self, observation: Any) -> np.ndarray:

@@ -28,7 +28,7 @@ _CONTROL_TIMESTEP = 0.1  # (Seconds).
 _DEFAULT_TIME_LIMIT = icub_tasks.MAX_EPISODE_STEPS * _CONTROL_TIMESTEP
 #: Degrees in a radian, MuJoCo's unit.
 _DEGREES = math.degrees(1.0)
-#: How deep the hand may press into table or ball at the start, in metres: contacts are soft.
+#: How far the hand may overlap the table at the start, in metres: contacts are soft.
 _START_OVERLAP = 0.0005
 SUITE = containers.TaggedTasks()
 
@@ -126,25 +126,25 @@ class Physics(mujoco.Physics):
         """Puts the task's joints at angles and keeps them there. As always, a call of `forward` must follow."""
         self._angles[:] = self._targets[:] = np.deg2rad(degrees)
 
-    def move_joint(self, joint: int, step: float, leash: float) -> None:
+    def move_joint(self, joint: int, step: float, max_lag: float) -> None:
         """Moves the target of one joint of the task.
 
         Args:
           joint: Its number.
           step: Degrees by which to move the target.
-          leash: Degrees by which a joint's target may be away from the joint beforehand: one that is blocked must not
-            gather force.
+          max_lag: Degrees by which a joint may lag behind its target beforehand: the controller of a blocked joint would
+            otherwise exert an ever larger force.
         """
-        leash /= _DEGREES
+        max_lag /= _DEGREES
         # Single numbers: for a handful of them NumPy takes several times as long.
         near = zip(self._targets.tolist(), self._angles.tolist(), strict=True)
-        targets = [min(max(target, angle - leash), angle + leash) for target, angle in near]
+        targets = [min(max(target, angle - max_lag), angle + max_lag) for target, angle in near]
         low, high = self._limits[joint]
         targets[joint] = min(max(targets[joint] + step / _DEGREES, low), high)
         self._targets[:] = targets
 
     def step(self, nstep: int = 1) -> None:
-        """Advances the physics by `nstep` steps; as dm_control's own, but for a cheaper check of the outcome."""
+        """Advances the physics by `nstep` steps; as dm_control does, with a cheaper check of the result."""
         if self.legacy_step:
             super().step(nstep)
             return
@@ -166,14 +166,14 @@ class Physics(mujoco.Physics):
     def render(self, *args: Any, **kwargs: Any) -> np.ndarray:
         """Returns a camera view, see `mujoco.Physics.render`; raises `RenderingError` when there is no OpenGL."""
         rendering.open_gl(self)
-        # A step leaves the places of the bodies a substep behind the state; none of this is part of the state.
+        # After a step the poses of the bodies are one substep older than the state, of which they are not a part.
         mujoco_bindings.mj_kinematics(self.model.ptr, self.data.ptr)
         mujoco_bindings.mj_camlight(self.model.ptr, self.data.ptr)
         return super().render(*args, **kwargs)
 
 
 class Strike(control.Task):
-    """An iCub `Task`: move the ball, even slightly. Each command costs 1, the hit brings 100."""
+    """An iCub `Task`: move the ball, even slightly. The reward is -1 for each command, and 100 more for the hit."""
 
     def __init__(
         self,
@@ -190,7 +190,7 @@ class Strike(control.Task):
           strike: Which joints move.
           start: Angles of the joints, in degrees, at which an episode begins; None for those of the task.
           extent: Degrees by which a command moves a joint.
-          motor_noise: Standard deviation of the extent, as a share of it.
+          motor_noise: Standard deviation of the extent, as a fraction of it.
           encoder_noise: Standard deviation of an observed angle, in degrees.
           random: Optional, either a `numpy.random.RandomState` instance, an integer seed for creating a new `RandomState`,
             or None to select a seed automatically (default).
@@ -207,7 +207,7 @@ class Strike(control.Task):
 
     @property
     def random(self) -> np.random.RandomState:
-        """The source of the noise."""
+        """The random state from which the noise is drawn."""
         return self._random
 
     @property
@@ -235,12 +235,12 @@ class Strike(control.Task):
             raise ValueError(f"start must keep the hand above the table or beside it; at {angles} it is in the table")
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Puts the robot at the start; the ball lies where it always does."""
+        """Moves the joints to the start; the ball always starts at the same place."""
         physics.set_joints(self._start)
         self._hit = self._new_hit = False
 
     def action_spec(self, physics: Physics) -> dm_env.specs.DiscreteArray:
-        """Returns the spec of the discrete action; `icub_tasks.Strike.action_names` says what each number does."""
+        """Returns the spec of the discrete action; `icub_tasks.Strike.action_names` names the actions."""
         return dm_env.specs.DiscreteArray(len(self._strike.action_names), dtype=np.int64, name="action")
 
     def observation_spec(self, physics: Physics) -> "collections.OrderedDict[str, dm_env.specs.BoundedArray]":
@@ -253,23 +253,23 @@ class Strike(control.Task):
         number = icub_tasks.check_action(action, self._action_names)
         joint, forward = divmod(number, 2)
         step = self._extent * (1.0 + self.random.normal(0.0, self._motor_noise)) if self._motor_noise else self._extent
-        physics.move_joint(joint, step if forward else -step, leash=self._extent)
+        physics.move_joint(joint, step if forward else -step, max_lag=self._extent)
 
     def after_step(self, physics: Physics) -> None:
-        """Notes whether the ball has been moved."""
+        """Records whether the ball has been moved."""
         moved = physics.ball_displacement() > icub_tasks.HIT_DISTANCE
         self._new_hit = moved and not self._hit
         self._hit = self._hit or moved
 
     def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
-        """Returns what the encoders say, in degrees."""
+        """Returns the encoder readings, in degrees."""
         angles = physics.encoders()
         if self._encoder_noise:
             angles += self.random.normal(0.0, self._encoder_noise, angles.shape)
         return collections.OrderedDict(encoders=np.minimum(np.maximum(angles, self._low), self._high))
 
     def get_reward(self, physics: Physics) -> float:
-        """Returns the cost of a command, and what a hit brings."""
+        """Returns the reward of a command: -1, and 100 more for the first hit."""
         return icub_tasks.STEP_REWARD + (icub_tasks.HIT_REWARD if self._new_hit else 0.0)
 
     def get_termination(self, physics: Physics) -> float | None:
@@ -278,7 +278,7 @@ class Strike(control.Task):
 
 
 class StrikeEnvironment(control.Environment):
-    """An `Environment` that asks the task on the last step of the time limit too, when a hit ends the episode for good."""
+    """An `Environment` in which a hit on the last step of the time limit terminates the episode, as on any other step."""
 
     def step(self, action: Any) -> dm_env.TimeStep:
         """Updates the environment using the action and returns a `TimeStep`."""

@@ -1,4 +1,4 @@
-"""The iCub's ball-striking tasks with a Gymnasium face; the class docstrings are their manuals."""
+"""The iCub's ball-striking tasks for Gymnasium; the class docstrings document them."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -11,12 +11,12 @@ from combrel_envs.gym_env import DmControlEnv
 
 class ICubStrikeEnv(DmControlEnv):
     """
-    What both tasks share; see :class:`ICubTorsoStrikeEnv` and :class:`ICubArmStrikeEnv`.
+    Common base class of both tasks; see :class:`ICubTorsoStrikeEnv` and :class:`ICubArmStrikeEnv`.
 
     :param look: ``"primitives"`` or ``"meshes"``
     :param start: angles of the joints, in degrees, at which an episode begins; None for those of the task
     :param extent: degrees by which a command moves a joint
-    :param motor_noise: standard deviation of the extent, as a share of it
+    :param motor_noise: standard deviation of the extent, as a fraction of it
     :param encoder_noise: standard deviation of an observed angle, in degrees
     :param render_mode: ``"rgb_array"`` or None
     :param width: width of a frame in pixels
@@ -42,7 +42,7 @@ class ICubStrikeEnv(DmControlEnv):
         height: int = 480,
         camera: str | None = None,
     ) -> None:
-        # The step limit is a wrapper's, as for every environment of Gymnasium.
+        # The step limit belongs to the `TimeLimit` wrapper, as for every environment of Gymnasium.
         environment = icub.make_environment(
             self.task,
             time_limit=float("inf"),
@@ -61,12 +61,12 @@ class ICubStrikeEnv(DmControlEnv):
         strike, start = self._environment.task, options.get("start")
         start = self._start if start is None else start
         if not np.array_equal(start, strike.start):
-            # The check moves the robot: an episode that was under way is over even if the start isn't possible.
+            # The check moves the robot: it ends a running episode even if the start isn't possible.
             self._running = False
             strike.set_start(start, self._environment.physics)
 
     def _flatten(self, observation: Any) -> np.ndarray:
-        # The task has put it within the limits, and rounding to float32, as the limits are, keeps it there.
+        # The task clips it to the limits; rounding both to float32 is monotonic and keeps it within them.
         return observation["encoders"].astype(np.float32)
 
 
@@ -110,7 +110,7 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
 
     MuJoCo simulates the robot (kinematics, inertias and limits of iCubGazeboV2_5), the table and the ball. An action moves
     the target angle of one joint by the extent, 2 degrees, but not beyond the joint's limits; position controllers follow
-    the targets for 0.1 s, in which a free joint arrives to within about 0.1 degrees. The hand can be blocked by
+    the targets for 0.1 s, in which a free joint comes to within about 0.1 degrees of its target. The hand can be blocked by
     the table: before each action every target is brought to within one extent of its joint. Only the right hand collides.
 
     The simulation is deterministic: the same actions lead to the same observations, bit by bit. The variant
@@ -133,7 +133,7 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
       this. As always with this wrapper, a hit on the very last step is reported as both terminated and truncated; treat it as
       terminated. The class itself, made without `gymnasium.make`, has no limit.
 
-    `info["is_success"]` says after every step whether the ball was hit. The tests replay a plan of 26
+    `info["is_success"]` is True if the ball has been hit. The tests replay a plan of 26
     actions that hits; random actions hit in about 6 % of the episodes.
 
     ## Arguments
@@ -141,7 +141,7 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
     - `start`: two angles in degrees, in the order of the observation: another start. The hand must not touch the ball there,
       nor be inside the table.
     - `extent`: degrees by which an action moves a joint, 2 by default.
-    - `motor_noise`: standard deviation of an action's extent, as a share of it; 0 by default, 0.1 in the noisy variant.
+    - `motor_noise`: standard deviation of an action's extent, as a fraction of it; 0 by default, 0.1 in the noisy variant.
     - `encoder_noise`: standard deviation of an encoder reading in degrees; 0 by default, 0.2 in the noisy variant. The seed
       of `reset` decides both.
     - `look`: `"primitives"` (the default) or `"meshes"`, the robot's true shape, for which the package `icub-models` is needed
@@ -208,7 +208,7 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
 
     MuJoCo simulates the robot (kinematics, inertias and limits of iCubGazeboV2_5), the table and the ball. An action moves
     the target angle of one joint by the extent, 2 degrees, but not beyond the joint's limits; position controllers follow
-    the targets for 0.1 s, in which a free joint arrives to within about 0.1 degrees. The hand can be blocked by
+    the targets for 0.1 s, in which a free joint comes to within about 0.1 degrees of its target. The hand can be blocked by
     the table: before each action every target is brought to within one extent of its joint. Only the right hand collides.
 
     The simulation is deterministic: the same actions lead to the same observations, bit by bit. The variant
@@ -231,7 +231,7 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
       this. As always with this wrapper, a hit on the very last step is reported as both terminated and truncated; treat it as
       terminated. The class itself, made without `gymnasium.make`, has no limit.
 
-    `info["is_success"]` says after every step whether the ball was hit. The tests replay a plan of 29
+    `info["is_success"]` is True if the ball has been hit. The tests replay a plan of 29
     actions that hits, and Fitted R-Max finds some of 27; random actions hit in about 2 % of the episodes.
 
     ## Arguments
@@ -239,7 +239,7 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
     - `start`: four angles in degrees, in the order of the observation: another start. The hand must not touch the ball there,
       nor be inside the table.
     - `extent`: degrees by which an action moves a joint, 2 by default.
-    - `motor_noise`: standard deviation of an action's extent, as a share of it; 0 by default, 0.1 in the noisy variant.
+    - `motor_noise`: standard deviation of an action's extent, as a fraction of it; 0 by default, 0.1 in the noisy variant.
     - `encoder_noise`: standard deviation of an encoder reading in degrees; 0 by default, 0.2 in the noisy variant. The seed
       of `reset` decides both.
     - `look`: `"primitives"` (the default) or `"meshes"`, the robot's true shape, for which the package `icub-models` is needed

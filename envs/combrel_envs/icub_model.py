@@ -14,7 +14,7 @@ from combrel_envs.icub_meshes import add_meshes  # noqa: E402
 from combrel_envs.icub_tasks import JOINTS, Strike  # noqa: E402
 
 SCENE = Path(__file__).parent / "assets" / "icub_scene.xml"
-#: What of the robot collides: enough to strike a ball and to lean on the table, little enough to be fast.
+#: Geoms of the robot that collide: those that strike the ball or touch the table. More would cost time.
 HAND = ("r_fingers", "r_palm")
 #: The robot's outermost body.
 _ROBOT = "icub"
@@ -22,6 +22,8 @@ _ROBOT = "icub"
 
 def make_model(strike: Strike, look: str) -> mujoco.MjModel:
     """
+    Compile the model of a task.
+
     :param strike: the task
     :param look: ``"primitives"``, or ``"meshes"`` for those of the package ``icub_models``; the dynamics are the same
     :return: the compiled model; its joints are the task's, in their order, and then the ball's
@@ -34,7 +36,7 @@ def make_model(strike: Strike, look: str) -> mujoco.MjModel:
     _weld_others(spec, robot, strike)
     for name in strike.state_names:
         _add_controller(spec, name)
-    # The robot's own controllers carry its weight.
+    # The robot's own controllers compensate for its weight.
     for body in _with_descendants(robot):
         body.gravcomp = 1
     for name in HAND:
@@ -43,7 +45,7 @@ def make_model(strike: Strike, look: str) -> mujoco.MjModel:
 
 
 def _weld_others(spec: mujoco.MjSpec, robot: mujoco.MjsBody, strike: Strike) -> None:
-    """Turn the bodies whose joint the task doesn't move to their fixed angles, and take the joints away."""
+    """Turn the bodies whose joint the task doesn't move to their fixed angles, and remove the joints."""
     for body in _with_descendants(robot):
         for joint in body.joints:
             if joint.name not in strike.start:

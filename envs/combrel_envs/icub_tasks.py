@@ -1,4 +1,4 @@
-"""The numbers of the iCub's ball-striking tasks, and the checks of their options; knows nothing of MuJoCo.
+"""Constants of the iCub's ball-striking tasks and checks of their options, without MuJoCo.
 
 All angles are in degrees, as the iCub's encoders report them.
 """
@@ -11,17 +11,17 @@ from typing import Any, NamedTuple, SupportsIndex
 
 #: Steps until an episode is truncated.
 MAX_EPISODE_STEPS = 400
-#: Reward of a step, and what the step that hits the ball brings on top.
+#: Reward of a step, and what is added to it when the step hits the ball.
 STEP_REWARD = -1.0
 HIT_REWARD = 100.0
 
 #: How far a command moves a joint, in degrees.
 EXTENT = 2.0
-#: Noise of the stochastic variants. Motors: standard deviation as a share of the extent. Encoders: in degrees.
+#: Noise of the stochastic variants. Motors: standard deviation as a fraction of the extent. Encoders: in degrees.
 NOISY_MOTORS = 0.1
 NOISY_ENCODERS = 0.2
 
-#: Horizontal distance in metres that the ball must move to count as hit: far above numerical creep, still "even slightly".
+#: Horizontal distance in metres that the ball must move to count as hit: far above numerical drift, still "even slightly".
 HIT_DISTANCE = 0.002
 
 LOOKS = ("primitives", "meshes")
@@ -41,7 +41,8 @@ class Joint(NamedTuple):
     stiffness: float
 
 
-#: Limits of the real robot (iCubGazeboV2_5). The stiffness lets a joint arrive within a step and stay soft at the table.
+#: Limits of the real robot (iCubGazeboV2_5). With this stiffness a joint reaches its target within a step and still yields
+#: to the table.
 JOINTS: dict[str, Joint] = {
     "torso_pitch": Joint(-20.0, 70.0, 2500.0),
     "torso_yaw": Joint(-50.0, 50.0, 900.0),
@@ -58,7 +59,7 @@ class Strike(NamedTuple):
 
     :param prefix: first letter of the action names
     :param start: where an episode begins: the task's joints, in the order of its observation
-    :param fixed: joints that stand still at another angle than 0
+    :param fixed: angles of the joints that do not move, where they differ from 0
     """
 
     prefix: str
@@ -86,7 +87,7 @@ class Strike(NamedTuple):
         return tuple(JOINTS[name].high for name in self.start)
 
 
-#: The left arm and the head only look natural there: neither can reach the ball.
+#: Pose of the left arm and the head, which only affects the look: neither can reach the ball.
 _REST = {"l_shoulder_pitch": -10.0, "l_shoulder_roll": 25.0, "l_elbow": 95.0, "neck_pitch": -15.0}
 
 #: "S" for the source task of the paper, "T" for its target task (Table 4, Figure 7).
@@ -106,6 +107,8 @@ TASKS: dict[str, Strike] = {
 
 def check_look(look: Any) -> str:
     """
+    Check the name of a look.
+
     :param look: name of a look
     :return: the same
     :raises ValueError: when there is no such look
@@ -117,7 +120,9 @@ def check_look(look: Any) -> str:
 
 def check_time_limit(seconds: Any) -> None:
     """
-    :param seconds: the time limit of a dm_control environment; infinity is none
+    Check a time limit.
+
+    :param seconds: the time limit of a dm_control environment; infinity for none
     :raises ValueError: when it isn't a number above 0
     """
     if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not float(seconds) > 0:
@@ -126,6 +131,8 @@ def check_time_limit(seconds: Any) -> None:
 
 def check_amount(name: str, value: Any, zero: bool) -> float:
     """
+    Check that an argument is a finite number above 0, or at least 0.
+
     :param name: name of an argument
     :param value: its value
     :param zero: whether it may be 0
@@ -141,6 +148,8 @@ def check_amount(name: str, value: Any, zero: bool) -> float:
 
 def check_start(start: Any, strike: Strike) -> tuple[float, ...]:
     """
+    Check the angles at which an episode begins.
+
     :param start: angles of the task's joints in degrees, or None for the task's own start
     :param strike: the task
     :return: the angles
@@ -164,6 +173,8 @@ def check_start(start: Any, strike: Strike) -> tuple[float, ...]:
 
 def check_action(action: SupportsIndex, names: Sequence[str]) -> int:
     """
+    Check the number of an action.
+
     :param action: number of an action
     :param names: names of all actions
     :return: the number

@@ -2,7 +2,7 @@
 
 ``climb_2d`` is the car in a valley between two hills (Singh and Sutton 1996), ``climb_4d`` the car on a surface with hills
 along two axes. One control step is one second of simulated time, so that the default time limit, 4000, is in steps too.
-The dynamics are those of :mod:`combrel_envs.mountain_car_dynamics`; MuJoCo holds the state and draws it.
+The dynamics are those of :mod:`combrel_envs.mountain_car_dynamics`; MuJoCo stores the state and draws it.
 """
 
 import collections
@@ -111,7 +111,7 @@ class Physics(mujoco.Physics):
         self.forward()
 
     def forward(self) -> None:
-        """Puts the drawn car where the state says, and brings MuJoCo's derived quantities up to date."""
+        """Moves the drawn car to the position of the state, and updates MuJoCo's derived quantities."""
         position, rotation = scene.car_pose(tuple(self.data.qpos.tolist()), tuple(self.data.qvel.tolist()))
         self.data.mocap_pos[0] = position
         mujoco_bindings.mju_mat2Quat(self.data.mocap_quat[0], rotation.ravel())
@@ -124,7 +124,7 @@ class Physics(mujoco.Physics):
 
 
 class Climb(base.Task):
-    """A Mountain Car `Task`: reach the goal. Each step costs 1, the last included."""
+    """A Mountain Car `Task`: reach the goal. The reward is -1 on every step, the last included."""
 
     def __init__(self, start: str = "offset", random: np.random.RandomState | int | None = None):
         """Initializes an instance of `Climb`.
@@ -139,16 +139,16 @@ class Climb(base.Task):
         super().__init__(random=random)
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Puts the car where the start option says."""
+        """Sets the state according to the start option."""
         physics.set_car(*dynamics.sample_start(self._start, physics.n_axes, self.random.uniform))
         super().initialize_episode(physics)
 
     def action_spec(self, physics: Physics) -> dm_env.specs.DiscreteArray:
-        """Returns the spec of the discrete action; `dynamics.ACTION_NAMES` says what each number does."""
+        """Returns the spec of the discrete action; `dynamics.ACTION_NAMES` names the actions."""
         return dm_env.specs.DiscreteArray(len(dynamics.PUSHES[physics.n_axes]), dtype=np.int64, name="action")
 
     def before_step(self, action: Any, physics: Physics) -> None:
-        """Turns the action into a push of the engine."""
+        """Sets the control to the push of the engine that the action stands for."""
         physics.set_control(dynamics.push_of(action, physics.n_axes))
 
     def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
@@ -159,7 +159,7 @@ class Climb(base.Task):
         return observation
 
     def get_reward(self, physics: Physics) -> float:
-        """Returns the cost of a step."""
+        """Returns the reward of a step, -1."""
         return -1.0
 
     def get_termination(self, physics: Physics) -> float | None:

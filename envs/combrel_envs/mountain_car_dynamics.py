@@ -1,8 +1,8 @@
 """The equations of Mountain Car, in plain Python floats.
 
-Both faces of the environment, dm_control's and Gymnasium's, step the car with :func:`step_car`, so there is one set of
-equations and the two can't drift apart. This module needs neither NumPy nor MuJoCo: for two to four scalars Python's floats
-are several times faster than arrays.
+Both interfaces of the environment, dm_control's and Gymnasium's, step the car with :func:`step_car`: there is one set of
+equations. This module needs neither NumPy nor MuJoCo: for two to four scalars Python's floats are several times faster than
+arrays.
 
 A state is a pair ``(positions, velocities)`` of tuples with one float an axis: ``((x,), (v,))`` or ``((x, y), (vx, vy))``.
 """
@@ -41,7 +41,7 @@ State = tuple[Axes, Axes]
 
 def step_axis(position: float, velocity: float, push: float) -> tuple[float, float]:
     """
-    One step of one axis: engine and gravity change the velocity, the new velocity moves the car, the walls stop it.
+    Advance one axis by one step: engine and gravity change the velocity, the new velocity moves the car, the walls stop it.
 
     :param position: position before the step
     :param velocity: velocity before the step
@@ -63,7 +63,7 @@ def step_axis(position: float, velocity: float, push: float) -> tuple[float, flo
 
 def step_car(positions: Axes, velocities: Axes, pushes: Axes) -> State:
     """
-    One step of the car: every axis moves by :func:`step_axis`, independently of the others.
+    Advance the car by one step: every axis by :func:`step_axis`, independently of the others.
 
     :param positions: position on each axis
     :param velocities: velocity on each axis
@@ -77,6 +77,8 @@ def step_car(positions: Axes, velocities: Axes, pushes: Axes) -> State:
 
 def push_of(action: SupportsIndex, n_axes: int) -> Axes:
     """
+    Look up the push of the engine that an action stands for.
+
     :param action: number of an action, any integer type
     :param n_axes: number of axes, 1 or 2
     :return: what the engine does on each axis
@@ -94,17 +96,21 @@ def push_of(action: SupportsIndex, n_axes: int) -> Axes:
 
 def at_goal(positions: Axes) -> bool:
     """
+    Check whether the car is at the goal.
+
     :param positions: position on each axis
-    :return: whether the car is at the goal: every axis at ``GOAL_POSITION`` or beyond
+    :return: True if every axis is at ``GOAL_POSITION`` or beyond
     """
     return min(positions) >= GOAL_POSITION
 
 
 def check_start(start: str) -> str:
     """
-    :param start: the start option that a user gave
-    :return: the same option, when it is one
-    :raises ValueError: when it isn't
+    Check a start option.
+
+    :param start: the option that a user gave
+    :return: the same option
+    :raises ValueError: if it is not one of ``STARTS``
     """
     if start not in STARTS:
         raise ValueError(f"start must be one of {', '.join(map(repr, STARTS))}, got {start!r}")

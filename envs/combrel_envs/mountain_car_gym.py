@@ -1,4 +1,4 @@
-"""Mountain Car's Gymnasium face: the equations stepped directly, without MuJoCo, which is loaded for pictures only."""
+"""Mountain Car for Gymnasium: the equations stepped directly, without MuJoCo, which is loaded for pictures only."""
 
 from typing import TYPE_CHECKING, Any, ClassVar, SupportsIndex
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 class MountainCarEnv(RenderedEnv):
     """
-    What the 2D and the 4D car share; see :class:`MountainCar2DEnv` and :class:`MountainCar4DEnv`.
+    Common base class of the 2D and the 4D car; see :class:`MountainCar2DEnv` and :class:`MountainCar4DEnv`.
 
     :param start: where an episode begins: ``"offset"``, ``"fixed"`` or ``"random"``
     :param render_mode: ``"rgb_array"`` or None
@@ -53,7 +53,7 @@ class MountainCarEnv(RenderedEnv):
         """
         Begin an episode.
 
-        :param seed: seed of the starts to come; None goes on with the present generator
+        :param seed: seed of this and the following starts; None continues with the present generator
         :param options: ``{"start": ...}`` overrides the environment's start option for this episode,
             ``{"state": [...]}`` begins in exactly that state, in the order of ``state_names``
         :return: the first observation, and an empty dictionary
@@ -73,11 +73,11 @@ class MountainCarEnv(RenderedEnv):
 
     def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
         """
-        Drive for one step.
+        Advance the car by one step.
 
         :param action: number of an action
-        :return: observation, reward -1, whether the car is at the goal, False (the step limit is a wrapper's), and a
-            dictionary with ``is_success``
+        :return: observation, reward -1, whether the car is at the goal, False (the step limit belongs to the ``TimeLimit``
+            wrapper), and a dictionary with ``is_success``
         :raises ValueError: when there is no such action
         """
         state = dynamics.step_car(*self._running_state(), dynamics.push_of(action, self.n_axes))
@@ -186,7 +186,7 @@ class MountainCar2DEnv(MountainCarEnv):
       this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
       truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
 
-    `info["is_success"]` says after every step whether the car is at the goal. From the bottom the goal can be reached in 103
+    `info["is_success"]` is True if the car is at the goal after the step. From the bottom the goal can be reached in 103
     steps.
 
     ## Arguments
@@ -276,7 +276,7 @@ class MountainCar4DEnv(MountainCarEnv):
       this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
       truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
 
-    `info["is_success"]` says after every step whether the car is at the goal. From the bottom the goal can be reached in 146
+    `info["is_success"]` is True if the car is at the goal after the step. From the bottom the goal can be reached in 146
     steps, which the tests replay; whether fewer are possible isn't known.
 
     ## Arguments

@@ -1,7 +1,7 @@
-"""What Mountain Car looks like: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
+"""The pictures of Mountain Car: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
 
-The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale of the picture (the dynamics know no height).
-The meshes are made from these formulas when a scene is built, so the picture can't disagree with the task.
+The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale of the picture (heights do not enter the
+dynamics). The meshes are computed from these formulas when a scene is built, so the picture agrees with the task.
 """
 
 import functools
@@ -17,7 +17,7 @@ from combrel_envs import mountain_car_dynamics as dynamics
 #: Height of the picture's hills for each number of axes. One third in 2D is the true scale: gravity along the slope of
 #: sin(3x) / 3 is proportional to cos(3x).
 HEIGHT_SCALE = {1: 1 / 3, 2: 0.2}
-#: How far the ground goes on beyond the walls: half a car.
+#: How far the ground extends beyond the walls: half a car.
 MARGIN = 0.1
 LOW, HIGH = dynamics.MIN_POSITION - MARGIN, dynamics.MAX_POSITION + MARGIN
 STRIP_HALF_WIDTH = 0.13
@@ -37,6 +37,8 @@ _LINE = np.array([0.98, 0.98, 0.96])
 
 def height(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> np.ndarray:
     """
+    Compute the height of the ground.
+
     :param x: position along x
     :param y: position along y (in 2D across the strip, where the ground is level)
     :param n_axes: number of axes, 1 or 2
@@ -48,6 +50,8 @@ def height(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> np.ndar
 
 def gradient(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> tuple[np.ndarray, np.ndarray]:
     """
+    Compute the slope of the ground.
+
     :param x: position along x
     :param y: position along y
     :param n_axes: number of axes, 1 or 2
@@ -60,8 +64,10 @@ def gradient(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> tuple
 
 def model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
     """
+    Build the scene.
+
     :param n_axes: number of axes, 1 or 2
-    :return: the MJCF model and the files that it asks for, as ``Physics.from_xml_string`` takes them
+    :return: the MJCF model and the files that it includes, as ``Physics.from_xml_string`` takes them
     """
     return (_ASSETS / f"mountain_car_{2 * n_axes}d.xml").read_bytes(), dict(_assets(n_axes))
 
@@ -79,9 +85,9 @@ def _assets(n_axes: int) -> dict[str, bytes]:
 
 def car_pose(positions: dynamics.Axes, velocities: dynamics.Axes) -> tuple[np.ndarray, np.ndarray]:
     """
-    Where the car is drawn: wheels on the ground, roof along the ground's normal.
+    Compute the pose in which the car is drawn: wheels on the ground, roof along the ground's normal.
 
-    In 2D the nose points right, as the car can reverse; in 4D it points where the car is going (north-east at rest).
+    In 2D the nose points right, as the car can reverse; in 4D it points in the direction of motion (north-east at rest).
 
     :param positions: position on each axis
     :param velocities: velocity on each axis
@@ -125,7 +131,7 @@ def _floor(n_axes: int) -> float:
 
 
 def _ground_mesh(n_axes: int) -> bytes:
-    """The surface on which the car drives, its texture spread over it as seen from above."""
+    """The surface on which the car drives, with a texture projected from above."""
     xs = np.linspace(LOW, HIGH, _GROUND_CELLS + 1)
     ys = np.linspace(*_extent(n_axes), _GROUND_CELLS + 1 if n_axes == 2 else 3)
     x, y = (grid.ravel() for grid in np.meshgrid(xs, ys, indexing="ij"))
@@ -151,15 +157,15 @@ def _soil_mesh(n_axes: int) -> bytes:
 
 
 def _side(start: np.ndarray, end: np.ndarray, n_axes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """One vertical side from ``start`` to ``end``, which has its outside on the right of that way."""
+    """One vertical side from ``start`` to ``end``, whose outer face is on the right of that direction."""
     share = np.linspace(0, 1, _GROUND_CELLS + 1)
     foot = start + share[:, None] * (end - start)
     top = height(foot[:, 0], foot[:, 1], n_axes)
     levels = np.linspace(0, 1, 9)
     depth = (top - _floor(n_axes))[:, None] * levels
     vertices = np.column_stack([np.repeat(foot, len(levels), axis=0), (top[:, None] - depth).ravel()])
-    way = (end - start) / np.linalg.norm(end - start)
-    normals = np.tile([way[1], -way[0], 0.0], (len(vertices), 1))
+    along = (end - start) / np.linalg.norm(end - start)
+    normals = np.tile([along[1], -along[0], 0.0], (len(vertices), 1))
     uv = np.column_stack([np.repeat(share, len(levels)), 1 - depth.ravel()])
     return vertices, normals, uv, _grid_faces(len(share), len(levels))[:, ::-1]
 
@@ -197,7 +203,7 @@ def _ground_texture(n_axes: int) -> np.ndarray:
 
 
 def _near(z: np.ndarray, spacing: float, slope: np.ndarray) -> np.ndarray:
-    """Where a contour line passes: the same width on steep and on level ground."""
+    """Mark the points on contour lines, which have the same width on steep and on level ground."""
     distance = np.abs((z + spacing / 2) % spacing - spacing / 2)
     return distance < np.minimum(0.0028 * slope, 0.05 * spacing)
 

@@ -1,4 +1,4 @@
-"""dm_control with or without OpenGL: the choice of a rendering backend, and a clear word when there is none."""
+"""dm_control with or without OpenGL: the choice of a rendering backend, and a clear error if there is none."""
 
 import contextlib
 import ctypes
@@ -25,7 +25,7 @@ def import_dm_control() -> None:
     Import dm_control; call this before the first import of it.
 
     dm_control reads ``MUJOCO_GL`` when it is imported, and fails at once if that backend doesn't start. The dynamics don't
-    need OpenGL, so a failure is kept for the day when a picture is asked for, and dm_control is imported without a renderer.
+    need OpenGL, so dm_control is then imported without a renderer, and the error is raised when a picture is requested.
     On Linux without a display EGL is the default; a value that the user set is never changed.
     """
     global _failure
@@ -71,10 +71,10 @@ def _is_headless_linux() -> bool:
 def _import_triton() -> None:
     """Import triton, where it is installed, before Mesa is loaded.
 
-    Both have an LLVM of their own. PyTorch's wheels for CUDA bring triton and import it with the first optimizer; if
-    Mesa was there first, that ends the process with a segmentation fault.
+    Each contains a copy of LLVM. PyTorch's wheels for CUDA install triton and import it with the first optimizer; if Mesa
+    was loaded before, that import ends the process with a segmentation fault.
     """
-    # Most don't have it, and what is wrong with it PyTorch will say.
+    # It is often not installed; where it is broken, PyTorch reports that itself.
     with contextlib.suppress(Exception):
         importlib.import_module("triton")
 

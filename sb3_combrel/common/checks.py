@@ -24,15 +24,51 @@ def check_finite(name: str, value: object) -> None:
         raise ValueError(f"{name} must be a finite number, got {value!r}")
 
 
-def check_count(name: str, value: object, *, least: int = 1, none_allowed: bool = False) -> None:
+def check_count(
+    name: str, value: object, *, min: int = 1, max: int | None = None, none_allowed: bool = False, why_max: str = ""
+) -> None:
     """
-    :raises ValueError: unless ``value`` is a whole number from ``least`` on (or None, where that is allowed)
+    :param why_max: the reason for ``max``, for the message, such as "more cannot be kept in memory"
+    :raises ValueError: unless ``value`` is a whole number from ``min`` to ``max`` (or None, where that is allowed)
     """
     if value is None and none_allowed:
         return
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_whole or value < min or (max is not None and value > max):  # type: ignore[operator]
+        limit = f"of at least {min}" if max is None else f"from {min} to {max:,}"
+        reason = f" ({why_max})" if max is not None and why_max else ""
         or_none = " or None" if none_allowed else ""
-        raise ValueError(f"{name} must be a whole number of at least {least}{or_none}, got {value!r}")
+        given = count_text(int(value)) if is_whole else repr(value)  # type: ignore[call-overload]
+        raise ValueError(f"{name} must be a whole number {limit}{reason}{or_none}, got {given}")
+
+
+def as_count(name: str, value: object, *, min: int = 1, max: int | None = None, why_max: str = "") -> int:
+    """
+    A whole number that may have been written as a float, such as 1e5.
+
+    :param name: name of the argument
+    :param value: its value; bool is refused, it would pass as 0 or 1
+    :param min: smallest value allowed
+    :param max: largest value allowed
+    :param why_max: see :func:`check_count`
+    :return: the value as an int
+    :raises ValueError: unless it is a whole number from ``min`` to ``max``
+    """
+    if isinstance(value, float | np.floating) and float(value).is_integer():
+        value = int(value)
+    check_count(name, value, min=min, max=max, why_max=why_max)
+    return int(value)  # type: ignore[call-overload]
+
+
+def count_text(number: int) -> str:
+    """
+    A whole number to be read in a message: with separators, or, of more than 15 digits, as a power of ten.
+
+    Python refuses to write out integers of more than 4300 digits.
+    """
+    if abs(number) < 10**15:
+        return f"{number:,}"
+    return f"{'-' if number < 0 else ''}about 10^{math.log10(abs(number)):.0f}"
 
 
 def check_resolution(value: int | Sequence[int] | None, n_variables: int) -> None:

@@ -1,36 +1,37 @@
 """Experience of one task, in unit coordinates, kept by action for compiled code."""
 
+from typing import NamedTuple
+
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import part
+from sb3_combrel.common.compiled import EntryPoint, compiled, part
 
 BLOCK = 8
 
 
-class InstanceArrays(ArrayStruct):
-    """Instances by action; those of action ``a`` are the first ``count[a]`` along the second axis.
+class Instances(NamedTuple):
+    """Instances by action; those of action ``a`` are the first ``size[a]`` along the second axis.
 
     Experience comes as trajectories, so ``BLOCK`` instances in a row lie close together: the box around each block
-    lets a search for near instances pass over most blocks unseen.
+    lets a search for near instances skip most blocks.
 
     :param state: float64, shape (n_actions, capacity, n_variables), unit coordinates
     :param effect: float64, same shape: next state minus state, unit coordinates
     :param reward: float64, shape (n_actions, capacity)
     :param terminated: bool, same shape: the episode ended in a terminal state (not by a time limit)
-    :param count: int64, shape (n_actions,)
+    :param size: int64, shape (n_actions,)
     :param block_low: float64, shape (n_actions, n_variables, capacity / BLOCK), lower corners of the blocks' boxes
     :param block_high: the same for the upper corners
     :param gap: float64 scratch, shape (capacity / BLOCK,): how far a state is from the boxes
-    :param seen: int64 scratch, shape (n_actions, capacity): the last search that looked at each instance ahead of its turn
-    :param searches: int64 scratch, shape (1,): how many there were
+    :param seen: int64 scratch, shape (n_actions, capacity): the last search that began with each instance
+    :param searches: int64 scratch, shape (1,): how many searches there were
     """
 
     state: np.ndarray
     effect: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
-    count: np.ndarray
+    size: np.ndarray
     block_low: np.ndarray
     block_high: np.ndarray
     gap: np.ndarray
@@ -38,15 +39,15 @@ class InstanceArrays(ArrayStruct):
     searches: np.ndarray
 
     @classmethod
-    def empty(cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK) -> "InstanceArrays":
-        """No instances yet, with room for ``capacity`` (a multiple of BLOCK) of each action."""
+    def empty(cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK) -> "Instances":
+        """Make room for ``capacity`` (a multiple of BLOCK) instances of each action."""
         n_blocks = capacity // BLOCK
         return cls(
             state=np.empty((n_actions, capacity, n_variables)),
             effect=np.empty((n_actions, capacity, n_variables)),
             reward=np.empty((n_actions, capacity)),
             terminated=np.zeros((n_actions, capacity), dtype=np.bool_),
-            count=np.zeros(n_actions, dtype=np.int64),
+            size=np.zeros(n_actions, dtype=np.int64),
             block_low=np.full((n_actions, n_variables, n_blocks), np.inf),
             block_high=np.full((n_actions, n_variables, n_blocks), -np.inf),
             gap=np.empty(n_blocks),
@@ -63,7 +64,7 @@ class InstanceArrays(ArrayStruct):
         effect: np.ndarray,
         reward: np.ndarray,
         terminated: np.ndarray,
-    ) -> "InstanceArrays":
+    ) -> "Instances":
         """Instances given one a row, in their order.
 
         :param action: int64, shape (n,)
@@ -74,39 +75,62 @@ class InstanceArrays(ArrayStruct):
         capacity = 8 * BLOCK
         while capacity < counts.max():
             capacity *= 2
-        held = cls.empty(n_actions, state.shape[1], capacity)
-        held.count[:] = counts
+        made = cls.empty(n_actions, state.shape[1], capacity)
+        made.size[:] = counts
         for a, n in enumerate(counts):
             rows = np.flatnonzero(action == a)
-            held.state[a, :n], held.effect[a, :n] = state[rows], effect[rows]
-            held.reward[a, :n], held.terminated[a, :n] = reward[rows], terminated[rows]
+            made.state[a, :n], made.effect[a, :n] = state[rows], effect[rows]
+            made.reward[a, :n], made.terminated[a, :n] = reward[rows], terminated[rows]
             first = np.arange(0, n, BLOCK)
             if n > 0:
-                held.block_low[a, :, : len(first)] = np.minimum.reduceat(state[rows], first).T
-                held.block_high[a, :, : len(first)] = np.maximum.reduceat(state[rows], first).T
-        return held
+                made.block_low[a, :, : len(first)] = np.minimum.reduceat(state[rows], first).T
+                made.block_high[a, :, : len(first)] = np.maximum.reduceat(state[rows], first).T
+        return made
+
+    @classmethod
+    def from_rows(cls, n_actions: int, rows: np.ndarray) -> "Instances":
+        """
+        Build them from :meth:`rows`, in the same order for each action.
+
+        :param rows: float64, shape (n, 2 * n_variables + 3)
+        """
+        d = (rows.shape[1] - 3) // 2
+        actions = np.clip(rows[:, 0], 0, n_actions - 1).astype(np.int64)
+        return cls.of_rows(n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -2], rows[:, -1] > 0.5)
+
+    def rows(self) -> np.ndarray:
+        """Action, state, effect, reward and terminated of each instance, by action: float64, shape (n, 2 n_variables + 3)."""
+        by_action = [
+            np.column_stack([np.full(n, a), self.state[a, :n], self.effect[a, :n], self.reward[a, :n], self.terminated[a, :n]])
+            for a, n in enumerate(self.size.tolist())
+        ]
+        return np.vstack(by_action)
 
     @property
     def capacity(self) -> int:
         """Instances of one action for which there is room."""
         return self.state.shape[1]
 
-    def grown(self) -> "InstanceArrays":
+    def grown(self) -> "Instances":
         """The same instances with twice the room."""
         n_actions, capacity, n_variables = self.state.shape
-        larger = InstanceArrays.empty(n_actions, n_variables, 2 * capacity)
-        for old, new in zip(self.arrays().values(), larger.arrays().values(), strict=True):
+        larger = Instances.empty(n_actions, n_variables, 2 * capacity)
+        for old, new in zip(self, larger, strict=True):
             new[tuple(slice(n) for n in old.shape)] = old
         return larger
 
-    def with_room(self, action: int) -> "InstanceArrays":
+    def with_room(self, action: int) -> "Instances":
         """Itself, or grown if one more instance of ``action`` would not fit."""
-        return self if self.count[action] < self.capacity else self.grown()
+        return self if self.size[action] < self.capacity else self.grown()
 
 
 @part
-def put_instance(instances, action, slot, state, next_state, reward, terminated):
-    """Write one instance of ``action`` to ``slot``, at or before the end of that action's instances."""
+def put_instance(instances, transition):
+    """Write one instance to its slot, at or before the end of its action's instances.
+
+    :param transition: (action, slot, state, next_state, reward, terminated)
+    """
+    action, slot, state, next_state, reward, terminated = transition
     block = slot // BLOCK
     for k in range(len(state)):
         instances.state[action, slot, k] = state[k]
@@ -115,8 +139,17 @@ def put_instance(instances, action, slot, state, next_state, reward, terminated)
         instances.block_high[action, k, block] = max(instances.block_high[action, k, block], state[k])
     instances.reward[action, slot] = reward
     instances.terminated[action, slot] = terminated
-    if slot == instances.count[action]:
-        instances.count[action] += 1
+    if slot == instances.size[action]:
+        instances.size[action] += 1
+
+
+@compiled
+def put_one(instances, transition):
+    """:func:`put_instance` for callers from Python."""
+    put_instance(instances, transition)
+
+
+put_instance_at = EntryPoint(put_one)
 
 
 def along_curve(states: np.ndarray) -> np.ndarray:

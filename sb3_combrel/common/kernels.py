@@ -74,23 +74,25 @@ def measure_gaps(state, low, high, n_blocks, gap):
 
 
 @part
-def near_instances(instances, action, state, breadth, min_weight, min_fraction, indices, weights, n_before):
+def near_instances(instances, action, state, kernel, indices, weights, n_before):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first.
 
     What was near at the last query is likely to be near again. Looked at first, it gives at once a list that most
     other instances are too far away to enter. The result does not depend on it.
 
+    :param kernel: (breadth, min_weight, min_fraction)
     :param indices: int32 scratch that receives them, at least ``list_room(min_fraction)`` long
     :param weights: float64 scratch of the same length that receives their weights exp(-d^2 / breadth^2)
     :param n_before: how many instances of the last query are in ``indices``
     :return: how many, sum of their weights
     """
+    breadth, min_weight, min_fraction = kernel
     scale = -1.0 / (breadth * breadth)
     farthest = np.log(min_weight) / scale
     start = np.int64(0)
     length = np.int64(0)
     total = 0.0
-    count = instances.count[action]
+    count = instances.size[action]
     instances.searches[0] += 1
     search = instances.searches[0]
     for b in range(n_before):
@@ -131,40 +133,3 @@ def farthest_to_enter(last, total, min_weight, min_fraction, scale):
 def list_room(min_fraction: float) -> int:
     """Entries that a list needs while one is inserted: 1 + 1/min_fraction equal ones are kept, and one is cut."""
     return int(np.floor(1.0 / min_fraction)) + 3
-
-
-@inlined
-def corners_of(position, shape, strides, corner_index, corner_weight):
-    """Grid points around ``position`` and their multilinear weights.
-
-    :param position: float64, shape (n_variables,): unit coordinates times cells per unit; clipped into the grid
-    :param corner_index: int64 scratch, shape (2 ** n_variables,)
-    :param corner_weight: float64 scratch of the same shape
-    :return: how many corners have a weight above 0
-    """
-    corner_index[0] = 0
-    corner_weight[0] = 1.0
-    n_corners = 1
-    for k in range(len(position)):
-        last = shape[k] - 1
-        at = min(max(position[k], 0.0), float(last))
-        low = int(at)
-        part = at - low
-        for c in range(n_corners):
-            corner_index[c] += low * strides[k]
-        if part > 0.0:
-            for c in range(n_corners):
-                corner_index[n_corners + c] = corner_index[c] + strides[k]
-                corner_weight[n_corners + c] = corner_weight[c] * part
-                corner_weight[c] *= 1.0 - part
-            n_corners *= 2
-    return n_corners
-
-
-@inlined
-def interpolate(values, position, shape, strides, corner_index, corner_weight):
-    """The value at ``position`` (see :func:`corners_of`), multilinear between the grid points."""
-    value = 0.0
-    for c in range(corners_of(position, shape, strides, corner_index, corner_weight)):
-        value += corner_weight[c] * values[corner_index[c]]
-    return value

@@ -1,98 +1,108 @@
-"""A compiled store of many short, growing lists of (index, weight) entries in two flat arrays.
+"""A compiled store of many short, growing lists of (item, weight) entries in two flat arrays.
 
-The kernel model keeps such a list for every state-action pair of the grid: hundreds of thousands of lists, most of
-them empty, few of them long. One slab with slots of doubling size keeps them compact and lets compiled code walk
-them without pointers.
+Such a list is kept for every state-action pair of the grid: hundreds of thousands of lists, most of them empty, few of them
+long. Slots of doubling size in one array keep them compact, and compiled code walks them without pointers.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import inner
 
-SMALLEST_SLOT = 4
+MIN_SLOT = 4
 N_SIZE_CLASSES = 26
+# Where the allocator keeps what it needs besides the free slots.
+USED, FULL = N_SIZE_CLASSES, N_SIZE_CLASSES + 1
 
 
-class Pool(ArrayStruct):
-    """Lists of (index, weight); list ``p`` is ``index[start[p] : start[p] + length[p]]`` and the same of ``weight``.
+class ListStore(NamedTuple):
+    """Lists of (item, weight); list ``p`` is ``item[start[p] : start[p] + length[p]]`` and the same of ``weight``.
 
-    :param index: int32, shape (capacity,)
+    :param item: int32, shape (capacity,)
     :param weight: float64, shape (capacity,)
     :param start: int64, shape (n_lists,): first entry of each list's slot, -1 while it has none
     :param length: int32, shape (n_lists,)
-    :param size_class: int8, shape (n_lists,): the slot holds ``SMALLEST_SLOT << size_class`` entries
-    :param free: int64, shape (N_SIZE_CLASSES,): head of the chain of free slots of each class, -1 if none
-    :param used: int64, shape (1,): entries of the slab handed out so far
-    :param full: bool, shape (1,): the slab was too small for what was last asked of it
+    :param size_class: int8, shape (n_lists,): the slot has room for ``MIN_SLOT << size_class`` entries
+    :param allocator: int64, shape (N_SIZE_CLASSES + 2,): head of the chain of free slots of each class, -1 if none; how many
+        entries are in slots (USED); 1 if there was no room for the last slot asked for (FULL)
     """
 
-    index: np.ndarray
+    item: np.ndarray
     weight: np.ndarray
     start: np.ndarray
     length: np.ndarray
     size_class: np.ndarray
-    free: np.ndarray
-    used: np.ndarray
-    full: np.ndarray
+    allocator: np.ndarray
 
     @classmethod
-    def empty(cls, n_lists: int, capacity: int) -> "Pool":
-        """A pool of ``n_lists`` empty lists with room for ``capacity`` entries before it has to grow."""
+    def empty(cls, n_lists: int, capacity: int) -> "ListStore":
+        """
+        Make empty lists.
+
+        :param n_lists: how many
+        :param capacity: entries that there is room for before the store has to grow
+        """
         return cls(
-            index=np.empty(capacity, dtype=np.int32),
+            item=np.empty(capacity, dtype=np.int32),
             weight=np.empty(capacity, dtype=np.float64),
             start=np.full(n_lists, -1, dtype=np.int64),
             length=np.zeros(n_lists, dtype=np.int32),
             size_class=np.zeros(n_lists, dtype=np.int8),
-            free=np.full(N_SIZE_CLASSES, -1, dtype=np.int64),
-            used=np.zeros(1, dtype=np.int64),
-            full=np.zeros(1, dtype=np.bool_),
+            allocator=np.array([-1] * N_SIZE_CLASSES + [0, 0], dtype=np.int64),
         )
 
-    def with_room(self) -> "Pool":
-        """Itself, or the same lists with twice the room if it was full."""
-        if not self.full[0]:
+    def with_room(self) -> "ListStore":
+        """
+        Double the room if the store is full.
+
+        :return: itself, or a store with the same lists
+        """
+        if not self.allocator[FULL]:
             return self
-        self.full[0] = False
-        more = len(self.index)
-        return self.replace(
-            index=np.concatenate([self.index, np.empty(more, dtype=np.int32)]),
+        self.allocator[FULL] = 0
+        more = len(self.item)
+        return self._replace(
+            item=np.concatenate([self.item, np.empty(more, dtype=np.int32)]),
             weight=np.concatenate([self.weight, np.empty(more, dtype=np.float64)]),
         )
 
     def entries(self, p: int) -> tuple[np.ndarray, np.ndarray]:
-        """Indices and weights of list ``p``, as views."""
+        """
+        Read list ``p``.
+
+        :return: its items and weights, as views
+        """
         first = int(self.start[p])
         last = first + int(self.length[p])
-        return self.index[first:last], self.weight[first:last]
+        return self.item[first:last], self.weight[first:last]
 
 
 @inner
-def reserve(pool: Pool, p: int, n_entries: int) -> bool:
-    """Make room for ``n_entries`` in list ``p``, keeping what it holds; False if the slab must grow first."""
-    old_start = pool.start[p]
-    if old_start >= 0 and n_entries <= SMALLEST_SLOT << pool.size_class[p]:
+def reserve(store, p, n_entries):
+    """Make room for ``n_entries`` in list ``p``, keeping its entries; False if the store must grow first."""
+    old_start = store.start[p]
+    if old_start >= 0 and n_entries <= MIN_SLOT << store.size_class[p]:
         return True
     size_class = 0
-    while SMALLEST_SLOT << size_class < n_entries:
+    while MIN_SLOT << size_class < n_entries:
         size_class += 1
-    slot = pool.free[size_class]
+    slot = store.allocator[size_class]
     if slot >= 0:
-        pool.free[size_class] = pool.index[slot]
+        store.allocator[size_class] = store.item[slot]
     else:
-        slot = pool.used[0]
-        if slot + (SMALLEST_SLOT << size_class) > len(pool.index):
-            pool.full[0] = True
+        slot = store.allocator[USED]
+        if slot + (MIN_SLOT << size_class) > len(store.item):
+            store.allocator[FULL] = 1
             return False
-        pool.used[0] = slot + (SMALLEST_SLOT << size_class)
+        store.allocator[USED] = slot + (MIN_SLOT << size_class)
     if old_start >= 0:
-        for k in range(pool.length[p]):
-            pool.index[slot + k] = pool.index[old_start + k]
-            pool.weight[slot + k] = pool.weight[old_start + k]
-        old_class = pool.size_class[p]
-        pool.index[old_start] = np.int32(pool.free[old_class])
-        pool.free[old_class] = old_start
-    pool.start[p] = slot
-    pool.size_class[p] = size_class
+        for k in range(store.length[p]):
+            store.item[slot + k] = store.item[old_start + k]
+            store.weight[slot + k] = store.weight[old_start + k]
+        old_class = store.size_class[p]
+        store.item[old_start] = np.int32(store.allocator[old_class])
+        store.allocator[old_class] = old_start
+    store.start[p] = slot
+    store.size_class[p] = size_class
     return True

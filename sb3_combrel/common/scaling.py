@@ -163,6 +163,8 @@ def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64]
     for name, bound in (("low", low), ("high", high)):
         if bound.shape not in ((), (n_variables,)):
             raise ValueError(f"{right}, got a {name} of shape {bound.shape} in bounds={bounds!r}")
+        if any(isinstance(each, bool | np.bool_) for given in bounds for each in np.ravel(np.array(given, dtype=object))):
+            raise ValueError(f"{right}, got bounds={bounds!r}")
         if not np.all(np.isfinite(bound)):
             raise ValueError(f"{right}, got a {name} of {bound.tolist()} in bounds={bounds!r}")
     low, high = np.broadcast_to(low, n_variables), np.broadcast_to(high, n_variables)

@@ -1,67 +1,134 @@
 """Transferred instances on their way from a transfer method to the model."""
 
+from typing import NamedTuple
+
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
+from sb3_combrel.common.compiled import EntryPoint, compiled
+
+ROUNDING = 1e-9
 
 
-class Supply(ArrayStruct):
-    """Transferred instances for a number of state-action pairs, one pair a row (see ``Transfer.supply``).
+class TransferredInstances(NamedTuple):
+    """Transferred instances for a number of state-action pairs, one pair a row (see ``Transfer.transferred``).
 
-    Rows beyond those asked for mean nothing: a transfer method may write to the same supply again and again.
+    Rows beyond those asked for are not read, nor are entries beyond a row's length: a transfer method may write to the
+    same arrays at every call.
 
-    :param count: int64, shape (n,): instances for each pair, 0 if the pair cannot be settled
-    :param weight: float64, shape (n, most)
-    :param effect: float64, shape (n, most, n_variables): predicted displacement, unit coordinates of the target
-    :param reward: float64, shape (n, most)
-    :param terminated: bool, shape (n, most)
+    :param length: int64, shape (n,): instances for each pair; 0 leaves the pair optimistic
+    :param weight: float64, shape (n, max_instances): their kernel weights, above 0
+    :param effect: float64, shape (n, max_instances, n_variables): predicted displacement, unit coordinates of the target
+    :param reward: float64, shape (n, max_instances), raw
+    :param terminated: bool, shape (n, max_instances): the instance ends the episode
     """
 
-    count: np.ndarray
+    length: np.ndarray
     weight: np.ndarray
     effect: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
-    # Number of state variables for which the shapes have been checked: they stay what they are.
-    _fits = -1
 
     @classmethod
-    def empty(cls, n: int, n_variables: int, most: int = 0) -> "Supply":
-        """Nothing for any of ``n`` pairs yet, and room for ``most`` instances of each."""
+    def empty(cls, n: int, n_variables: int, max_instances: int = 0) -> "TransferredInstances":
+        """
+        Make room for transferred instances.
+
+        :param n: number of pairs
+        :param n_variables: number of state variables of the target
+        :param max_instances: of one pair
+        :return: arrays of that shape, with nothing transferred to any pair
+        """
         return cls(
-            count=np.zeros(n, dtype=np.int64),
-            weight=np.empty((n, most)),
-            effect=np.empty((n, most, n_variables)),
-            reward=np.empty((n, most)),
-            terminated=np.empty((n, most), dtype=np.bool_),
+            length=np.zeros(n, dtype=np.int64),
+            weight=np.zeros((n, max_instances)),
+            effect=np.zeros((n, max_instances, n_variables)),
+            reward=np.zeros((n, max_instances)),
+            terminated=np.zeros((n, max_instances), dtype=np.bool_),
         )
 
-    def check(self, n: int, n_variables: int, method: object) -> None:
-        """Refuse what compiled code would read beyond its ends.
 
-        :param n: rows that were asked for
-        :param n_variables: of the target
-        :param method: whoever supplied this
-        :raises ValueError: if there are fewer rows, or the arrays do not fit each other
-        """
-        if self._fits != n_variables:
-            self._check_shapes(n_variables, type(method).__name__)
-        if len(self.count) < n:
-            raise ValueError(f"{type(method).__name__} supplied {len(self.count)} rows, but was asked for {n}")
-        count, most = self.count[:n], self.weight.shape[1]
-        # What is below 0 is large without a sign.
-        if n > 0 and np.maximum.reduce(count.view(np.uint64)) > most:
+_TYPES = tuple(map(np.dtype, (np.int64, np.float64, np.float64, np.float64, np.bool_)))
+
+
+def check_transferred(
+    given: TransferredInstances, method: object, own_weight: np.ndarray, n_variables: int, threshold: float
+) -> None:
+    """
+    Check what a transfer method returned before compiled code reads it.
+
+    :param given: what it returned
+    :param method: the transfer method, named in the message
+    :param own_weight: weight of the target's own instances of each pair that was asked for, shape (n,)
+    :param n_variables: number of state variables of the target
+    :param threshold: weight that own and transferred instances of a pair must reach together
+    :raises ValueError: if rows are missing, arrays have other types or shapes, a value is not finite, a weight is not above
+        0, or the weights of a pair do not reach the threshold
+    """
+    name = type(method).__name__
+    _check_arrays(given, name, len(own_weight), n_variables)
+    problem, row = _first_problem.call(given, own_weight, threshold)
+    if problem == _NO_PROBLEM:
+        return
+    length, weights = int(given.length[row]), given.weight[row, : max(0, given.length[row])]
+    if problem == _LENGTH:
+        raise ValueError(
+            f"{name} returned length={length} for row {row}; it must be from 0 to {given.weight.shape[1]}, the room in weight"
+        )
+    if problem == _WEIGHT:
+        raise ValueError(f"{name} returned the weights {weights} for row {row}; they must be finite and above 0")
+    if problem == _VALUE:
+        raise ValueError(f"{name} returned an effect or a reward that is not finite for row {row}")
+    raise ValueError(
+        f"{name} returned weights that add up to {weights.sum():g} for row {row}, with {own_weight[row]:g} of the target's "
+        f"own instances; together they must reach the threshold of {threshold:g}, or length must be 0"
+    )
+
+
+def _check_arrays(given: TransferredInstances, name: str, n: int, n_variables: int) -> None:
+    if not isinstance(given, TransferredInstances):
+        raise ValueError(f"{name} must return TransferredInstances, got {given!r}")
+    for field, array, dtype in zip(given._fields, given, _TYPES, strict=True):
+        if not isinstance(array, np.ndarray) or array.dtype != dtype or not array.flags.carray:
+            kind = getattr(array, "dtype", type(array).__name__)
+            raise ValueError(f"{name} returned {field} of type {kind}; it must be a C-contiguous array of {dtype}")
+    shape = given.weight.shape
+    if len(shape) != 2:
+        raise ValueError(f"{name} returned weight of shape {shape}; it must be (number of pairs, max_instances)")
+    expected = (shape[:1], shape, (*shape, n_variables), shape, shape)
+    for field, array, wanted in zip(given._fields, given, expected, strict=True):
+        if array.shape != wanted:
             raise ValueError(
-                f"{type(method).__name__} supplied counts from {count.min()} to {count.max()}, with room for {most} instances"
+                f"{name} returned {field} of shape {array.shape} with weight of shape {shape}; "
+                f"with {n_variables} state variables it must be {wanted}"
             )
+    if shape[0] < n:
+        raise ValueError(f"{name} returned {shape[0]} rows, but was asked for {n}")
 
-    def _check_shapes(self, n_variables: int, name: str) -> None:
-        places = self.weight.shape
-        expected = {"count": places[:1], "effect": (*places, n_variables), "reward": places, "terminated": places}
-        for array, shape in expected.items():
-            if getattr(self, array).shape != shape:
-                raise ValueError(
-                    f"{name} supplied {array} of shape {getattr(self, array).shape} with weight of shape {places}; "
-                    f"with {n_variables} state variables that must be {shape}"
-                )
-        vars(self)["_fits"] = n_variables
+
+_NO_PROBLEM, _LENGTH, _WEIGHT, _VALUE, _THRESHOLD = range(5)
+
+
+@compiled
+def first_problem(given, own_weight, threshold):
+    """What is wrong with the first row that breaks the contract, and its number."""
+    for row in range(len(own_weight)):
+        n = given.length[row]
+        if n < 0 or n > given.weight.shape[1]:
+            return _LENGTH, row
+        total = own_weight[row]
+        for k in range(n):
+            weight = given.weight[row, k]
+            if not (weight > 0.0 and weight < np.inf):
+                return _WEIGHT, row
+            total += weight
+            fine = np.isfinite(given.reward[row, k])
+            for v in range(given.effect.shape[2]):
+                fine = fine and np.isfinite(given.effect[row, k, v])
+            if not fine:
+                return _VALUE, row
+        if n > 0 and total < threshold * (1.0 - ROUNDING):
+            return _THRESHOLD, row
+    return _NO_PROBLEM, 0
+
+
+_first_problem = EntryPoint(first_problem)

@@ -35,14 +35,14 @@ MAX_EPISODE_STEPS = 400
 #: A hit by the first command returns 99. The paper's breadth (Table 3) is 0.1; with 0.2 the arm is learnt in fewer steps.
 LEARNER: dict[str, Any] = {"model_breadth": 0.2, "max_value": 100.0}
 #: How COMBREL is set here; see the class for what each argument is.
-TRANSFER: dict[str, Any] = {"voting_radius": 0.6, "breadth": 0.4, "fading": 1.0, "max_transitions": 20_000}
-#: With all signed injective mappings many comply about equally well. The best of them settles what it gets wrong as well,
-#: and is slow to be found out; drawn ones are not, and may reach farther.
+TRANSFER: dict[str, Any] = {"neighbor_radius": 0.6, "breadth": 0.4, "breadth_decay": 1.0, "max_transitions": 20_000}
+#: Of all signed injective mappings many have about the same compliance. If only the best is used, its errors determine all
+#: predictions and are corrected slowly; drawn mappings do not have that drawback, and may be used farther from transitions.
 OF_ALL: dict[str, Any] = {
     **TRANSFER,
     "mappings": "signed_injective",
     "choice": "drawn",
-    "voting_radius": 0.7,
+    "neighbor_radius": 0.7,
     "breadth": 0.5,
 }
 #: As near to the paper as its text allows.
@@ -50,9 +50,9 @@ FAITHFUL: dict[str, Any] = {
     "mappings": "paper_icub",
     "measured": "first_episode",
     "min_compliance": 0.0,
-    "fading": 1.0,
+    "breadth_decay": 1.0,
     "breadth": 0.1,
-    "believe_terminal": True,
+    "transfer_terminals": True,
 }
 
 NO_TRANSFER = "no transfer"
@@ -73,7 +73,7 @@ THRESHOLDS = (100, 50)
 
 def learn_source(seed: int = 0) -> SourceInstances:
     """
-    Learn the torso's task by Fitted R-Max and keep 1000 instances that cover what it has seen, hits included.
+    Learn the torso's task by Fitted R-Max and keep 1000 instances that cover the visited states, hits included.
 
     :param seed: seed of the learner and the choice
     """
@@ -82,13 +82,14 @@ def learn_source(seed: int = 0) -> SourceInstances:
 
 def transfer_of(method: str, source: SourceInstances, mapping: InterTaskMapping | None = None) -> Transfer | None:
     """
-    The transfer method of a name.
+    Make the transfer method of a name.
 
     :param method: one of :data:`METHODS`
     :param source: instances of the torso's task
     :param mapping: COMBREL's most frequent mapping, for the method that uses it
+    :return: the method, not bound to a task; None for no transfer
     """
-    timbrel = {name: TRANSFER[name] for name in ("breadth", "fading")}
+    timbrel = {name: TRANSFER[name] for name in ("breadth", "breadth_decay")}
     if method == PAPERS_MAPPINGS:
         return COMBREL(source, "paper_icub", **TRANSFER)
     if method == ALL_MAPPINGS:
@@ -103,7 +104,7 @@ def transfer_of(method: str, source: SourceInstances, mapping: InterTaskMapping 
 
 def most_frequent_of(runs: Sequence[Run], source: SourceInstances) -> InterTaskMapping:
     """
-    The mapping that COMBREL used most, for TIMBREL (Section 5.2).
+    Find the mapping that COMBREL used most, for TIMBREL (Section 5.2).
 
     :param runs: the experiment's runs, those of COMBREL complete
     :param source: instances of the torso's task
@@ -132,7 +133,7 @@ def run_experiment(
     :param workers: processes at a time
     :param console: where to write; None for the standard output
     :param first_seed: the seeds are this and those after it
-    :raises ValueError: if a number is below 1, a method is unknown, or one lacks the method whose mapping it takes over
+    :raises ValueError: if a number is below 1, a method is unknown, or a method is missing whose mapping another one uses
     """
     for name, number in {"n_seeds": n_seeds, "n_episodes": n_episodes, "workers": workers}.items():
         check_count(name, number)
@@ -140,7 +141,7 @@ def run_experiment(
     if unknown or not methods:
         raise ValueError(f"methods must be some of {', '.join(METHODS)}, got {list(methods)!r}")
     if FREQUENT in methods and PAPERS_MAPPINGS not in methods:
-        raise ValueError(f"{FREQUENT!r} takes over the mapping that {PAPERS_MAPPINGS!r} used most: methods needs both")
+        raise ValueError(f"{FREQUENT!r} uses the mapping that {PAPERS_MAPPINGS!r} used most: methods needs both")
     console = console or Console()
     prepare_folder(output, settings())
     source = _source(output / "source.npz", console)
@@ -153,7 +154,7 @@ def run_experiment(
         return [Run(output, method, seed, *arguments) for seed in range(first_seed, first_seed + n_seeds)]
 
     first = [method for method in METHODS if method in methods and method != FREQUENT]
-    # Seed by seed: the methods can be compared before all is done.
+    # Seed by seed, so that the methods can be compared before all runs are complete.
     runs = [run for of_one_seed in zip(*map(runs_of, first), strict=True) for run in of_one_seed]
     carry_out_all(runs, workers, console)
     if FREQUENT in methods:
@@ -166,7 +167,7 @@ def run_experiment(
 
 
 def settings() -> dict[str, Any]:
-    """What the results depend on, seeds and number of episodes excepted."""
+    """Return what the results depend on, except for seeds and number of episodes."""
     return {
         "source": SOURCE_ID,
         "target": TARGET_ID,
@@ -221,7 +222,7 @@ def write_summary(runs: Sequence[Run], path: Path) -> None:
 
 def threshold_table(steps: Mapping[str, np.ndarray]) -> Table:
     """
-    Environment steps until the median of the last episodes is at most so many commands (the paper's Figure 6).
+    Make a table of environment steps until the median of the last episodes is at most a threshold (the paper's Figure 6).
 
     :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
     """
@@ -236,12 +237,12 @@ def threshold_table(steps: Mapping[str, np.ndarray]) -> Table:
         rows.append((method, *cells))
     header = ("method", *(text for t in THRESHOLDS for text in (f"steps until {t} commands", "share")))
     n_runs = len(next(iter(steps.values())))
-    return Table(f"Steps until the median of {WINDOW} episodes: median of {n_runs} runs (least to most)", header, rows)
+    return Table(f"Steps until the median of {WINDOW} episodes: median of {n_runs} runs (minimum to maximum)", header, rows)
 
 
 def end_table(steps: Mapping[str, np.ndarray]) -> Table:
     """
-    Commands in the last ten episodes, and all steps.
+    Make a table of the commands in the last ten episodes, and of all steps.
 
     :param steps: as above
     """
@@ -271,9 +272,11 @@ def _names_of_target() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description="The iCub's arm, learned with and without transfer from its torso.")
-    parser.add_argument("--output", type=Path, default=Path("icub_experiment"), help="a later call goes on with what is there")
+    parser.add_argument(
+        "--output", type=Path, default=Path("icub_experiment"), help="a later call continues from the results in it"
+    )
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="the settings were chosen on other seeds")
     parser.add_argument("--episodes", type=int, default=300)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 class Case(NamedTuple):
     """One line of the table.
 
-    :param name: what stands in it
+    :param name: its text
     :param env_id: the environment
     :param env_kwargs: its arguments
     :param kwargs: arguments of FittedRMax
@@ -79,7 +79,7 @@ for transfer, n_steps in ((None, 5), (COMBREL(source), 200)):
 
 
 def resident_memory() -> float:
-    """Resident memory of this process in MiB (Linux; elsewhere the peak so far)."""
+    """Return the resident memory of this process in MiB (Linux; elsewhere the peak so far)."""
     try:
         with open("/proc/self/statm") as statm:
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
@@ -90,13 +90,13 @@ def resident_memory() -> float:
 
 
 def import_seconds() -> float:
-    """Seconds that the import takes on top of that of Stable-Baselines3, in a fresh process."""
+    """Measure the seconds that the import takes on top of that of Stable-Baselines3, in a fresh process."""
     done = subprocess.run([sys.executable, "-c", _IMPORT], capture_output=True, text=True, check=True)
     return float(done.stdout)
 
 
 def first_use_seconds() -> tuple[float, float]:
-    """Seconds until the first steps and the first prediction are done, in a fresh process with nothing compiled.
+    """Measure the seconds until the first steps and the first prediction are done, in a fresh process with nothing compiled.
 
     :return: without transfer, and after that with COMBREL
     """
@@ -108,7 +108,7 @@ def first_use_seconds() -> tuple[float, float]:
 
 
 def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
-    """Learn ``n_episodes`` of a case; environment steps, and seconds of processor time."""
+    """Learn ``n_episodes`` of a case, and return the environment steps and the seconds of processor time."""
     from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
     from stable_baselines3.common.env_util import make_vec_env
 
@@ -124,8 +124,8 @@ def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
     return model.num_timesteps, time.process_time() - start
 
 
-def measure(number: int, part: float = 1.0, seed: int = 0) -> tuple[int, float, float]:
-    """Steps, milliseconds a step and MiB beyond the imports of case ``number``, warm, in a process of its own."""
+def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, float, float]:
+    """Measure steps, milliseconds a step and MiB beyond the imports of case ``number``, all compiled, in a new process."""
     code = (
         "import torch; torch.set_num_threads(1)\n"
         "from sb3_combrel.experiments import bench\n"
@@ -133,7 +133,7 @@ def measure(number: int, part: float = 1.0, seed: int = 0) -> tuple[int, float, 
         "bench.learn(bench.CASES[0], 1, seed=1)\n"
         "if case.transfers: bench.learn(case, 1, seed=1)\n"
         "before = bench.resident_memory()\n"
-        f"steps, seconds = bench.learn(case, max(1, round({part} * case.n_episodes)), {seed})\n"
+        f"steps, seconds = bench.learn(case, max(1, round({fraction} * case.n_episodes)), {seed})\n"
         "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -141,39 +141,39 @@ def measure(number: int, part: float = 1.0, seed: int = 0) -> tuple[int, float, 
     return int(steps), float(milliseconds), float(memory)
 
 
-def compare(n_pairs: int, part: float) -> None:
+def compare(n_pairs: int, fraction: float) -> None:
     """Print what COMBREL adds to the mean time of a step with each kernel, in pairs of runs with the same seed.
 
-    Both runs of a pair go at the same time: whatever else slows the machine slows both.
+    Both runs of a pair are carried out at the same time, so that other load slows both.
     """
     for number, case in enumerate(CASES):
         if not case.transfers:
             continue
         numbers, added = (number - 1, number), []
         print(f"{CASES[number - 1].name}, without transfer and with COMBREL, {COMPARED_EPISODES} episodes, ms/step")
-        parts = [part * COMPARED_EPISODES / CASES[n].n_episodes for n in numbers]
+        fractions = [fraction * COMPARED_EPISODES / CASES[n].n_episodes for n in numbers]
         with ThreadPoolExecutor(2) as pool:
             for seed in range(n_pairs):
-                (_, without, _), (_, transferring, _) = pool.map(measure, numbers, parts, (seed, seed))
+                (_, without, _), (_, transferring, _) = pool.map(measure, numbers, fractions, (seed, seed))
                 added.append(transferring / without - 1.0)
                 print(f"seed {seed:2}: {without:.3f} {transferring:.3f} {added[-1]:+.0%}", flush=True)
         print(f"mean {sum(added) / n_pairs:+.0%}, from {min(added):+.0%} to {max(added):+.0%}")
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the command line: print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--part", type=float, default=1.0, help="part of each case's episodes, for a quick look")
+    parser.add_argument("--fraction", "--part", type=float, default=1.0, help="fraction of each case's episodes to run")
     parser.add_argument("--pairs", type=int, default=0, help="instead: what transfer adds to a step, in so many pairs of runs")
     arguments = parser.parse_args()
-    part = arguments.part
+    fraction = arguments.fraction
     if arguments.pairs > 0:
-        compare(arguments.pairs, part)
+        compare(arguments.pairs, fraction)
         return
     print(f"{'case':45} {'episodes':>8} {'steps':>7} {'ms/step':>8} {'MiB':>6}")
     for number, case in enumerate(CASES):
-        steps, milliseconds, memory = measure(number, part)
-        n_episodes = max(1, round(part * case.n_episodes))
+        steps, milliseconds, memory = measure(number, fraction)
+        n_episodes = max(1, round(fraction * case.n_episodes))
         print(f"{case.name:45} {n_episodes:8} {steps:7} {milliseconds:8.2f} {memory:6.0f}", flush=True)
     print(f"import, beyond that of Stable-Baselines3: {import_seconds():.2f} s")
     without, transferring = first_use_seconds()

@@ -34,12 +34,12 @@ LEARNT = {SOURCE_ID: 27, TARGET_ID: 32}
 
 class Outcome(NamedTuple):
     """
-    What came of one run.
+    The outcome of one run.
 
     :param episodes: until the median of five episodes was as in :data:`LEARNT`; inf if it never was
     :param in_the_end: median of the last ten episodes
     :param steps: environment steps of all episodes
-    :param milliseconds: time of a step, simulation included, with whatever else the machine did
+    :param milliseconds: time of a step, simulation included, under whatever other load there was
     """
 
     episodes: float
@@ -49,7 +49,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(run: Run) -> Outcome:
-    """What came of a complete run."""
+    """Compute the outcome of a complete run."""
     steps = run.steps()
     task = run.env_id.replace("Noisy", "")
     seconds = float(run.episodes()[run.n_episodes - 1]["seconds"])
@@ -95,7 +95,7 @@ def run_experiment(
 
 
 def settings(breadths: Sequence[float]) -> list[tuple[str, str, float]]:
-    """Name, task and breadth of every setting."""
+    """Return name, task and breadth of every setting."""
     tasks = {"torso": SOURCE_ID, "arm": TARGET_ID}
     return [
         (f"{task} {breadth:g}{noise}", env_id.replace("-v0", f"{noise.strip().title()}-v0"), breadth)
@@ -114,7 +114,7 @@ def write_summary(runs: Sequence[Run], path: Path) -> None:
 
 
 def table_of(runs: Sequence[Run]) -> Table:
-    """One row a setting: when its runs had learnt, where they ended, and what a step took."""
+    """Make a table with a row for each setting: episodes until learnt, commands in the end, and time of a step."""
     rows = []
     for setting in dict.fromkeys(run.method for run in runs):
         found = [outcome(run) for run in runs if run.method == setting]
@@ -138,10 +138,10 @@ def table_of(runs: Sequence[Run]) -> Table:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description="The iCub's tasks at several breadths, with and without noise.")
     parser.add_argument(
-        "--output", type=Path, default=Path("breadths_experiment"), help="a later call goes on with what is there"
+        "--output", type=Path, default=Path("breadths_experiment"), help="a later call continues from the results in it"
     )
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=300)

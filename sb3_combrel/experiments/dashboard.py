@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-#: Tabs of TensorBoard to look at: file name, the part of the address after "#", window size.
+#: Tabs of TensorBoard: file name, the part of the address after "#", window size.
 TABS = {
     "scalars": ("scalars", (1300, 1100)),
     "custom_scalars": ("custom_scalars", (1300, 1150)),
@@ -30,7 +30,7 @@ SECONDS_TO_DRAW = 20
 
 def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TABS)) -> list[Path]:
     """
-    Start TensorBoard, look at it, stop it.
+    Start TensorBoard, take screenshots of it, and stop it.
 
     :param logs: folder with one folder a run
     :param output: folder for PNG files, one a tab
@@ -48,12 +48,12 @@ def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TAB
 
 @contextlib.contextmanager
 def _tensorboard(logs: Path) -> Iterator[str]:
-    """A server of the logs on this machine only; its address."""
+    """Run a server of the logs, for this machine only; its address."""
     with contextlib.closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     logs = logs.resolve()
-    # Shown on the page: the folder's name says enough.
+    # The name is shown on the page; the folders above it are not needed there.
     command = [sys.executable, "-m", "tensorboard.main", "--logdir", logs.name, "--host", "127.0.0.1", "--port", str(port)]
     server = subprocess.Popen([*command, "--samples_per_plugin", "images=100"], cwd=logs.parent, stderr=subprocess.DEVNULL)
     try:
@@ -66,7 +66,7 @@ def _tensorboard(logs: Path) -> Iterator[str]:
 
 
 def _wait_for(url: str, server: subprocess.Popen[bytes]) -> None:
-    """Until the runs have been read."""
+    """Wait until the runs have been read."""
     end = time.monotonic() + SECONDS_TO_START
     while time.monotonic() < end and server.poll() is None:
         with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=5) as answer:
@@ -89,7 +89,7 @@ def _photograph(browser: str, address: str, path: Path, size: tuple[int, int]) -
 
 def learn_three_ways(logs: Path, total_timesteps: int) -> None:
     """
-    One run without transfer, one with TIMBREL and one with COMBREL, logged side by side.
+    Learn without transfer, with TIMBREL and with COMBREL, and log the three runs in one folder.
 
     :param logs: folder for the logs
     :param total_timesteps: environment steps of each run

@@ -26,7 +26,7 @@ from sb3_combrel.experiments.warm_up import warm_up
 SETTINGS, SOURCE, RUNS, TENSORBOARD = "settings.json", "source.npz", "runs", "tensorboard"
 FIGURE, TABLES, RESULTS = "learning_curves.png", "tables.md", "results.csv"
 MODEL, VIDEO = "car.zip", "car.mp4"
-#: All that the demonstration ever writes into its folder.
+#: All that the demonstration writes into its folder.
 OUTPUTS = (SETTINGS, SOURCE, RUNS, TENSORBOARD, FIGURE, TABLES, RESULTS, MODEL, VIDEO)
 
 FILMED = "COMBREL"
@@ -46,9 +46,9 @@ def run_demo(
     console: Console | None = None,
 ) -> None:
     """
-    Learn the target task without transfer, with TIMBREL and with COMBREL, and show what came of it.
+    Learn the target task without transfer, with TIMBREL and with COMBREL, and report the results.
 
-    What an earlier call has finished in the same folder is kept and not done again.
+    Runs that an earlier call has completed in the same folder are kept.
 
     :param output: folder for all results
     :param n_seeds: runs of each method
@@ -56,7 +56,7 @@ def run_demo(
     :param max_episode_steps: steps after which an episode is cut off
     :param model_breadth: breadth of the learner's kernel
     :param workers: processes at a time; None for one a core
-    :param fresh: begin anew and delete the results in the folder
+    :param fresh: delete the results in the folder first
     :param console: where to write; None for the standard output
     :raises ValueError: if a number is below 1, or the folder has results of other settings
     """
@@ -89,16 +89,16 @@ def run_demo(
 
 def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool = False) -> None:
     """
-    Make the folder ready to take up results, those of an earlier call with the same settings included.
+    Prepare the folder for results; those of an earlier call with the same settings are kept.
 
     :param output: the folder
-    :param settings: what the results depend on, as data that JSON can hold
+    :param settings: what the results depend on, as data that JSON can represent
     :param fresh: delete earlier results; nothing else is ever deleted
-    :raises ValueError: if there are results of other settings, or things that are not the demonstration's
+    :raises ValueError: if there are results of other settings, or files that are not the demonstration's
     """
     file = output / SETTINGS
     if output.exists() and not file.exists() and any(output.iterdir()):
-        raise ValueError(f"{output} holds something else than results of this command; choose another --output")
+        raise ValueError(f"{output} has files that are not results of this command; choose another --output")
     if fresh:
         for name in OUTPUTS:
             path = output / name
@@ -108,7 +108,7 @@ def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool = False) 
         other = sorted(key for key in {*before, *settings} if before.get(key) != settings.get(key))
         if other:
             differences = ", ".join(f"{key} was {before.get(key)!r} and is {settings.get(key)!r}" for key in other)
-            raise ValueError(f"{output} holds results of other settings ({differences}); use --fresh or another --output")
+            raise ValueError(f"{output} has results of other settings ({differences}); use --fresh or another --output")
     output.mkdir(parents=True, exist_ok=True)
     unfinished = file.with_suffix(".part")
     unfinished.write_text(json.dumps(settings, indent=2) + "\n")
@@ -116,7 +116,7 @@ def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool = False) 
 
 
 def _settings(learner: dict[str, Any], max_episode_steps: int) -> dict[str, Any]:
-    """What a run's results depend on, its seed and number of episodes excepted."""
+    """Return what a run's results depend on, except for its seed and number of episodes."""
     return {
         "version": sb3_combrel.__version__,
         "source": mountain_car.SOURCE_ID,
@@ -157,7 +157,7 @@ def _report(runs: Sequence[Run], output: Path, console: Console) -> None:
 
 
 def _best(runs: Sequence[Run], console: Console) -> Run:
-    """The run whose model needs the fewest steps now that it no longer explores."""
+    """Return the run whose model needs the fewest steps without exploring."""
     with console.status("Trying the trained cars ..."):
         steps = [_drive(run) for run in runs]
     best = int(np.argmin(steps))

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_combrel.experiments.statistics import mean_of_runs
 
-#: Okabe and Ito's colours, which the colour-blind can tell apart too.
+#: Okabe and Ito's colours, which the colour-blind can distinguish too.
 COLOURS = ("#555555", "#0072B2", "#D55E00", "#009E73", "#CC79A7")
 MARKERS = ("s", "^", "o", "D", "v")
 
@@ -70,7 +70,7 @@ def draw_smoothed_curves(steps: Mapping[str, np.ndarray], path: Path, title: str
         episodes = np.arange(window, samples.shape[1] + 1)
         axes.plot(episodes, mean, color=colour, label=f"{method} ({len(samples)} runs)")
         axes.fill_between(episodes, np.maximum(low, 0), high, color=colour, alpha=0.15, linewidth=0)
-    # All that differs happens in the first tenth.
+    # The curves differ in the first tenth of the episodes.
     axes.set_xscale("log")
     axes.set_xlim(window, samples.shape[1])
     axes.xaxis.set_major_formatter("{x:g}")

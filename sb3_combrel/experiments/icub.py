@@ -1,4 +1,4 @@
-"""Pictures of the iCub striking the ball: learn a task by Fitted R-Max, then draw what was learnt.
+"""Pictures of the iCub striking the ball: learn a task by Fitted R-Max, then film what was learnt.
 
 Run as ``python -m sb3_combrel.experiments.icub``.
 """
@@ -17,9 +17,9 @@ from sb3_combrel import FittedRMax
 from sb3_combrel.experiments.video import greedy_episode, write_video
 
 TASK_IDS = {"torso": "combrel/ICubTorsoStrike-v0", "arm": "combrel/ICubArmStrike-v0"}
-#: Episodes after which a task is learnt, with some to spare.
+#: More episodes than it takes to learn a task.
 N_EPISODES = {"torso": 40, "arm": 80}
-#: What the return cannot exceed: a hit by the first command brings 99.
+#: What the return cannot exceed: a hit by the first command returns 99.
 MAX_VALUE = 100.0
 
 #: As long as the commands take: the film runs in real time.
@@ -95,7 +95,7 @@ def write_pictures(task: str, look: str, output: Path, n_episodes: int | None = 
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description="Learn the iCub's ball-striking tasks and film what was learnt.")
     parser.add_argument("--task", choices=[*TASK_IDS, "both"], default="both")
     parser.add_argument("--look", choices=["primitives", "meshes"], default="meshes")

@@ -1,4 +1,4 @@
-"""What mappings COMBREL has used, from the files that runs leave: Table 4 of the paper, and its most frequent mapping."""
+"""The mappings that COMBREL used, from the files of its runs: Table 4 of the paper, and the most frequent mapping."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STATE_MAPPINGS_SHOWN = 10
 
 
 class Use(NamedTuple):
-    """What stood for a target action: a source action, seen through a state mapping in words (``target<-source, ...``)."""
+    """A target action, the source action it was mapped to, and the state mapping as text (``target<-source, ...``)."""
 
     target_action: str
     source_action: str
@@ -23,7 +23,7 @@ class Use(NamedTuple):
 
 def uses_of(runs: Iterable[Run], method: str) -> Counter[Use]:
     """
-    How often each mapping supplied instances to a decision, over all runs of a method.
+    Count how often each mapping's instances were used in a step, over all runs of a method.
 
     :param runs: the experiment's runs
     :param method: name of the method
@@ -31,8 +31,8 @@ def uses_of(runs: Iterable[Run], method: str) -> Counter[Use]:
     uses: Counter[Use] = Counter()
     for run in runs:
         if run.method == method:
-            for words, count in run.mapping_counts().items():
-                actions, state_mapping = words.split(" with ")
+            for name, count in run.mapping_counts().items():
+                actions, state_mapping = name.split(" with ")
                 target, source = actions.split("<-", 1)
                 uses[Use(target, source, state_mapping)] += count
     return uses
@@ -40,7 +40,7 @@ def uses_of(runs: Iterable[Run], method: str) -> Counter[Use]:
 
 def action_table(uses: Mapping[Use, int], method: str, source_actions: Sequence[str], target_actions: Sequence[str]) -> Table:
     """
-    The share that each source action has in the transfers of each target action (the paper's Table 4, action by action).
+    Make a table of each source action's share in the transfers of each target action (the paper's Table 4, by action).
 
     :param uses: see :func:`uses_of`
     """
@@ -54,12 +54,12 @@ def action_table(uses: Mapping[Use, int], method: str, source_actions: Sequence[
         shares = [f"{count[source, target] / total[target]:.1%}" if total[target] else "-" for target in target_actions]
         rows.append((source, *shares))
     rows.append(("transfers", *(f"{total[target]:,}" for target in target_actions)))
-    return Table(f"Source action that stood for each target action, {method}", ("source action", *target_actions), rows)
+    return Table(f"Source action to which each target action was mapped, {method}", ("source action", *target_actions), rows)
 
 
 def state_table(uses: Mapping[Use, int], method: str) -> Table:
     """
-    The state mappings used most.
+    Make a table of the state mappings used most.
 
     :param uses: see :func:`uses_of`
     """
@@ -79,7 +79,7 @@ def most_frequent_mapping(
     target_actions: Sequence[str],
 ) -> InterTaskMapping:
     """
-    The state mapping used most, with the source action that most often stood for each target action under it.
+    Find the state mapping used most, with the source action to which each target action was mapped most often with it.
 
     :param uses: see :func:`uses_of`
     :raises ValueError: if there are no uses
@@ -89,15 +89,15 @@ def most_frequent_mapping(
     states: Counter[str] = Counter()
     for use, n in uses.items():
         states[use.state_mapping] += n
-    ((words, _),) = states.most_common(1)
+    ((variables, _),) = states.most_common(1)
     action = []
     for target in target_actions:
-        with_these = Counter({source: uses.get(Use(target, source, words), 0) for source in source_actions})
+        with_these = Counter({source: uses.get(Use(target, source, variables), 0) for source in source_actions})
         if not with_these.total():
-            # Never seen so; what stood for it under any state mapping is the next best.
+            # Never used with this state mapping: count over all state mappings.
             with_these.update({u.source_action: n for u, n in uses.items() if u.target_action == target})
         action.append(source_actions.index(with_these.most_common(1)[0][0]))
-    pairs = dict(pair.split("<-", 1) for pair in words.split(", "))
+    pairs = dict(pair.split("<-", 1) for pair in variables.split(", "))
     state = [source_variables.index(pairs[name].strip("()-")) if name in pairs else None for name in target_variables]
     sign = [-1 if pairs.get(name, "").startswith("(-") else 1 for name in target_variables]
     return InterTaskMapping(state=tuple(state), action=tuple(action), sign=tuple(sign))

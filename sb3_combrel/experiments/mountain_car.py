@@ -18,9 +18,9 @@ NO_TRANSFER = "no transfer"
 
 def intuitive_mapping() -> list[InterTaskMapping]:
     """
-    The mapping that a person would choose, one for each action of the target.
+    Return the mapping that a person would choose, one for each action of the target.
 
-    Neutral, West and East are seen along x, South and North along y; each time the other axis is left alone.
+    With Neutral, West and East the variables of x are mapped, with South and North those of y; the others are left unmapped.
     """
     to_source_action = (0, 1, 2, 1, 2)
     along_x = InterTaskMapping(state=(0, None, 1, None), action=to_source_action)
@@ -30,7 +30,7 @@ def intuitive_mapping() -> list[InterTaskMapping]:
 
 def methods(source: SourceInstances) -> dict[str, Transfer | None]:
     """
-    What is compared, by name.
+    Make the transfer methods that are compared, by name.
 
     :param source: instances of the source task
     """

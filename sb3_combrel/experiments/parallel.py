@@ -1,4 +1,4 @@
-"""Several learning runs at once, with a display of how far they are."""
+"""Several learning runs at once, with a display of their progress."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sb3_combrel.experiments.runs import Run, carry_out
 
-SECONDS_BETWEEN_LOOKS = 0.5
+UPDATE_SECONDS = 0.5
 
 
 def carry_out_all(runs: Sequence[Run], workers: int, console: Console) -> None:
@@ -31,14 +31,14 @@ def carry_out_all(runs: Sequence[Run], workers: int, console: Console) -> None:
     with _progress_of(runs, console), parallel_config(backend="loky", inner_max_num_threads=1):
         jobs = (delayed(carry_out)(run) for run in missing)
         for run in Parallel(n_jobs=workers, return_as="generator_unordered")(jobs):
-            # Where no bars can be drawn, as in a log file, lines take their place.
+            # Where no bars can be drawn, as in a log file, print lines.
             if not console.is_terminal:
                 console.print(f"  {run.method}, seed {run.seed}: {run.steps().sum():,} steps in {run.n_episodes} episodes")
 
 
 @contextmanager
 def _progress_of(runs: Sequence[Run], console: Console) -> Iterator[None]:
-    """One bar for each method, read off the files that the runs write."""
+    """Show one bar for each method, from the files that the runs write."""
     columns = (
         TextColumn("{task.description:<12}"),
         BarColumn(),
@@ -55,7 +55,7 @@ def _progress_of(runs: Sequence[Run], console: Console) -> Iterator[None]:
             for method, its_runs in by_method.items()
         }
 
-        def look() -> None:
+        def update() -> None:
             for method, its_runs in by_method.items():
                 steps = [run.steps() for run in its_runs]
                 n_episodes, n_steps = sum(map(len, steps)), sum(int(s.sum()) for s in steps)
@@ -63,15 +63,15 @@ def _progress_of(runs: Sequence[Run], console: Console) -> Iterator[None]:
 
         over = threading.Event()
 
-        def keep_looking() -> None:
-            while not over.wait(SECONDS_BETWEEN_LOOKS):
-                look()
+        def keep_updating() -> None:
+            while not over.wait(UPDATE_SECONDS):
+                update()
 
-        watcher = threading.Thread(target=keep_looking, daemon=True)
+        watcher = threading.Thread(target=keep_updating, daemon=True)
         watcher.start()
         try:
             yield
         finally:
             over.set()
             watcher.join()
-            look()
+            update()

@@ -25,7 +25,7 @@ class Table(NamedTuple):
     rows: Sequence[tuple[str, ...]]
 
     def for_terminal(self) -> RichTable:
-        """The table as Rich shows it."""
+        """Return the table for Rich to print."""
         table = RichTable(title=self.title, title_justify="left")
         for number, name in enumerate(self.header):
             table.add_column(name, justify="left" if number == 0 else "right")
@@ -34,14 +34,14 @@ class Table(NamedTuple):
         return table
 
     def as_markdown(self) -> str:
-        """The table in GitHub's Markdown."""
+        """Return the table in GitHub's Markdown."""
         lines = [self.header, ("---", *["---:"] * (len(self.header) - 1)), *self.rows]
         return f"**{self.title}**\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def episodes_table(steps: Mapping[str, np.ndarray]) -> Table:
     """
-    Steps of each episode and of all, mean of the runs and half the width of its 95% confidence interval.
+    Make a table of the steps of each episode and of all, mean of the runs and half the width of its 95% confidence interval.
 
     :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
     """
@@ -57,7 +57,7 @@ def episodes_table(steps: Mapping[str, np.ndarray]) -> Table:
 
 def savings_table(steps: Mapping[str, np.ndarray], baseline: str) -> Table:
     """
-    Steps saved over all episodes.
+    Make a table of the steps saved over all episodes.
 
     :param steps: as above
     :param baseline: the method that the others are compared with
@@ -75,7 +75,7 @@ def savings_table(steps: Mapping[str, np.ndarray], baseline: str) -> Table:
 
 def mappings_table(runs: Iterable[Run], method: str) -> Table:
     """
-    The mappings that a method used most, over all its runs.
+    Make a table of the mappings that a method used most, over all its runs.
 
     :param runs: the experiment's runs
     :param method: name of the method

@@ -1,4 +1,4 @@
-"""One learning run: an agent that learns a task for a number of episodes, and leaves its results in files as it goes."""
+"""One learning run: an agent that learns a task for a number of episodes, and writes its results to files meanwhile."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class EpisodeLog(BaseCallback):
         csv.writer(self._file).writerow(COLUMNS)
 
     def _on_step(self) -> bool:
-        # One step late: the algorithm plans and logs at the end of an episode only after it has asked the callbacks.
+        # One step later: the algorithm plans and logs at the end of an episode only after it has asked the callbacks.
         if self._n_done >= self.n_episodes:
             return False
         for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
@@ -141,9 +141,9 @@ class EpisodeLog(BaseCallback):
 
 def carry_out(run: Run) -> Run:
     """
-    Learn, unless that was done before, and leave episodes, mappings used, model and TensorBoard logs in the run's folder.
+    Learn, unless that was done before, and write episodes, mappings used, model and TensorBoard logs to the run's folder.
 
-    A run that was stopped begins again from its seed: only then are its results those of an undisturbed one.
+    A run that was stopped is repeated from the start, so that its results are those of a run without a stop.
 
     :return: the run
     """
@@ -157,12 +157,12 @@ def carry_out(run: Run) -> Run:
             model = FittedRMax(
                 env, transfer=run.transfer, seed=run.seed, tensorboard_log=str(run.tensorboard_folder), **run.learner
             )
-        most_steps = run.n_episodes * run.max_episode_steps
-        model.learn(most_steps, EpisodeLog(run.episodes_file, run.n_episodes), log_interval=1, tb_log_name=run.name)
+        max_steps = run.n_episodes * run.max_episode_steps
+        model.learn(max_steps, EpisodeLog(run.episodes_file, run.n_episodes), log_interval=1, tb_log_name=run.name)
     finally:
         env.close()
-    if model.policy.transfer is not None:
-        _write_mappings(run.mappings_file, model.policy.transfer)
+    if model.agent.transfer is not None:
+        _write_mappings(run.mappings_file, model.agent.transfer)
     unfinished = run.model_file.with_suffix(".part")
     model.save(unfinished)
     os.replace(unfinished, run.model_file)
@@ -171,9 +171,9 @@ def carry_out(run: Run) -> Run:
 
 @contextlib.contextmanager
 def coarse_on_purpose() -> Iterator[None]:
-    """Keep quiet about a coarse grid: an experiment has chosen it, and would be told once for every run."""
+    """Suppress the warning of a coarse grid, which an experiment has chosen and which would come once for every run."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="resolution=")
+        warnings.filterwarnings("ignore", message="resolution=.* is coarse")
         yield
 
 

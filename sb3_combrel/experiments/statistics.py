@@ -1,4 +1,4 @@
-"""Means of several runs with confidence intervals, and what a method saves, by SciPy."""
+"""Means of several runs with confidence intervals, and the steps that a method saves, by SciPy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Saving(NamedTuple):
     :param steps: difference of the means
     :param low: lower bound of its 95% confidence interval, NaN with fewer than two runs of each
     :param high: upper bound
-    :param share: the difference as part of the other's mean
+    :param share: the difference as a fraction of the other's mean
     :param p_value: of Welch's t-test that both need equally many steps
     """
 
@@ -38,7 +38,7 @@ class Saving(NamedTuple):
 
 def mean_of_runs(samples: np.ndarray) -> Estimate:
     """
-    Mean over runs, with the interval of Student's t.
+    Compute the mean over runs, with the interval of Student's t.
 
     :param samples: one run a row, shape (n_runs, ...)
     """
@@ -52,7 +52,7 @@ def mean_of_runs(samples: np.ndarray) -> Estimate:
 
 def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
     """
-    What transfer saves, by Welch's t-test: the runs are independent and their variances differ.
+    Compute what transfer saves, by Welch's t-test: the runs are independent and their variances differ.
 
     :param without: steps of each run without transfer, shape (n_runs,)
     :param with_transfer: steps of each run with transfer, shape (n_runs,)
@@ -70,7 +70,7 @@ def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
 
 def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
     """
-    Episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
+    Count the episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
 
     :param steps: steps of each episode, shape (n_runs, n_episodes)
     """
@@ -83,7 +83,7 @@ def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.nd
 
 def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
     """
-    Environment steps of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
+    Count the steps of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
 
     :param steps: steps of each episode, shape (n_runs, n_episodes)
     """

@@ -39,8 +39,8 @@ def film(
     :param env: an environment with ``render_mode="rgb_array"``; it is left open
     :param path: MP4 file to write
     :param seed: seed of the episode
-    :param every: steps between two frames, for software rendering takes its time
-    :param most_steps: where the film ends if the episode doesn't
+    :param every: steps between two frames, as software rendering is slow
+    :param most_steps: steps after which the film ends if the episode does not
     :raises combrel_envs.RenderingError: if OpenGL is missing
     """
     frames = []
@@ -54,7 +54,7 @@ def film(
 
 def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> None:
     """
-    Write frames as an MP4 file that appears complete or not at all.
+    Write frames as an MP4 file, completely or not at all.
 
     :param frames: arrays of shape (height, width, 3), uint8
     :param path: file to write

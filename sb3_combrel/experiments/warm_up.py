@@ -1,4 +1,4 @@
-"""Compile the inner loops once, before several processes would each do it: ``python -m sb3_combrel.experiments.warm_up``."""
+"""Compile the inner loops once for all processes: ``python -m sb3_combrel.experiments.warm_up``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 
 def warm_up(relevance: bool = False) -> None:
     """
-    Learn for a moment with each method; Numba keeps what it compiles in its cache.
+    Learn a few steps with each method; Numba stores what it compiles in its cache.
 
     :param relevance: also compile what only the variants with relevance use
     """

@@ -1,4 +1,4 @@
-"""What an evaluation remembers of its episode: where it has been, and whether what the model promises comes true."""
+"""What an evaluation stores of its episode, so as to notice that it is caught in a loop."""
 
 from __future__ import annotations
 
@@ -7,36 +7,34 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.instances import InstanceArrays
-from sb3_combrel.common.transferred import Supply
-from sb3_combrel.planning.corrections import CELL_OFFSET, CELLS_PER_GRID_CELL, PATIENCE
+from sb3_combrel.planning.corrections import CELL_OFFSET, CELLS_PER_GRID_CELL, MAX_VISITS
 from sb3_combrel.planning.grid import StateGrid
-from sb3_combrel.planning.q_values import QueryScratch
 
-# Ways to act, in the order in which they are tried, over and over: without optimism; known actions first, but with
+# How actions are chosen, in the order in which it is tried, over and over: without optimism; known actions first, but with
 # optimistic values of where they lead; as in learning.
-TRUSTING, HOPEFUL, TRYING = range(3)
+EXPLOIT, OPTIMISTIC, EXPLORE = range(3)
 
 
 class EpisodeMemory:
-    """Notices that an evaluation goes round in circles, and says how to act then.
+    """
+    Notices that an evaluation is caught in a loop, and changes how actions are chosen.
 
-    Where data are few a model may promise progress that doesn't come. Learning would find out; a policy that learns no
-    more would try the same for ever. While a model is right, values rise on the way by what is *hoped* for with each step,
-    (1 - gamma) Q - reward. An agent that is in the same small cell more than ``PATIENCE`` times, and whose value has not
-    risen by half of what was hoped for since the first of them, hopes in vain: it tries the next way to act. Where it is
-    good to stay, as with a pole in balance, nothing is hoped for.
+    Where data are few a model may predict progress that does not happen. Learning would find out; a policy that learns no
+    more would repeat the same for ever. While a model is right, values rise along the way by what is *expected* with each
+    step, (1 - gamma) Q - reward. An agent is caught in a loop when it is in the same small cell more than ``MAX_VISITS``
+    times, and its value has not risen by half of what was expected since the first of them: then actions are chosen in
+    the next manner. Where it is good to stay, as with a pole in balance, no rise is expected.
     """
 
     def __init__(self) -> None:
-        self._n_doubts = 0
+        self._n_loops = 0
         self._seen: dict[Hashable, tuple[int, tuple[float, float, float]]] = {}
-        self._hoped = self._at_stake = 0.0
+        self._expected = self._at_stake = 0.0
 
     @property
     def mode(self) -> int:
-        """How to act: TRUSTING, HOPEFUL or TRYING."""
-        return self._n_doubts % 3
+        """How actions are to be chosen: EXPLOIT, OPTIMISTIC or EXPLORE."""
+        return self._n_loops % 3
 
     def note(self, cell: Hashable, value: float, reward: float, gamma: float) -> None:
         """
@@ -46,48 +44,36 @@ class EpisodeMemory:
         :param value: Q of the chosen action
         :param reward: what the model predicts of it
         """
-        visits, before = self._seen.get(cell, (0, (value, self._hoped, self._at_stake)))
+        visits, before = self._seen.get(cell, (0, (value, self._expected, self._at_stake)))
         self._seen[cell] = visits + 1, before
-        if visits >= PATIENCE and (self.mode != TRUSTING or self._in_vain(value, *before)):
-            self._n_doubts += 1
+        if visits >= MAX_VISITS and (self.mode != EXPLOIT or self._no_progress(value, *before)):
+            self._n_loops += 1
             self._seen.clear()
-        self._hoped += (1.0 - gamma) * value - reward
+        self._expected += (1.0 - gamma) * value - reward
         self._at_stake += (1.0 - gamma) * abs(value) + abs(reward)
 
-    def _in_vain(self, value: float, value_before: float, hoped_before: float, at_stake_before: float) -> bool:
+    def _no_progress(self, value: float, value_before: float, expected_before: float, at_stake_before: float) -> bool:
         """Whether the value should have risen since an earlier visit, and has not by half of it."""
-        hoped = self._hoped - hoped_before
-        # Where it is good to stay the two parts of what is hoped for cancel out, but for errors.
-        return hoped > 0.5 * (self._at_stake - at_stake_before) and value - value_before < 0.5 * hoped
+        expected = self._expected - expected_before
+        # Where it is good to stay the two parts of what is expected cancel out, but for errors.
+        return expected > 0.5 * (self._at_stake - at_stake_before) and value - value_before < 0.5 * expected
 
 
 def memories(state: Sequence[Any] | None, episode_start: np.ndarray | None, n: int) -> list[EpisodeMemory]:
     """
-    The memories of ``n`` episodes: those that ``predict`` returned as its state, new ones where an episode begins.
+    Read the memories of ``n`` episodes from what ``predict`` returned as its state; new ones where an episode begins.
 
     :raises ValueError: if ``state`` is something else
     """
     if state is None:
         return [EpisodeMemory() for _ in range(n)]
-    held = list(state[0]) if len(state) == 1 else []
-    if len(held) != n or not all(isinstance(memory, EpisodeMemory) for memory in held):
+    given = list(state[0]) if len(state) == 1 else []
+    if len(given) != n or not all(isinstance(memory, EpisodeMemory) for memory in given):
         raise ValueError(f"state must be None or what predict returned for {n} observation(s), got {state!r}")
     begins = np.zeros(n, dtype=np.bool_) if episode_start is None else np.broadcast_to(episode_start, n)
-    return [EpisodeMemory() if new else memory for memory, new in zip(held, begins, strict=True)]
+    return [EpisodeMemory() if new else memory for memory, new in zip(given, begins, strict=True)]
 
 
 def small_cell(state: np.ndarray, grid: StateGrid) -> Hashable:
     """The small cell around a state (unit coordinates), of the size of those of the corrections."""
     return (state * grid.arrays.cells * CELLS_PER_GRID_CELL + CELL_OFFSET).astype(np.int64).tobytes()
-
-
-def predicted_reward(action: int, instances: InstanceArrays, query: QueryScratch, supply: Supply, threshold: float) -> float:
-    """What the instances in ``query``, and those of ``supply`` if they are needed, predict for an action; 0 without any."""
-    n, total = query.length[action], query.total[action]
-    reward = query.weight[action, :n] @ instances.reward[action, query.index[action, :n]]
-    if total < threshold:
-        n_supplied = supply.count[action]
-        weights = supply.weight[action, :n_supplied]
-        total += weights.sum()
-        reward += weights @ supply.reward[action, :n_supplied]
-    return float(reward / total) if total > 0.0 else 0.0

@@ -1,60 +1,73 @@
-"""The policy of Fitted R-Max: Q at a state, the greedy action, and how it learns."""
+"""The policy of Fitted R-Max: the agent behind Stable-Baselines3's ``predict`` and ``state_dict``."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from time import perf_counter
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_combrel.common.compiled import SameTypes
+from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
-from sb3_combrel.common.transferred import Supply
-from sb3_combrel.fitted_rmax.loop_detection import (
-    HOPEFUL,
-    TRUSTING,
-    TRYING,
-    EpisodeMemory,
-    memories,
-    predicted_reward,
-    small_cell,
-)
-from sb3_combrel.fitted_rmax.restorable_policy import RestorablePolicy
-from sb3_combrel.models.kernel_average import NO_PAIRS, KernelModel
-from sb3_combrel.planning.corrections import PATIENCE, CorrectionArrays
-from sb3_combrel.planning.grid import StateGrid, fitting_grid
-from sb3_combrel.planning.q_values import QueryScratch, choose, find_near
-from sb3_combrel.planning.sweeping import NOWHERE, Planner
-from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.common.task import Task
+from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
+from sb3_combrel.fitted_rmax.loop_detection import EpisodeMemory, memories
+from sb3_combrel.fitted_rmax.saving import misfit
+from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.models.base import Model
+from sb3_combrel.models.kernel_average import KernelAverage
+from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
 
-# Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
-# enough that one hopeless grid point does not drown its neighbours' interpolated values for long.
-LONGEST_PLAN = 10_000
+_scale_into_box = EntryPoint(scale_into_box)
 
-# By default so many corners of grid cells are looked at in a step: a backup costs as much as a cell has corners.
-CORNERS_A_STEP = 400
-# Backups in multiples of max_backups, passes over the grid, and backups for each pair that transfer has changed.
-AT_EPISODE_END = 400
-BEFORE_THE_FIRST_STEP = 300
-BACKUPS_PER_RENEWED_PAIR = 2
-NOBODY = (-1, 0.0, 0)
+# What was the policy's in version 0.1.0, and where it is in the agent; the old names work for one version.
+MOVED_TO_AGENT = {
+    "model": "model",
+    "planner": "planner",
+    "corrections": "corrections",
+    "q_values": "q_values",
+    "statistics": "statistics",
+    "end_episode": "end_episode",
+    "prepare": "prepare",
+    "rng": "rng",
+    "n_truncated": "n_truncated",
+    "max_backups": "max_backups",
+    "n_actions": "task.n_actions",
+    "state_names": "task.state_names",
+    "action_names": "task.action_names",
+}
 
 
-class FittedRMaxPolicy(RestorablePolicy):
+def _check_names(state_names: Any, action_names: Any, observation_space: spaces.Space, action_space: spaces.Discrete) -> None:
+    shape = observation_space.shape or (0,)
+    for argument, names, n in (("state_names", state_names, shape[0]), ("action_names", action_names, int(action_space.n))):
+        is_list = isinstance(names, Sequence) and not isinstance(names, str)
+        if names is not None and not (is_list and len(names) in (0, n) and all(isinstance(name, str) for name in names)):
+            raise ValueError(f"{argument} must be {n} names or None, got {names!r}")
+
+
+class FittedRMaxPolicy(BasePolicy):
     """
-    Acts greedily on the action values of a kernel model (see :class:`FittedRMax` for the parameters).
+    Acts on the action values of a :class:`~sb3_combrel.fitted_rmax.agent.FittedRMaxAgent`, :attr:`agent`.
+
+    Its ``state_dict`` consists of float64 tensors made from :meth:`FittedRMaxAgent.get_state`; all else is rebuilt from these.
 
     :param observation_space: a one-dimensional Box
     :param action_space: Discrete
     :param lr_schedule: not used; SB3 passes one to every policy
-    :param transfer: a transfer method of the policy's own, bound here; or what a file has of one
-    :param rng: source of all chance (ties, transfer)
+    :param transfer: a transfer method of the policy's own; or what a file has of one
+    :param model_class: the model of the dynamics
+    :param state_names: names of the state variables, for display
+    :param action_names: names of the actions, for display
+    :param rng: generator of all random numbers of learning
+    :param settings: arguments of :class:`FittedRMaxSettings`
     """
 
     def __init__(
@@ -63,110 +76,57 @@ class FittedRMaxPolicy(RestorablePolicy):
         action_space: spaces.Discrete,
         lr_schedule: Schedule | None = None,
         *,
-        model_breadth: float = 1 / 16,
-        min_fraction: float = 0.01,
-        min_weight: float = 0.01,
-        exploration_threshold: float = 1.0,
-        resolution: int | Sequence[int] | None = None,
-        max_value: float = 0.0,
-        gamma: float = 1.0,
-        planning_tolerance: float = 0.001,
-        max_backups: int | None = None,
-        max_instances: int | None = 20_000,
-        bounds: tuple[Any, Any] | None = None,
         transfer: Transfer | dict[str, Any] | None = None,
+        model_class: type[Model] = KernelAverage,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         rng: np.random.Generator | None = None,
+        **settings: Any,
     ):
         super().__init__(observation_space, action_space, normalize_images=False)
-        self.kernel = (float(model_breadth), float(min_weight), float(min_fraction))
-        self.gamma = float(gamma)
-        self.n_truncated = 0
-        self.transfer: Transfer | None = restore_transfer(transfer)
-        self.rng = np.random.default_rng() if rng is None else rng
-        self.scaling = StateScaling.from_space(observation_space, bounds)
-        self.max_backups = max(1, CORNERS_A_STEP // 2**self.scaling.n_variables) if max_backups is None else max_backups
+        _check_names(state_names, action_names, observation_space, action_space)
+        if not (isinstance(model_class, type) and issubclass(model_class, Model)):
+            raise ValueError(f"model_class must be a subclass of Model, got {model_class!r}")
+        given = FittedRMaxSettings(**settings)
+        self.scaling = StateScaling.from_space(observation_space, given.bounds)
+        task = Task(self.scaling, int(action_space.n), state_names or (), action_names or ())
+        self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
         self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
-        self._scale_into_box = SameTypes(scale_into_box)
-        self._find_near, self._choose = SameTypes(find_near), SameTypes(choose)
-        self._flat = (-1, self.scaling.n_variables)
-        self.n_actions = int(action_space.n)
         self._first_action = int(action_space.start)
-        self._constructor_parameters = dict(
-            model_breadth=model_breadth,
-            min_fraction=min_fraction,
-            min_weight=min_weight,
-            exploration_threshold=exploration_threshold,
-            resolution=resolution,
-            max_value=max_value,
-            gamma=gamma,
-            planning_tolerance=planning_tolerance,
-            max_backups=max_backups,
-            max_instances=max_instances,
-            bounds=bounds,
-        )
-        grid = fitting_grid(self.scaling.n_variables, self.n_actions, resolution, model_breadth, min_weight)
-        self.state_names = tuple(state_names or (f"s{k}" for k in range(grid.n_variables)))
-        self.action_names = tuple(action_names or (f"a{k}" for k in range(self.n_actions)))
-        if self.transfer is not None:
-            self._task = self._target_task(grid, exploration_threshold)
-            self.transfer.bind(self._task, self.rng)
-        self.model = KernelModel(
-            grid,
-            self.n_actions,
-            model_breadth=model_breadth,
-            min_weight=min_weight,
-            min_fraction=min_fraction,
-            exploration_threshold=exploration_threshold,
-            gamma=gamma,
-            transfer=self.transfer,
-            max_instances=max_instances,
-        )
-        self.planner = Planner(
-            self.model, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=planning_tolerance
-        )
-        if self.transfer is not None:
-            self._widen(self.transfer.lowest_reward())
-        self.corrections = CorrectionArrays.empty(grid.n_variables)
-        self._query = QueryScratch.empty(self.n_actions, grid.n_variables, self.model.list_room)
-        self._no_supply = self._supply = Supply.empty(self.n_actions, grid.n_variables)
-        self._q = np.empty(self.n_actions)
-        self._handed_on: tuple[Any, Any] = (None, None)
-        self._episodes: list[EpisodeMemory] = []
-        self._unsettled: list[np.ndarray] = []
+        self._settings = settings
+        self._episodes: tuple[Any, Any] = (None, None)
         self._warned_outside = False
-        self.timed, self.reporting = False, True
-        self.planning_seconds = 0.0
 
-    def _target_task(self, grid: StateGrid, exploration_threshold: float) -> TargetTask:
-        return TargetTask(
-            scaling=self.scaling,
-            n_actions=self.n_actions,
-            sample_states=grid.points(),
-            exploration_threshold=float(exploration_threshold),
-            min_weight=self.kernel[1],
-            min_fraction=self.kernel[2],
-            state_names=self.state_names,
-            action_names=self.action_names,
-        )
+    def __getattr__(self, name: str) -> Any:
+        # Called only for what is not there otherwise.
+        if name not in MOVED_TO_AGENT or "agent" not in self.__dict__:
+            return super().__getattr__(name)
+        path = MOVED_TO_AGENT[name]
+        warnings.warn(f"policy.{name} has moved to policy.agent.{path}", DeprecationWarning, stacklevel=2)
+        return attrgetter(path)(self.agent)
+
+    @property
+    def transfer(self) -> Transfer | None:
+        """The transfer method, bound to the task; None if there is none."""
+        return self.agent.transfer
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
-        return {**spaces_of_both, **self._constructor_parameters, "transfer": describe_transfer(self.transfer)}
-
-    # ------------------------------------------------------------------ acting
+        parameters = {**spaces_of_both, **self._settings, "transfer": describe_transfer(self.transfer)}
+        # A class is pickled by its name, and imported by who reads it: only one of the user's own has to be.
+        return parameters if self.agent.model_class is KernelAverage else {**parameters, "model_class": self.agent.model_class}
 
     def to_unit(self, observations: np.ndarray) -> np.ndarray:
         """
-        Unit coordinates of observations; what lies outside the bounds is moved to the boundary, with one warning.
+        Scale observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
 
         :param observations: raw units, shape (..., n_variables)
         :raises ValueError: if an observation is not finite
         """
-        raw = np.asarray(observations, dtype=np.float64)
+        raw = np.ascontiguousarray(observations, dtype=np.float64)
         inside = np.empty_like(raw)
-        if self._scale_into_box(raw.reshape(self._flat), self._low, self._range, inside.reshape(self._flat)):
+        flat = (-1, self.scaling.n_variables)
+        if _scale_into_box.call(raw.reshape(flat), self._low, self._range, inside.reshape(flat)):
             self._check_outside(observations, self.scaling.to_unit(raw) - inside)
         return inside
 
@@ -182,83 +142,6 @@ class FittedRMaxPolicy(RestorablePolicy):
                 stacklevel=3,
             )
 
-    def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
-        """
-        Action values at an exact state; optimistic actions have ``max_value``.
-
-        :param state: unit coordinates, shape (n_variables,)
-        :param values: at the grid points; by default the planner's, optimistic ones
-        :return: shape (n_actions,)
-        """
-        exact = np.ascontiguousarray(state, dtype=np.float64)
-        self._choose_at(exact, self.planner.values if values is None else values, NOBODY)
-        return self._q.copy()
-
-    def _choose_at(self, state: np.ndarray, values: np.ndarray, visitor: tuple[int, float, int]) -> int:
-        """Work out ``_q`` at a state, and note a visit there (see ``choose``); the best action, -1 if several are."""
-        model = self.model
-        least = self._find_near(model.instances, state, self.kernel, self._query)
-        supply = self._no_supply
-        if self.transfer is not None and least < model.exploration_threshold:
-            supply = self.transfer.supply_at(state, self._query.total)
-            supply.check(self.n_actions, len(state), self.transfer)
-        # For whoever asks what stands behind ``_q``.
-        self._supply = supply
-        best: int = self._choose(
-            model.instances,
-            state,
-            model.exploration_threshold,
-            self.gamma,
-            values,
-            self.corrections,
-            model.grid.arrays,
-            self.planner.bounds,
-            supply,
-            self._query,
-            self._q,
-            visitor,
-        )
-        return best
-
-    def explore(self, state: np.ndarray, episode: int) -> int:
-        """
-        The action to learn from: greedy, ties broken at random, so optimistic actions come first.
-
-        :param state: unit coordinates, shape (n_variables,)
-        :param episode: a number that tells the episodes of all environments apart
-        :return: action, from 0 on
-        """
-        if self.corrections.count[0] == len(self.corrections.key):
-            self.corrections = self.corrections.with_room()
-        best = self._choose_at(state, self.planner.values, (episode, 5 * self.planner.tolerance, PATIENCE))
-        if best >= 0:
-            return best
-        ties = np.flatnonzero(self._q == self._q.max())
-        return int(ties[self.rng.integers(len(ties))])
-
-    def exploit(self, state: np.ndarray, episode: EpisodeMemory | None = None) -> int:
-        """
-        The best action of those that are known; where none is, of those that have a model, from transferred instances.
-
-        An evaluation must not depend on trying things out, and what a wrong mapping promises it would try for ever.
-
-        :param state: unit coordinates, shape (n_variables,)
-        :param episode: what is remembered of the episode so far; where it goes round in circles, things are tried out
-        """
-        mode = TRUSTING if episode is None else episode.mode
-        q = self.q_values(state, self.planner.exploitation_values() if mode == TRUSTING else None)
-        eligible = self._query.total >= self.model.exploration_threshold
-        if not eligible.any():
-            eligible = self._supply.count[: self.n_actions] > 0
-        if mode == TRYING or (mode == HOPEFUL and not eligible.any()):
-            eligible = np.ones(self.n_actions, dtype=np.bool_)
-        action = int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
-        if episode is not None:
-            of_model = self.model.instances, self._query, self._supply, self.model.exploration_threshold
-            reward = predicted_reward(action, *of_model)
-            episode.note(small_cell(state, self.model.grid), float(q[action]), reward, self.gamma)
-        return action
-
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
 
@@ -270,123 +153,86 @@ class FittedRMaxPolicy(RestorablePolicy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Actions for observations.
+        Choose actions for observations.
 
         :param observation: one, or a batch of them
-        :param state: what the last call returned, of the same environments. Who hands it on, as ``evaluate_policy`` and
-            RL-Zoo do, gets a deterministic policy that notices when it goes round in circles; who doesn't, one that
-            depends on the observation alone.
+        :param state: what the last call returned, of the same environments. With it, as in ``evaluate_policy`` and
+            RL-Zoo, a deterministic policy notices when it is caught in a loop; without, actions depend on the observation
+            alone.
         :param episode_start: bool, one for each observation: whether an episode begins with it
         :param deterministic: the best known action; otherwise optimistic actions first, as in learning
         :return: actions, and the state for the next call (None if not deterministic)
         :raises ValueError: if ``state`` is not what a call for as many observations returned
         """
-        self._handed_on = (state, episode_start)
-        try:
+        if state is None or not deterministic:
+            # With no state given there may be none in the next call either: what costs time begins with the next call.
             actions, _ = super().predict(observation, None, None, deterministic)
-        finally:
-            self._handed_on = (None, None)
-        return actions, (np.array(self._episodes, dtype=object),) if deterministic else None
+            episodes = memories(None, None, np.size(actions))
+        else:
+            tensor, vectorized = self.obs_to_tensor(observation)
+            episodes = memories(state, episode_start, len(tensor))  # type: ignore[arg-type]
+            actions = self._act(tensor, episodes)  # type: ignore[arg-type]
+            actions = actions if vectorized else actions.squeeze(axis=0)
+        if not deterministic:
+            return actions, None
+        next_state = np.empty(len(episodes), dtype=object)
+        next_state[:] = episodes
+        return actions, (next_state,)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        states = self.to_unit(np.asarray(observation.cpu().numpy(), dtype=np.float64))  # type: ignore[union-attr]
-        if deterministic:
-            self._episodes = memories(*self._handed_on, len(states))
-            # With no state handed on there may be nobody who will: what costs time begins with the next call.
-            remembered = self._episodes if self._handed_on[0] is not None else [None] * len(states)
-            actions = list(map(self.exploit, states, remembered))
+        n = len(observation)
+        actions = self._act(observation, [None] * n) if deterministic else self._act(observation, None)  # type: ignore[arg-type]
+        return th.as_tensor(actions, device=observation.device)  # type: ignore[union-attr]
+
+    def _act(self, observation: th.Tensor, episodes: Sequence[EpisodeMemory | None] | None) -> np.ndarray:
+        """Deterministic actions, with the memories of episodes; or sampled ones, without."""
+        states = self.to_unit(observation.cpu().numpy())
+        if episodes is None:
+            chosen = [self.agent.sample_action(state) for state in states]
         else:
-            actions = [self._sample(state) for state in states]
-        return th.as_tensor(np.array(actions) + self._first_action, device=observation.device)  # type: ignore[union-attr]
+            chosen = [
+                self.agent.act(state, explore=False, memory=memory) for state, memory in zip(states, episodes, strict=True)
+            ]
+        return np.array(chosen, dtype=np.int64) + self._first_action
 
-    def _sample(self, state: np.ndarray) -> int:
-        """Greedy with optimistic actions first, as in learning, but without a trace."""
-        q = self.q_values(state)
-        return int(self.rng.choice(np.flatnonzero(q == q.max())))
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        for name, array in self.agent.get_state().items():
+            # Column by column: a file of it becomes a tenth smaller.
+            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
 
-    # ---------------------------------------------------------------- learning
-
-    def learn_from(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> int:
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """
-        Take up one transition and plan.
+        Load parameters as PyTorch does; without ``strict`` those that are not given stay as they are.
 
-        :param state: unit coordinates; ``next_state``: the same
-        :param action: from 0 on
-        :param terminated: in a terminal state; a time limit is none
-        :return: backups done
+        :raises RuntimeError: if parameters do not fit; nothing has changed then
         """
-        self._widen(reward)
-        self._unsettled.append(self.model.add(state, action, reward, next_state, terminated))
-        if self.transfer is not None:
-            self.transfer.observe(state, action, reward, next_state, terminated)
-        return self._plan(self.max_backups, NOWHERE if terminated else next_state)
+        if not strict:
+            present = self.state_dict()
+            state_dict = {**present, **{name: tensor for name, tensor in state_dict.items() if name in present}}
+        return super().load_state_dict(state_dict, strict, assign)
 
-    def end_episode(self, truncated: bool) -> int:
-        """Time to think: plan on while no action is due; backups done."""
-        if truncated:
-            self.n_truncated += 1
-            self._unsettled.append(self.model.lower_threshold(self.n_truncated))
-        if self.transfer is not None:
-            self.transfer.end_episode(truncated)
-            self._unsettled.append(self.model.waiting())
-        return self._plan(AT_EPISODE_END * self.max_backups)
-
-    def prepare(self) -> int:
-        """Take up what transfer has to say before the first step, and plan until that is thought through."""
-        # Episodes are numbered anew.
-        self.corrections.visits.fill(0)
-        backups = self._plan(0)
-        if self.transfer is None and self.model.n_instances == 0:
-            return backups
-        self.planner.start_anew()
-        return backups + self.planner.sweep_all(BEFORE_THE_FIRST_STEP)
-
-    def _plan(self, max_backups: int, around: np.ndarray = NOWHERE) -> int:
-        """Plan, and note how long it took if that is wanted (``timed``); backups done."""
-        if not self.timed:
-            return self._settle_and_plan(max_backups, around)
-        began = perf_counter()
-        backups = self._settle_and_plan(max_backups, around)
-        self.planning_seconds += perf_counter() - began
-        return backups
-
-    def _settle_and_plan(self, max_backups: int, around: np.ndarray) -> int:
-        """Settle the pairs that changed, and plan; longer where transfer changed many pairs at once."""
-        passes = 0
-        if self.transfer is not None:
-            renewed = self.transfer.renewed(self.model.arrays.known)
-            if len(renewed):
-                self._unsettled.append(renewed)
-                backups = BACKUPS_PER_RENEWED_PAIR * len(renewed)
-                passes = backups // self.model.grid.n_points
-                max_backups += backups if passes == 0 else 0
-        if not self._unsettled:
-            return self.planner.update(NO_PAIRS, max_backups, around)
-        # Left on the list until all is done: an interrupt in between loses no change.
-        pairs = self._unsettled[0] if len(self._unsettled) == 1 else np.unique(np.concatenate(self._unsettled))
-        backups = self.planner.update(pairs, max_backups, around)
-        self._unsettled.clear()
-        return backups + (self.planner.sweep_all(passes) if passes else 0)
-
-    def _widen(self, reward: float) -> None:
-        """Keep the lower bound of the values below what the worst reward seen could add up to."""
-        low, high = self.planner.bounds
-        lowest = min(0.0, high) + LONGEST_PLAN * min(0.0, reward)
-        if lowest < low:
-            self.planner.bounds = (lowest, high)
-
-    def statistics(self) -> dict[str, float]:
-        """Figures for the logger, by name."""
-        arrays = self.model.arrays
-        settled = float(arrays.settled.mean())
-        known = float(arrays.known.mean())
-        figures = {
-            "model/instances": self.model.n_instances,
-            "model/known": known,
-            "model/transferred": settled - known,
-            "model/optimistic": 1.0 - settled,
-            "model/threshold": self.model.exploration_threshold,
-            "planner/waiting": self.planner.n_waiting,
-            "planner/corrections": int(self.corrections.count[0]),
-        }
-        return figures if self.transfer is None else {**figures, **self.transfer.statistics()}
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        expected = self.agent.get_state()
+        missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
+        unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
+        if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
+            error_msgs.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
+        if missing_keys or unexpected_keys or error_msgs:
+            return
+        saved = {name: state_dict[prefix + name] for name in expected}
+        problem = misfit(saved, expected)
+        if problem:
+            error_msgs.append(problem)
+        else:
+            arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
+            self.agent.set_state(arrays)

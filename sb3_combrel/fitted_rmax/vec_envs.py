@@ -1,4 +1,4 @@
-"""What environments say beside observations and rewards."""
+"""What environments return and define beside observations and rewards."""
 
 from __future__ import annotations
 
@@ -10,22 +10,25 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
 def names_of(env: VecEnv | None) -> dict[str, Any]:
-    """Names of state variables and actions, where the environment has them."""
+    """Return names of state variables and actions, where the environment has as many of them as it must have."""
     if env is None:
         return {}
     found = {}
-    for name in ("state_names", "action_names"):
+    counts = {"state_names": (env.observation_space.shape or (0,))[0], "action_names": getattr(env.action_space, "n", 0)}
+    for name, n in counts.items():
         # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
         if not env.has_attr(name):
             continue
         value = env.get_attr(name, 0)[0]
-        if isinstance(value, Sequence) and not isinstance(value, str):
+        if isinstance(value, Sequence) and len(value) == n and all(isinstance(each, str) for each in value):
             found[name] = value
     return found
 
 
 def refuse_normalized_observations(env: VecEnv) -> None:
-    """Raise a ValueError if a ``VecNormalize`` normalizes the observations."""
+    """
+    :raises ValueError: if a ``VecNormalize`` normalizes the observations
+    """
     normalizer = unwrap_vec_normalize(env)
     if normalizer is not None and normalizer.norm_obs:
         raise ValueError(
@@ -37,9 +40,14 @@ def refuse_normalized_observations(env: VecEnv) -> None:
 def true_outcomes(
     new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]], ended: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each step led, before an environment reset itself, and whether that was a terminal state.
+    """
+    Find out where each step led before environments reset themselves, and whether that was a terminal state.
 
+    :param new_obs: observations after the step, those of the next episode where one is done
+    :param dones: bool, shape (n_envs,)
+    :param infos: of each environment
     :param ended: the environments that are done
+    :return: observations, and bool, shape (n_envs,); a time limit is no terminal state
     """
     if not ended:
         return np.asarray(new_obs), dones

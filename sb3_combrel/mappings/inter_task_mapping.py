@@ -1,4 +1,4 @@
-"""One inter-task mapping: which source variable and source action each target variable and action stands for."""
+"""One inter-task mapping: the source variable of each target variable and the source action of each target action."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_combrel.common.serialisation import register_reader, register_writer
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 UNMAPPED = -1
-"""Stands for None in integer arrays of state mappings."""
+"""Represents None in integer arrays of state mappings."""
+
+_MAX_INDEX = 2**31 - 1
 
 
 class MappingNames(NamedTuple):
@@ -93,7 +97,7 @@ class InterTaskMapping:
 
         Where several target variables map to one source variable, the source coordinate is their mean, the point with
         the smallest squared distance to all of them. A source variable that no target variable maps to is NaN: the
-        mapping says nothing of it.
+        mapping does not determine it.
 
         :param target_units: unit coordinates, shape (..., n_target_variables)
         :param n_source_variables: number of variables of the source task
@@ -222,6 +226,8 @@ def _index(name: str, value: object) -> int:
         raise ValueError(f"{name} must hold integers{none}, got the entry {value!r}") from error
     if number < 0:
         raise ValueError(f"{name} must hold integers from 0 on{none}, got the entry {value!r}")
+    if number > _MAX_INDEX:
+        raise ValueError(f"{name} must hold indices up to {_MAX_INDEX}{none}, got a larger entry")
     return number
 
 
@@ -240,10 +246,10 @@ def _checked_names(names: MappingNames, state: tuple[int | None, ...], action: t
     named = MappingNames(*(tuple(str(name) for name in group) for group in names))
     needed = MappingNames._fields
     used = (max(i for i in state if i is not None) + 1, len(state), max(action) + 1, len(action))
-    for kind, group, least in zip(needed, named, used, strict=True):
+    for kind, group, min_names in zip(needed, named, used, strict=True):
         exact = kind.startswith("target")
-        if (exact and len(group) != least) or len(group) < least:
-            raise ValueError(f"{kind} must hold {'' if exact else 'at least '}{least} names, got {group}")
+        if (exact and len(group) != min_names) or len(group) < min_names:
+            raise ValueError(f"{kind} must hold {'' if exact else 'at least '}{min_names} names, got {group}")
     return named
 
 
@@ -269,3 +275,35 @@ def _check_range(name: str, entries: Sequence[int | None], n_source: int, kind: 
             f"{name} must hold indices from 0 to {n_source - 1}, the source task has {n_source} {kind}, "
             f"got {largest} in {name}={tuple(entries)}"
         )
+
+
+def index_table(name: str, values: ArrayLike, shape: str) -> Ints:
+    """
+    A table of indices as an array of its own.
+
+    :param name: name of the argument
+    :param values: its value
+    :param shape: the shape that is right, in words
+    :return: int64, two-dimensional, not empty
+    :raises ValueError: if it is not such a table of integers
+    """
+    try:
+        array = np.array(values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be integers of shape {shape}, got {values!r}") from error
+    if array.ndim != 2 or 0 in array.shape or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name} must be integers of shape {shape}, got {array.dtype} of shape {array.shape}")
+    if array.max() > _MAX_INDEX:
+        raise ValueError(f"{name} must hold indices up to {_MAX_INDEX}, got {array.max()}")
+    return array.astype(np.int64)
+
+
+def _read_mapping(state: list[int | None], action: list[int], sign: list[int] | None = None) -> InterTaskMapping:
+    return InterTaskMapping(state, action, sign)  # type: ignore[arg-type]
+
+
+register_writer(
+    InterTaskMapping,
+    lambda mapping: ("InterTaskMapping", {"state": mapping.state, "action": mapping.action, "sign": mapping.sign}),
+)
+register_reader("InterTaskMapping", _read_mapping)

@@ -1,71 +1,79 @@
-"""Sets of inter-task mappings: state mappings times action mappings, never multiplied out."""
+"""Sets of inter-task mappings: pairs of state and action mappings, which are never all written out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from operator import index as as_index
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Floats, InterTaskMapping, Ints, MappingNames
-from sb3_combrel.mappings.mapping_factors import (
-    LAYINGS_OF_TWO_ON_FOUR,
+from sb3_combrel.common.checks import count_text
+from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.mappings.action_mappings import (
     ActionMappings,
     AllActionMappings,
     BalancedActionMappings,
     ListedActionMappings,
     paper_icub_actions,
-    state_mappings_using_sources,
-    with_mirrored,
 )
-
-
-class Candidates(NamedTuple):
-    """
-    The different ways in which the mappings of a set treat one target action; compliance distinguishes no others.
-
-    :param state_index: row of ``MappingSet.state_mappings``, shape (n_candidates,)
-    :param source_action: source action that the target action maps to, shape (n_candidates,)
-    """
-
-    state_index: Ints
-    source_action: Ints
+from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Floats, InterTaskMapping, Ints, MappingNames, index_table
+from sb3_combrel.mappings.mapping_lists import distinct_parts
+from sb3_combrel.mappings.members import AllPairs, Candidates, ListedPairs
+from sb3_combrel.mappings.state_mappings import TWO_VARIABLES_ON_FOUR, state_mappings_using_sources, with_mirrored
 
 
 class MappingSet:
     """
-    The set X of inter-task mappings (Section 3): all pairs of a state mapping and an action mapping.
+    The set X of inter-task mappings (Section 3): all pairs of a state mapping and an action mapping, or some of them.
 
-    Only the two factors are held. Mapping number i is the pair of state mapping ``i // n_action_mappings`` and action
-    mapping ``i % n_action_mappings``, and is built when it is asked for.
+    Only the two factors are stored. Without ``pairs``, mapping number i is the pair of state mapping
+    ``i // n_action_mappings`` and action mapping ``i % n_action_mappings``; it is built when it is asked for.
 
     :param state_mappings: one state mapping a row, shape (n_state_mappings, n_target_variables); the source variable of
         each target variable, -1 for None
     :param actions: action mappings: one a row, shape (n_action_mappings, n_target_actions), or an ``ActionMappings``
     :param signs: +1 or -1 for each entry of ``state_mappings``, -1 mirrors; None for +1 throughout
-    :raises ValueError: if an array has another shape or other entries
+    :param pairs: the members, in their order: row of ``state_mappings`` and number of the action mapping, shape
+        (n_mappings, 2); None for all pairs
+    :raises ValueError: if an array has another shape or other entries, or if there are more than ``MAX_CANDIDATES``
     """
 
-    def __init__(self, state_mappings: ArrayLike, actions: ActionMappings | ArrayLike, signs: ArrayLike | None = None) -> None:
-        self.state_mappings: Ints = _integer_table("state_mappings", state_mappings)
-        self.signs: Ints = np.ones_like(self.state_mappings) if signs is None else _integer_table("signs", signs)
+    def __init__(
+        self,
+        state_mappings: ArrayLike,
+        actions: ActionMappings | ArrayLike,
+        signs: ArrayLike | None = None,
+        *,
+        pairs: ArrayLike | None = None,
+    ) -> None:
+        shape = "(n_state_mappings, n_target_variables)"
+        self.state_mappings: Ints = index_table("state_mappings", state_mappings, shape)
+        self.signs: Ints = np.ones_like(self.state_mappings) if signs is None else index_table("signs", signs, shape)
         self.actions = actions if isinstance(actions, ActionMappings) else ListedActionMappings(actions)
         self.names: MappingNames | None = None
         if self.signs.shape != self.state_mappings.shape or not np.isin(self.signs, (1, -1)).all():
             raise ValueError(
-                f"signs must hold +1 and -1 and have the shape of state_mappings, {self.state_mappings.shape}, "
+                f"signs must be +1 and -1 and have the shape of state_mappings, {self.state_mappings.shape}, "
                 f"got shape {self.signs.shape}"
             )
         if self.state_mappings.min() < UNMAPPED or (self.state_mappings == UNMAPPED).all(axis=1).any():
-            raise ValueError("state_mappings must hold source variables from 0 on or -1 for None, at least one of them not -1")
+            raise ValueError("state_mappings must be source variables from 0 on or -1 for None, at least one of them not -1")
         self.signs[self.state_mappings == UNMAPPED] = 1
         self.state_mappings.flags.writeable = self.signs.flags.writeable = False
         _, first, row_of = np.unique(
             np.hstack([self.state_mappings, self.signs]), axis=0, return_index=True, return_inverse=True
         )
         self._first_equal: Ints = first[row_of.reshape(-1)].astype(np.int64)
+        self._members = (
+            AllPairs(self._first_equal, self.actions) if pairs is None else ListedPairs(self._first_equal, self.actions, pairs)
+        )
+
+    @property
+    def pairs(self) -> Ints | None:
+        """The members as they were listed, shape (n_mappings, 2); None for all pairs."""
+        return self._members.pairs if isinstance(self._members, ListedPairs) else None
 
     @classmethod
     def injective(
@@ -78,7 +86,7 @@ class MappingSet:
         signs: bool = False,
     ) -> MappingSet:
         """
-        Each source variable stands for exactly one target variable, the other target variables are unmapped.
+        Each source variable is used by exactly one target variable, the other target variables are unmapped.
 
         If the source task has more variables than the target task, each target variable gets a source variable of its
         own instead. All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 12 x 243.
@@ -88,7 +96,7 @@ class MappingSet:
         :param n_source_actions: number of actions of the source task
         :param n_target_actions: number of actions of the target task
         :param signs: also include every state mapping with any of its mapped variables mirrored
-        :raises ValueError: if a number is below 1, or if there are too many state mappings to hold
+        :raises ValueError: if a number is below 1 or astronomically large, or if there are too many state mappings
         """
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=True, allow_none=True)
         return cls._of(rows, AllActionMappings(n_source_actions, n_target_actions), signs)
@@ -160,25 +168,25 @@ class MappingSet:
         """
         The factors that the paper names for Mountain Car 2D -> 4D (footnote 6): 4! = 24 state, 90 action mappings.
 
-        24 is the number of ways to lay (x, v, None, None) on the four target variables; they come in pairs of equal
-        mappings, so 12 differ. 90 is the number of action mappings that use the three source actions 2, 2 and 1 times.
-        The product has 2160 members, 1080 of which differ. The paper's "1960" (in Table 5's discussion "1195") pairs
-        follow from no such count.
+        Each state mapping leaves two of the four target variables unmapped: 24 is the number of permutations of
+        (x, v, None, None); they come in pairs of equal mappings, so 12 differ, those of :meth:`injective`. 90 is the
+        number of action mappings that use the three source actions 2, 2 and 1 times. The product has 2160 members, 1080
+        of which differ. The paper's "1960" (in Table 5's discussion "1195") pairs follow from no such count.
         """
-        return cls(LAYINGS_OF_TWO_ON_FOUR, BalancedActionMappings(n_source_actions=3, n_target_actions=5))
+        return cls(TWO_VARIABLES_ON_FOUR, BalancedActionMappings(n_source_actions=3, n_target_actions=5))
 
     @classmethod
     def paper_icub(cls) -> MappingSet:
         """
         The factors of the iCub experiment (Section 5.2), torso -> arm: 24 state mappings x 48 action mappings = 1152.
 
-        The 24 are 4! ways to lay the two torso joints on the four arm joints, 12 of which differ, as in
-        :meth:`paper_mountain_car`. The 48 are the 6 ways to give each source joint two of the four target joints times
-        the 2^3 relative directions: "T1-" always maps to the "+" of its source joint, as in all rows of Table 4 ("S1+"),
-        and each other target joint moves with or against it. Action 2j moves joint j in the negative direction, action
-        2j + 1 in the positive direction, on both sides. The signs of the state mappings are +1.
+        The 24 are the permutations of (joint 1, joint 2, None, None) on the four arm joints, 12 of which differ, as in
+        :meth:`paper_mountain_car`: two arm joints are unmapped. The 48 are the 6 ways to give each source joint two of the
+        four target joints times the 2^3 relative directions: "T1-" always maps to the "+" of its source joint, as in all
+        rows of Table 4 ("S1+"), and each other target joint moves with or against it. Action 2j moves joint j in the
+        negative direction, action 2j + 1 in the positive direction, on both sides. The signs of the state mappings are +1.
         """
-        return cls(LAYINGS_OF_TWO_ON_FOUR, paper_icub_actions())
+        return cls(TWO_VARIABLES_ON_FOUR, paper_icub_actions())
 
     @classmethod
     def from_list(cls, mappings: Iterable[InterTaskMapping]) -> MappingSet:
@@ -188,10 +196,11 @@ class MappingSet:
         :param mappings: mappings between the same two tasks
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
         """
-        # The subclass knows this class; only this way round is the import not circular.
-        from sb3_combrel.mappings.mapping_list import ListedMappingSet
-
-        return ListedMappingSet(list(mappings))
+        listed = list(mappings)
+        parts = distinct_parts(listed)
+        chosen = cls(parts.state_mappings, parts.action_mappings, parts.signs, pairs=parts.pairs)
+        chosen.names = listed[0].names
+        return chosen
 
     @classmethod
     def from_name(
@@ -211,7 +220,7 @@ class MappingSet:
         :raises ValueError: for another name; for the other parameters and errors see :meth:`injective`
         """
         constructors = {"injective": cls.injective, "surjective": cls.surjective, "all": cls.all, "balanced": cls.balanced}
-        unsigned = name.removeprefix("signed_")
+        unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
         if unsigned not in constructors:
             names = [*constructors, *(f"signed_{each}" for each in constructors), "paper_mountain_car", "paper_icub"]
             raise ValueError(f"mappings must be one of {', '.join(names)}, got {name!r}")
@@ -236,7 +245,7 @@ class MappingSet:
     @property
     def n_mappings(self) -> int:
         """Number of mappings; unlike ``len`` it has no upper limit."""
-        return self.n_state_mappings * self.n_action_mappings
+        return self._members.n_mappings
 
     @property
     def n_target_actions(self) -> int:
@@ -259,7 +268,7 @@ class MappingSet:
         number = number + self.n_mappings if number < 0 else number
         if not 0 <= number < self.n_mappings:
             raise IndexError(f"mapping {index} does not exist, the set has {self.n_mappings}")
-        state_index, action_index = self._pair(number)
+        state_index, action_index = self._members.pair(number)
         state = tuple(None if i == UNMAPPED else i for i in self.state_mappings[state_index].tolist())
         sign = tuple(self.signs[state_index].tolist())
         return InterTaskMapping(state, self.actions[action_index], sign, names=self.names)
@@ -273,7 +282,7 @@ class MappingSet:
         :raises ValueError: if there is no such target action
         """
         self._check_action(action)
-        return self.actions.source_actions_for(action)
+        return self._members.source_actions_for(action)
 
     def candidates(self, action: int) -> Candidates:
         """
@@ -286,9 +295,8 @@ class MappingSet:
         :return: the pairs, ordered by state mapping and source action
         :raises ValueError: if there is no such target action
         """
-        source_actions = self.source_actions_for(action)
-        rows = np.unique(self._first_equal)
-        return Candidates(np.repeat(rows, len(source_actions)), np.tile(source_actions, len(rows)))
+        self._check_action(action)
+        return self._members.candidates(action)
 
     def count(self, state_index: int, action: int, source_action: int) -> int:
         """
@@ -300,21 +308,20 @@ class MappingSet:
         :raises ValueError: if there is no such target action
         """
         self._check_action(action)
-        equal = int(np.count_nonzero(self._first_equal == self._first_equal[state_index]))
-        return equal * self.actions.count(action, source_action)
+        return self._members.count(state_index, action, source_action)
 
     def find(self, state_index: int, action: int, source_action: int) -> int:
         """
-        A mapping that stands for all with this state mapping (or an equal one) that map ``action`` to ``source_action``.
+        The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.
 
         :param state_index: row of ``state_mappings``
         :param action: target action
         :param source_action: source action
-        :return: the number of the first such mapping, to be used as ``mapping_set[number]``
+        :return: its number, to be used as ``mapping_set[number]``
         :raises ValueError: if there is none
         """
         self._check_action(action)
-        return int(self._first_equal[state_index]) * self.n_action_mappings + self.actions.first(action, source_action)
+        return self._members.find(state_index, action, source_action)
 
     def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
         """
@@ -322,11 +329,16 @@ class MappingSet:
 
         :raises ValueError: if a length or an index does not fit; the message names what would be right
         """
+        source_actions = [self._members.source_actions_for(action) for action in range(self.n_target_actions)]
+        largest = max(int(actions.max()) for actions in source_actions)
+        right_lengths = (n_target_variables, n_target_actions) == (self.state_mappings.shape[1], self.n_target_actions)
+        if right_lengths and self.state_mappings.max() < n_source_variables and largest < n_source_actions:
+            return
+        # Members with the largest index of a source variable or action: one of them fails its own check.
         for action in range(self.n_target_actions):
-            # The candidates cover every state mapping and every source action of the set: look at the largest of each.
-            states, source_actions = self.candidates(action)
-            for worst in (self.state_mappings[states].max(axis=1).argmax(), source_actions.argmax()):
-                self[self.find(int(states[worst]), action, int(source_actions[worst]))].check(
+            states, actions = self.candidates(action)
+            for worst in (self.state_mappings[states].max(axis=1).argmax(), actions.argmax()):
+                self[self.find(int(states[worst]), action, int(actions[worst]))].check(
                     n_source_variables=n_source_variables,
                     n_target_variables=n_target_variables,
                     n_source_actions=n_source_actions,
@@ -349,23 +361,33 @@ class MappingSet:
         return named
 
     def __repr__(self) -> str:
-        return (
-            f"<{self.n_mappings} mappings: {self.n_state_mappings} state mappings x {self.n_action_mappings} action mappings>"
-        )
-
-    def _pair(self, number: int) -> tuple[int, int]:
-        return divmod(number, self.n_action_mappings)
+        n_mappings, n_actions = (count_text(n).replace(",", "") for n in (self.n_mappings, self.n_action_mappings))
+        listed, times = ("", " x") if self.pairs is None else (" listed one by one", ",")
+        return f"<{n_mappings} mappings{listed}: {self.n_state_mappings} state mappings{times} {n_actions} action mappings>"
 
     def _check_action(self, action: int) -> None:
         if not 0 <= action < self.n_target_actions:
             raise ValueError(f"action must be a target action from 0 to {self.n_target_actions - 1}, got {action}")
 
 
-def _integer_table(name: str, values: ArrayLike) -> Ints:
-    array = np.array(values)
-    if array.ndim != 2 or 0 in array.shape or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(
-            f"{name} must be integers of shape (n_state_mappings, n_target_variables), "
-            f"got {array.dtype} of shape {array.shape}"
-        )
-    return array.astype(np.int64)
+def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:
+    if mappings.pairs is not None:
+        members = [{"state": each.state, "action": each.action, "sign": each.sign} for each in mappings]
+        return "ListedMappingSet", {"mappings": members}
+    factors = {"state_mappings": mappings.state_mappings, "signs": mappings.signs, "actions": mappings.actions}
+    return "MappingSet", factors
+
+
+def _read(state_mappings: ArrayLike, signs: ArrayLike, actions: ActionMappings) -> MappingSet:
+    if not isinstance(actions, ActionMappings):
+        raise ValueError(f"actions must be action mappings, got {actions!r}")
+    return MappingSet(state_mappings, actions, signs)
+
+
+def _read_list(mappings: Iterable[dict[str, Any]]) -> MappingSet:
+    return MappingSet.from_list(InterTaskMapping(each["state"], each["action"], each["sign"]) for each in mappings)
+
+
+register_writer(MappingSet, _write)
+register_reader("MappingSet", _read)
+register_reader("ListedMappingSet", _read_list)

@@ -1,25 +1,12 @@
-"""Inter-task mappings and sets of them, and what a user may write in their place."""
+"""What a user may write for a set of mappings, in Python or in a YAML file, as a :class:`MappingSet`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, InterTaskMapping, MappingNames
-from sb3_combrel.mappings.mapping_factors import ActionMappings, AllActionMappings, BalancedActionMappings
-from sb3_combrel.mappings.mapping_set import Candidates, MappingSet
-
-__all__ = [
-    "UNMAPPED",
-    "ActionMappings",
-    "AllActionMappings",
-    "BalancedActionMappings",
-    "Candidates",
-    "InterTaskMapping",
-    "MappingNames",
-    "MappingSet",
-    "resolve",
-]
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.mappings.mapping_set import MappingSet
 
 
 def resolve(

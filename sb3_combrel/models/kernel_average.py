@@ -1,259 +1,247 @@
-"""Fitted R-Max's kernel model: T and R of every state-action pair of the grid, from instances."""
+"""The kernel average of Jong & Stone (2007): reward and relative effects as weighted means of the instances near a state."""
+
+from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.compiled import SameTypes
-from sb3_combrel.common.instances import InstanceArrays
+from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import list_room
-from sb3_combrel.common.list_store import Pool
-from sb3_combrel.common.transferred import Supply
+from sb3_combrel.common.list_store import ListStore
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
 from sb3_combrel.models.kernel_lists import (
-    ModelArrays,
-    Scratch,
-    enter,
+    KernelLists,
+    ReachScratch,
+    enter_plain,
     leave_lists,
-    renew_predecessors,
-    settle,
+    update_rows_plain,
 )
-from sb3_combrel.models.refilling import in_neighbourhoods, note_effects, refill_lists
-from sb3_combrel.planning.grid import StateGrid
-from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.models.kernel_prediction import NearLists, join_transferred_plain, predict_own_plain
+from sb3_combrel.models.kernel_refill import in_neighbourhoods, note_all_effects, refill_all_lists
+from sb3_combrel.planning.mdp import FiniteMDP
+from sb3_combrel.planning.q_values import Prediction
 
-MOST_PAIRS_AT_ONCE = 4096
-NO_PAIRS = np.empty(0, dtype=np.int64)
-# Part of the threshold by which own weight must have changed before a pair that draws on transferred instances is settled
-# anew within an episode: an instance that hardly counts among them would have hundreds of pairs translated and planned.
-NEWS = 0.5
-# A time limit reached this often is taken as it comes; each further time the threshold shrinks by the factor.
-EPISODES_OF_PATIENCE = 10
-IMPATIENCE = 0.98
+# Fraction of the threshold by which own weight must have changed before the row of a pair that has transferred instances is
+# updated within an episode: an instance that hardly counts among them would have hundreds of pairs translated and planned.
+MIN_CHANGE = 0.5
+
+_enter, _leave_lists, _update_rows = EntryPoint(enter_plain), EntryPoint(leave_lists), EntryPoint(update_rows_plain)
+_predict_own, _join_transferred = EntryPoint(predict_own_plain), EntryPoint(join_transferred_plain)
 
 
-class KernelModel:
-    """The model of Jong & Stone (2007), one for each action, kept up to date instance by instance.
+class KernelAverage(Model):
+    """
+    The model of Jong & Stone (2007), one for each action, incremental.
 
-    Everything is in unit coordinates. A pair is *known* once the kernel weights of its own kept instances reach the
-    threshold, and stays known: a nearer instance can shorten the list (``min_fraction``), which is a better
-    model, not less knowledge. A pair that is not known can be *settled* by transferred instances; if it is not, it
-    is optimistic.
+    An instance at distance d (unit coordinates) weighs exp(-d^2 / breadth^2). Instances that weigh less than ``min_weight``
+    do not count; of the others, nearest first, one counts while its weight is at least ``min_fraction`` of the sum of those
+    before it. A nearer instance can so shorten the list of a known pair, which is a better model, not less knowledge: the
+    pair stays known. With ``max_instances``, the instance in the fewest lists is replaced.
 
-    :param grid: the finite sample of states
-    :param n_actions: number of actions
-    :param model_breadth: kernel breadth b in exp(-d^2 / b^2)
-    :param min_weight: instances with less weight do not count
-    :param min_fraction: nearest first, an instance counts while it has this part of the weight before it
-    :param exploration_threshold: weight that makes a pair known
-    :param gamma: discount factor
-    :param transfer: where to get instances for pairs that are not known
-    :param max_instances: of one action; beyond it the instance that stands in the fewest lists gives way
+    Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
-    def __init__(
-        self,
-        grid: StateGrid,
-        n_actions: int,
-        *,
-        model_breadth: float,
-        min_weight: float,
-        min_fraction: float,
-        exploration_threshold: float,
-        gamma: float,
-        transfer: Transfer | None = None,
-        max_instances: int | None = None,
-    ):
-        n_pairs = n_actions * grid.n_points
-        self.grid = grid
-        self.n_actions = n_actions
-        self.model_breadth = model_breadth
-        self.min_weight = min_weight
-        self.min_fraction = min_fraction
-        self.full_threshold = self.exploration_threshold = float(exploration_threshold)
-        self.gamma = float(gamma)
-        self.transfer = transfer
-        self.max_instances = max_instances
-        self.instances = InstanceArrays.empty(n_actions, grid.n_variables)
-        self.arrays = ModelArrays(
-            lists=Pool.empty(n_pairs, 1 << 12),
-            rows=Pool.empty(n_pairs, 1 << 14),
-            predecessors=Pool.empty(grid.n_points, 1 << 14),
+    def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
+        super().__init__(mdp, settings, transfer)
+        grid = self.grid
+        d, n_points, n_pairs = grid.n_variables, grid.n_points, self.n_actions * grid.n_points
+        lists = KernelLists(
+            lists=ListStore.empty(n_pairs, 1 << 12),
             entry=np.zeros(n_pairs),
-            total=np.zeros(n_pairs),
-            known=np.zeros(n_pairs, dtype=np.bool_),
-            settled=np.zeros(n_pairs, dtype=np.bool_),
-            reward=np.zeros(n_pairs),
-            heard=np.zeros(n_pairs),
-            n_optimistic=np.full(grid.n_points, n_actions, dtype=np.int64),
+            total=self.own_weight,
+            last_total=np.zeros(n_pairs),
+            known=self.known,
             **self._of_instances(),
         )
-        self._kernel = (float(model_breadth), float(min_weight), float(min_fraction))
-        self.scratch = Scratch.for_grid(grid)
-        self._enter_lists, self._settle = SameTypes(enter), SameTypes(settle)
+        self._set_arrays(lists)
+        self._kernel = (float(settings.model_breadth), float(settings.min_weight), float(settings.min_fraction))
+        self._scratch = scratch = ReachScratch(
+            kernel=np.empty((d, int(grid.arrays.shape.max()))),
+            at=np.empty((3, d), dtype=np.int64),
+            point=np.empty(n_points, dtype=np.int64),
+            weight=np.empty(n_points),
+        )
+        self._plain_scratch = tuple(scratch)
         self._progress = np.empty(3, dtype=np.int64)
-        self._no_supply = Supply.empty(MOST_PAIRS_AT_ONCE, grid.n_variables)
-        self.list_room = list_room(min_fraction)
+        self._list_room = room = list_room(settings.min_fraction)
+        self._near = NearLists(
+            item=np.empty((self.n_actions, room), dtype=np.int32),
+            weight=np.empty((self.n_actions, room)),
+            length=np.zeros(self.n_actions, dtype=np.int64),
+        )
+        self._plain_near = tuple(self._near)
+        self._make_prediction(room)
+        self._nothing = TransferredInstances.empty(1, d)
+
+    # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
+
+    def _set_arrays(self, arrays: KernelLists) -> None:
+        self.arrays, self._plain_arrays = arrays, arrays.plain()
+
+    def _make_prediction(self, room: int) -> None:
+        self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
+        self._plain_prediction = tuple(self._prediction)
 
     @property
-    def n_instances(self) -> int:
-        """Instances held, of all actions."""
-        return int(self.instances.count.sum())
+    def instances(self) -> Instances:
+        """The instances, by action."""
+        return self._instances
+
+    @instances.setter
+    def instances(self, instances: Instances) -> None:
+        self._instances, self._plain_instances = instances, tuple(instances)
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
-        """Take up one transition.
+        """
+        Add one transition (see :meth:`Model.add`).
 
-        :param state: unit coordinates, shape (n_variables,)
-        :param next_state: the same
-        :param terminated: the episode ended in a terminal state; a time limit is none
-        :return: the pairs to be settled anew, int64: those whose lists changed, but with a transfer method only known ones
-            and those with news; the others may wait (see :meth:`waiting`)
+        :return: the pairs whose lists changed, but with a transfer method only known ones and those whose weight has changed
+            enough; the others may wait (see :meth:`outdated`)
         """
         slot, without = self._slot_for(action)
-        changed = self._enter(action, slot, state, next_state, reward, terminated)
+        changed = self._enter((action, slot, state, next_state, reward, terminated))
         return changed if len(without) == 0 else np.union1d(without, changed)
 
     def _slot_for(self, action: int) -> tuple[int, np.ndarray]:
         """Where a new instance goes, and the pairs that lost one to make room."""
-        count = int(self.instances.count[action])
-        if self.max_instances is not None and count >= self.max_instances:
-            slot = int(self.arrays.members[action, :count].argmin())
+        size = int(self.instances.size[action])
+        if self.settings.max_instances is not None and size >= self.settings.max_instances:
+            slot = int(self.arrays.n_lists[action, :size].argmin())
             return slot, self._leave(action, slot)
         self.instances = self.instances.with_room(action)
-        room = self.arrays.members.shape[1]
+        room = self.arrays.n_lists.shape[1]
         if room < self.instances.capacity:
             larger = self._of_instances()
             for name, array in larger.items():
                 array[:, :room] = getattr(self.arrays, name)
-            self.arrays = self.arrays.replace(**larger)
-        return count, NO_PAIRS
+            self._set_arrays(self.arrays._replace(**larger))
+        return size, NO_PAIRS
 
     def _of_instances(self) -> dict[str, Any]:
-        """Those of the model's arrays that have a place for each instance, empty."""
-        d, places = self.grid.n_variables, (self.n_actions, self.instances.capacity)
+        """Those of the arrays that have an entry for each instance, empty."""
+        d, shape = self.grid.n_variables, (self.n_actions, self.instances.capacity)
         return dict(
-            members=np.zeros(places, dtype=np.int32),
-            corner_low=np.zeros((*places, d), dtype=np.int32),
-            corner_offset=np.zeros((*places, 2**d), dtype=np.int32),
-            corner_weight=np.zeros((*places, 2**d)),
+            n_lists=np.zeros(shape, dtype=np.int32),
+            corner_low=np.zeros((*shape, d), dtype=np.int32),
+            corner_offset=np.zeros((*shape, 2**d), dtype=np.int32),
+            corner_weight=np.zeros((*shape, 2**d)),
         )
 
-    def _enter(
-        self, action: int, slot: int, state: np.ndarray, next_state: np.ndarray, reward: float, terminated: bool
-    ) -> np.ndarray:
-        """Put an instance into its slot and into the lists it reaches; of these pairs, those to be settled anew."""
+    def _enter(self, transition: tuple[Any, ...]) -> np.ndarray:
+        """Put an instance into its slot and into the lists that it reaches; the pairs whose rows are to be updated."""
         threshold = self.exploration_threshold
-        news = 0.0 if self.transfer is None else NEWS * threshold
+        thresholds = threshold, 0.0 if self.transfer is None else MIN_CHANGE * threshold
         self._progress[:] = -1, 0, 0
-        while not self._enter_lists(
-            self.instances,
-            self.arrays,
-            self.grid.arrays,
-            self._kernel,
-            (threshold, news),
-            action,
-            slot,
-            state,
-            next_state,
-            reward,
-            terminated,
-            self.scratch,
-            self._progress,
+        instances, grid, scratch = self._plain_instances, self.grid.plain, self._plain_scratch
+        while not _enter.call(
+            instances, self._plain_arrays, grid, self._kernel, thresholds, transition, scratch, self._progress
         ):
-            self.make_room()
-        return self.scratch.point[: self._progress[2]] + action * self.grid.n_points
+            self._make_room()
+        return self._scratch.point[: self._progress[2]] + transition[0] * self.grid.n_points
 
-    def make_room(self) -> None:
-        """Grow the pools that were too small for what was last asked of them."""
-        pools = {name: getattr(self.arrays, name).with_room() for name in ("lists", "rows", "predecessors")}
-        self.arrays = self.arrays.replace(**pools)
+    def _make_room(self) -> None:
+        self._set_arrays(self.arrays._replace(lists=self.arrays.lists.with_room()))
 
     def _leave(self, action: int, slot: int) -> np.ndarray:
-        if self.arrays.members[action, slot] == 0:
+        if self.arrays.n_lists[action, slot] == 0:
             return NO_PAIRS
-        rest = (self._kernel, action, slot, np.zeros(self.grid.n_points), self.scratch)
-        changed = leave_lists(self.instances, self.arrays, self.grid.arrays, *rest)
-        return self.scratch.point[:changed] + action * self.grid.n_points
+        anywhere = np.zeros(self.grid.n_points)
+        grid = self.grid.arrays
+        changed = _leave_lists.call(self.instances, self.arrays, grid, self._kernel, action, slot, anywhere, self._scratch)
+        return self._scratch.point[:changed] + action * self.grid.n_points
 
-    def lower_threshold(self, n_truncated: int) -> np.ndarray:
-        """Be content with less weight after so many episodes that ran into their time limit.
-
-        Where the kernel is so narrow that all that is within an episode's reach cannot become known, exploration would
-        otherwise go on for ever. In the end any instance that counts at all will do.
-
-        :return: the pairs that become known by that, to be settled anew
-        """
-        lowered = self.full_threshold * IMPATIENCE ** max(0, n_truncated - EPISODES_OF_PATIENCE)
-        self.exploration_threshold = max(lowered, min(self.full_threshold, self.min_weight))
-        newly_known = np.flatnonzero(~self.arrays.known & (self.arrays.total >= self.exploration_threshold))
-        self.arrays.known[newly_known] = True
-        return newly_known
-
-    def waiting(self) -> np.ndarray:
-        """The pairs that are not known and whose own weight has changed since they were settled."""
+    def outdated(self) -> np.ndarray:
         arrays = self.arrays
-        return np.flatnonzero(~arrays.known & (arrays.total != arrays.heard))
+        return np.flatnonzero(~arrays.known & (arrays.total != arrays.last_total))
 
-    def settle(self, pairs: np.ndarray) -> None:
-        """Bring the rows of ``pairs`` up to date: with their lists, and with what transfer has for them."""
-        for first in range(0, len(pairs), MOST_PAIRS_AT_ONCE):
-            some = pairs[first : first + MOST_PAIRS_AT_ONCE]
-            supply = self.supply_for(some)
-            done = 0
-            while done < len(some):
-                done = self._settle(
-                    self.arrays,
-                    self.instances,
-                    self.grid.arrays,
-                    self.gamma,
-                    some,
-                    done,
-                    supply,
-                    self.scratch,
-                )
-                if done < len(some):
-                    self.make_room()
+    def update_rows(self, pairs: np.ndarray) -> None:
+        mdp, instances, arrays = self.mdp, self.instances, self._plain_arrays
+        transferred = tuple(self._transferred_to(pairs))
+        outcomes = instances.effect, instances.reward, instances.terminated
+        done = 0
+        while done < len(pairs):
+            query, grid, scratch = (pairs, done), self.grid.plain, mdp.plain_scratch
+            done = _update_rows.call(arrays, outcomes, mdp.plain, grid, mdp.gamma, query, transferred, scratch)
+            if done < len(pairs):
+                mdp.make_room()
 
-    def supply_for(self, pairs: np.ndarray) -> Supply:
-        """Transferred instances for ``pairs``, at most ``MOST_PAIRS_AT_ONCE``."""
-        if self.transfer is None:
-            return self._no_supply
-        known = self.arrays.known[pairs]
-        if known.all():
-            return self._no_supply
-        supply = self.transfer.supply(pairs, self.arrays.total[pairs], known)
-        supply.check(len(pairs), self.grid.n_variables, self.transfer)
-        return supply
+    def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
+        """Transferred instances for pairs; known ones need none."""
+        if self.transfer is None or self.known[pairs].all():
+            if len(self._nothing.length) < len(pairs):
+                self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
+            return self._nothing
+        actions, points = np.divmod(pairs, self.grid.n_points)
+        # Of a known pair the full threshold, so that no method has work with it; it may have been lowered.
+        full = self.settings.exploration_threshold
+        own_weight = np.where(self.known[pairs], np.maximum(full, self.own_weight[pairs]), self.own_weight[pairs])
+        given = self.transfer.transferred_to_sample(points, actions, own_weight)
+        self._check(given, own_weight)
+        return given
 
-    def renew_predecessors(self) -> None:
-        """Forget predecessors that no row needs any more."""
-        while not renew_predecessors(self.arrays):
-            self.make_room()
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
+        rows = []
+        for state, action in zip(states, actions, strict=True):
+            self._predict_own(np.ascontiguousarray(state, dtype=np.float64))
+            rows.append([array[action].copy() for array in self._prediction])
+        _, weight, reward, length, probability, effect = map(np.array, zip(*rows, strict=True))
+        used = np.arange(probability.shape[1]) < length[:, None]
+        return Predictions(weight, reward, np.where(used, probability, 0.0), np.where(used[:, :, None], effect, 0.0))
 
-    def restore(self, listed: np.ndarray, known: np.ndarray, total: np.ndarray) -> None:
-        """Rebuild lists and rows after instances were written to :attr:`instances` directly.
+    def _predict_own(self, state: np.ndarray) -> float:
+        """Fill the prediction from the own instances; the least weight that an action has."""
+        near, prediction = self._plain_near, self._plain_prediction
+        threshold = self.exploration_threshold
+        return float(_predict_own.call(self._plain_instances, state, self._kernel, threshold, near, prediction))
 
-        :param listed: the instances that stood in any list, bool, shape (n_instances,), by action
-        :param known: the pairs that were known when the instances were saved, bool, shape (n_pairs,)
-        :param total: the sums of their weights, shape (n_pairs,); used where they differ from the new ones by rounding only
+    def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
+        if self._predict_own(state) >= self.exploration_threshold or self.transfer is None:
+            return self._prediction, None
+        actions = np.arange(self.n_actions)
+        states = np.repeat(state[None], self.n_actions, axis=0)
+        given = self.transfer.transferred(states, actions, self._prediction.weight)
+        self._check(given, self._prediction.weight)
+        room = self._list_room + given.weight.shape[1]
+        if room > self._prediction.probability.shape[1]:
+            self._make_prediction(room)
+            self._predict_own(state)
+        near, prediction = self._plain_near, self._plain_prediction
+        _join_transferred.call(self._plain_instances, near, tuple(given), self.exploration_threshold, prediction)
+        return self._prediction, given
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        state = super().get_state()
+        listed = [self.arrays.n_lists[action, :size] > 0 for action, size in enumerate(self.instances.size.tolist())]
+        state["instances"][:, -1] = np.concatenate(listed)
+        return state
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
         """
-        self.arrays = self.arrays.replace(**self._of_instances())
-        note_effects(self.instances, self.arrays, self.grid.arrays)
-        scratch = np.empty(self.grid.n_variables), np.empty(self.list_room, np.int32), np.empty(self.list_room)
-        search = (
-            *in_neighbourhoods(self.instances, listed),
-            self.grid.arrays,
-            self._kernel,
-            self.exploration_threshold,
-            *scratch,
-        )
-        pair = 0
-        while (pair := refill_lists(self.arrays, *search, pair)) < len(known):
-            self.make_room()
+        Rebuild lists and rows from the instances.
+
+        The saved weights are used where they differ from the new ones by rounding only, and pairs that were known stay known.
+        """
+        rows, known, total = state["instances"], state["known"] > 0.5, state["total"]
+        rows = rows[np.argsort(np.clip(rows[:, 0], 0, self.n_actions - 1), kind="stable")]
+        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1])
+        self._set_arrays(self.arrays._replace(**self._of_instances()))
+        grid, arrays = self.grid.arrays, self.arrays
+        note_all_effects.call(self.instances, arrays, grid)
+        neighbours, slots = in_neighbourhoods(self.instances, rows[:, -1] > 0.5)
+        scratch = np.empty(grid.shape.size), np.empty(self._list_room, np.int32), np.empty(self._list_room)
+        threshold, pair = self.exploration_threshold, 0
+        while (
+            pair := refill_all_lists.call(self.arrays, neighbours, slots, grid, self._kernel, threshold, scratch, pair)
+        ) < len(known):
+            self._make_room()
         arrays = self.arrays
         same = np.abs(total - arrays.total) <= 1e-9 * arrays.total
         arrays.total[same] = total[same]
         listed = np.flatnonzero(arrays.lists.length > 0)
         last = arrays.lists.weight[arrays.lists.start[listed] + arrays.lists.length[listed] - 1]
-        arrays.entry[listed] = np.minimum(last, self.min_fraction * arrays.total[listed])
+        arrays.entry[listed] = np.minimum(last, self.settings.min_fraction * arrays.total[listed])
         arrays.known[listed] |= known[listed]
-        self.settle(np.arange(len(known)))
+        self.update_all_rows()

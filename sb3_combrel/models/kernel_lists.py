@@ -1,128 +1,111 @@
-"""Compiled loops of the kernel model: which instances stand behind each state-action pair, and what they predict."""
+"""Compiled loops of the kernel average: which instances are near each state-action pair, and what they predict."""
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inlined, inner, part
-from sb3_combrel.common.instances import put_instance
-from sb3_combrel.common.kernels import corners_of, cut_by_fraction, insert_by_weight
-from sb3_combrel.common.list_store import Pool, reserve
+from sb3_combrel.common.compiled import compiled, inlined, part
+from sb3_combrel.common.instances import Instances, put_instance
+from sb3_combrel.common.kernels import cut_by_fraction, insert_by_weight
+from sb3_combrel.common.list_store import ListStore, reserve
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.planning.grid import GridArrays
+from sb3_combrel.planning.mdp import RowScratch, add_successor, as_mdp, coordinates_of, finish_row, set_modelled
 
 
-class ModelArrays(ArrayStruct):
-    """The state of the kernel model; pair ``action * n_points + point`` is one state-action pair of the grid.
+class KernelLists(NamedTuple):
+    """The kept instances of each pair of the grid (pair ``action * n_points + point``).
 
     :param lists: kept instances of each pair, heaviest first, with their kernel weights
-    :param rows: what each settled pair leads to: grid points, with discounted probabilities (see ``build_row``)
-    :param predecessors: for each grid point those whose rows have led to it, with a bound on that probability
     :param entry: float64, shape (n_pairs,): the weight that a further instance needs to enter the pair's list
     :param total: float64, shape (n_pairs,): sum of the kept weights
-    :param known: bool, shape (n_pairs,): the target's own instances settle the pair
-    :param settled: bool, shape (n_pairs,): the pair has a row, from its own or with transferred instances
-    :param reward: float64, shape (n_pairs,): reward of the pair until its state is left
-    :param heard: float64, shape (n_pairs,): what ``total`` was when the row was brought up to date
-    :param n_optimistic: int64, shape (n_points,): actions of a grid point without a row
-    :param members: int32, shape (n_actions, capacity): in how many lists each instance stands
+    :param last_total: float64, shape (n_pairs,): what ``total`` was when the pair's row was updated
+    :param known: bool, shape (n_pairs,): the target's own instances suffice
+    :param n_lists: int32, shape (n_actions, capacity): how many lists each instance is in
     :param corner_low: int32, shape (n_actions, capacity, n_variables): the effect of each instance in cells, rounded down
-    :param corner_offset: int32, shape (n_actions, capacity, 2 ** n_variables): where, counted from a grid point that it
-        is applied to, the grid points around the place lie that the effect leads to; ``corner_weight``: float64, same
-        shape, their multilinear weights
+    :param corner_offset: int32, shape (n_actions, capacity, 2 ** n_variables): counted from a grid point that the effect
+        is applied to, the grid points around the state that it leads to; ``corner_weight``: float64, same shape, their
+        multilinear weights
     """
 
-    lists: Pool
-    rows: Pool
-    predecessors: Pool
+    lists: ListStore
     entry: np.ndarray
     total: np.ndarray
+    last_total: np.ndarray
     known: np.ndarray
-    settled: np.ndarray
-    reward: np.ndarray
-    heard: np.ndarray
-    n_optimistic: np.ndarray
-    members: np.ndarray
+    n_lists: np.ndarray
     corner_low: np.ndarray
     corner_offset: np.ndarray
     corner_weight: np.ndarray
 
+    def plain(self) -> tuple[Any, ...]:
+        """The same as plain tuples (see ``common.compiled``)."""
+        return tuple(self.lists), *self[1:]
 
-class Scratch(ArrayStruct):
-    """Work space of the compiled loops, allocated once.
+
+@inlined
+def as_lists(plain):
+    """:class:`KernelLists` from plain tuples."""
+    lists = ListStore(*plain[0])
+    return KernelLists(lists, plain[1], plain[2], plain[3], plain[4], plain[5], plain[6], plain[7], plain[8])
+
+
+class ReachScratch(NamedTuple):
+    """Work space for the grid points that an instance reaches.
 
     :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
-    :param first: int64, shape (n_variables,): first grid coordinate within reach; ``last``: one past the last
-    :param at: int64, shape (n_variables,): a grid coordinate
-    :param position: float64, shape (n_variables,)
-    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
-    :param dense: float64, shape (n_points,), all 0 between calls
-    :param touched: int64, shape (2 * n_points,)
-    :param told: float64, shape (n_points,), all 0 between calls
-    :param point: int64, shape (n_points,); ``weight``: float64, same shape: pairs that an instance reaches
+    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
+    :param point: int64, shape (n_points,): points within reach; ``weight``: float64, same shape: the instance's weight there
     """
 
     kernel: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
     at: np.ndarray
-    position: np.ndarray
-    corner_index: np.ndarray
-    corner_weight: np.ndarray
-    dense: np.ndarray
-    touched: np.ndarray
-    told: np.ndarray
     point: np.ndarray
     weight: np.ndarray
 
-    @classmethod
-    def for_grid(cls, grid) -> "Scratch":
-        """Work space for a :class:`StateGrid`."""
-        d, n_points = grid.n_variables, grid.n_points
-        return cls(
-            kernel=np.empty((d, int(grid.arrays.shape.max()))),
-            first=np.empty(d, dtype=np.int64),
-            last=np.empty(d, dtype=np.int64),
-            at=np.empty(d, dtype=np.int64),
-            position=np.empty(d),
-            corner_index=np.empty(2**d, dtype=np.int64),
-            corner_weight=np.empty(2**d),
-            dense=np.zeros(n_points),
-            touched=np.empty(2 * n_points, dtype=np.int64),
-            told=np.zeros(n_points),
-            point=np.empty(n_points, dtype=np.int64),
-            weight=np.empty(n_points),
-        )
+
+class Outcomes(NamedTuple):
+    """What the instances of a model lead to; three of the arrays of ``Instances``."""
+
+    effect: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
 
 
 @part
-def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
+def points_in_reach(state, kernel, grid, entry, scratch):
     """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
 
     The kernel is a product of one factor a variable, so the exponentials are few: one for each grid coordinate.
 
+    :param kernel: (breadth, min_weight, min_fraction)
     :param entry: float64, shape (n_points,)
     :return: how many; they and the weights are in ``scratch.point`` and ``scratch.weight``
     """
+    breadth, min_weight, _ = kernel
+    first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
     d = len(state)
     reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
     for k in range(d):
-        scratch.first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin[k])))
-        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin[k])) + 1
-        scratch.last[k] = min(grid.shape[k], beyond)
-        if scratch.first[k] >= scratch.last[k]:
+        first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin)))
+        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin)) + 1
+        last[k] = min(grid.shape[k], beyond)
+        if first[k] >= last[k]:
             return 0
-        for j in range(scratch.first[k], scratch.last[k]):
-            apart = ((j - grid.margin[k]) / grid.cells[k] - state[k]) / breadth
+        for j in range(first[k], last[k]):
+            apart = ((j - grid.margin) / grid.cells[k] - state[k]) / breadth
             scratch.kernel[k, j] = np.exp(-apart * apart)
-        scratch.at[k] = scratch.first[k]
+        at[k] = first[k]
     found = 0
     inner = d - 1
     while True:
         outer_weight = 1.0
         base = 0
         for k in range(inner):
-            outer_weight *= scratch.kernel[k, scratch.at[k]]
-            base += scratch.at[k] * grid.strides[k]
+            outer_weight *= scratch.kernel[k, at[k]]
+            base += at[k] * grid.strides[k]
         if outer_weight >= min_weight:
-            for j in range(scratch.first[inner], scratch.last[inner]):
+            for j in range(first[inner], last[inner]):
                 w = outer_weight * scratch.kernel[inner, j]
                 if w >= entry[base + j] and w >= min_weight:
                     scratch.point[found] = base + j
@@ -130,34 +113,37 @@ def points_in_reach(state, breadth, min_weight, grid, entry, scratch):
                     found += 1
         k = inner - 1
         while k >= 0:
-            scratch.at[k] += 1
-            if scratch.at[k] < scratch.last[k]:
+            at[k] += 1
+            if at[k] < last[k]:
                 break
-            scratch.at[k] = scratch.first[k]
+            at[k] = first[k]
             k -= 1
         if k < 0:
             return found
 
 
-@compiled
-def enter(instances, arrays, grid, kernel, thresholds, action, slot, state, next_state, reward, terminated, scratch, progress):
+@part
+def enter(instances, arrays, grid, kernel, thresholds, transition, scratch, progress):
     """Write an instance to its slot, and put it into the lists of all pairs that it reaches.
 
     :param kernel: (breadth, min_weight, min_fraction)
-    :param thresholds: (weight that makes a pair known, change of its weight that makes another one worth settling anew)
-    :param progress: int64, shape (3,): pairs in reach, how many of them are done, and how many of these are worth settling
-        anew, whose points are moved to the front of ``scratch.point``; {-1, 0, 0} at first
-    :return: False if the lists' pool must grow before another call goes on
+    :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
+        row is to be updated)
+    :param transition: (action, slot, state, next_state, reward, terminated)
+    :param progress: int64, shape (3,): pairs in reach, how many of them are done, and how many of these are to be updated,
+        whose points are moved to the front of ``scratch.point``; {-1, 0, 0} at first
+    :return: False if there is no room for the lists: they must grow before another call goes on
     """
-    breadth, min_weight, min_fraction = kernel
-    threshold, news = thresholds
-    n_points = len(arrays.n_optimistic)
+    _, _, min_fraction = kernel
+    threshold, min_change = thresholds
+    action, slot, _, _, _, _ = transition
+    n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
     if progress[0] < 0:
-        put_instance(instances, action, slot, state, next_state, reward, terminated)
+        put_instance(instances, transition)
         note_corners(arrays, instances.effect[action, slot], grid, action, slot)
         entry = arrays.entry[first_pair : first_pair + n_points]
-        progress[0] = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, entry, scratch)
+        progress[0] = points_in_reach(instances.state[action, slot], kernel, grid, entry, scratch)
     lists = arrays.lists
     while progress[1] < progress[0]:
         point = scratch.point[progress[1]]
@@ -167,18 +153,16 @@ def enter(instances, arrays, grid, kernel, thresholds, action, slot, state, next
             return False
         start = lists.start[pair]
         weight = scratch.weight[progress[1]]
-        kept, total = insert_by_weight(
-            lists.index, lists.weight, start, length, arrays.total[pair], slot, weight, min_fraction
-        )
-        arrays.members[action, slot] += 1
+        kept, total = insert_by_weight(lists.item, lists.weight, start, length, arrays.total[pair], slot, weight, min_fraction)
+        arrays.n_lists[action, slot] += 1
         for k in range(start + kept, start + length + 1):
-            arrays.members[action, lists.index[k]] -= 1
+            arrays.n_lists[action, lists.item[k]] -= 1
         lists.length[pair] = kept
         arrays.total[pair] = total
         arrays.entry[pair] = min(lists.weight[start + kept - 1], min_fraction * total)
         if total >= threshold:
             arrays.known[pair] = True
-        if arrays.known[pair] or abs(total - arrays.heard[pair]) >= news:
+        if arrays.known[pair] or abs(total - arrays.last_total[pair]) >= min_change:
             scratch.point[progress[2]] = point
             progress[2] += 1
         progress[1] += 1
@@ -186,16 +170,23 @@ def enter(instances, arrays, grid, kernel, thresholds, action, slot, state, next
 
 
 @compiled
+def enter_plain(instances, arrays, grid, kernel, thresholds, transition, scratch, progress):
+    """:func:`enter` for callers from Python, with plain tuples."""
+    instances, arrays, grid, scratch = Instances(*instances), as_lists(arrays), GridArrays(*grid), ReachScratch(*scratch)
+    return enter(instances, arrays, grid, kernel, thresholds, transition, scratch, progress)
+
+
+@compiled
 def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch):
-    """Take an instance out of the lists in which it stands.
+    """Take an instance out of the lists that it is in.
 
     :param kernel: (breadth, min_weight, min_fraction)
     :param anywhere: zeros, shape (n_points,)
     :return: how many lists changed; their points are moved to the front of ``scratch.point``
     """
-    breadth, min_weight, min_fraction = kernel
-    n_found = points_in_reach(instances.state[action, slot], breadth, min_weight, grid, anywhere, scratch)
-    first_pair = action * len(arrays.n_optimistic)
+    _, _, min_fraction = kernel
+    n_found = points_in_reach(instances.state[action, slot], kernel, grid, anywhere, scratch)
+    first_pair = action * grid.shape[0] * grid.strides[0]
     lists = arrays.lists
     changed = 0
     for f in range(n_found):
@@ -204,12 +195,12 @@ def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch
         start = lists.start[pair]
         length = lists.length[pair]
         k = 0
-        while k < length and lists.index[start + k] != slot:
+        while k < length and lists.item[start + k] != slot:
             k += 1
         if k == length:
             continue
         for j in range(start + k, start + length - 1):
-            lists.index[j] = lists.index[j + 1]
+            lists.item[j] = lists.item[j + 1]
             lists.weight[j] = lists.weight[j + 1]
         lists.length[pair] = length - 1
         _, arrays.total[pair] = cut_by_fraction(lists.weight, start, length - 1, min_fraction)
@@ -220,13 +211,13 @@ def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch
             arrays.entry[pair] = min(lists.weight[start + length - 2], min_fraction * arrays.total[pair])
         scratch.point[changed] = point
         changed += 1
-    arrays.members[action, slot] = 0
+    arrays.n_lists[action, slot] = 0
     return changed
 
 
 @part
 def note_corners(arrays, effect, grid, action, slot):
-    """Work out ``corner_low``, ``corner_offset`` and ``corner_weight`` of an instance: the same for all grid points."""
+    """Compute ``corner_low``, ``corner_offset`` and ``corner_weight`` of an instance: the same for all grid points."""
     low = arrays.corner_low[action, slot]
     offset = arrays.corner_offset[action, slot]
     weight = arrays.corner_weight[action, slot]
@@ -236,22 +227,25 @@ def note_corners(arrays, effect, grid, action, slot):
     for k in range(len(effect)):
         moved = effect[k] * grid.cells[k]
         low[k] = int(np.floor(moved))
-        part = moved - low[k]
+        fraction = moved - low[k]
         for c in range(n_corners):
             offset[c] += low[k] * grid.strides[k]
             offset[n_corners + c] = offset[c] + grid.strides[k]
-            weight[n_corners + c] = weight[c] * part
-            weight[c] *= 1.0 - part
+            weight[n_corners + c] = weight[c] * fraction
+            weight[c] *= 1.0 - fraction
         n_corners *= 2
 
 
 @part
-def scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_touched):
-    """Spread probability ``p`` of the effect of an instance from a grid point, at ``scratch.at``, over grid points."""
+def add_instance(p, arrays, effect, action, i, point, scratch, grid, n_touched):
+    """Add the successors of an instance, of probability ``p``, at a grid point with coordinates ``scratch.at``.
+
+    :return: see ``add_successor``
+    """
     for k in range(len(grid.shape)):
         low = scratch.at[k] + arrays.corner_low[action, i, k]
         if low < 0 or low + 1 >= grid.shape[k]:
-            return scatter(p, instances.effect[action, i], scratch, grid, n_touched)
+            return add_successor(p, effect, scratch, grid, n_touched)
     for c in range(arrays.corner_offset.shape[2]):
         weight = arrays.corner_weight[action, i, c]
         if weight > 0.0:
@@ -263,169 +257,64 @@ def scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_to
     return n_touched
 
 
-@inner
-def scatter(p, effect, scratch, grid, n_touched):
-    """Spread probability ``p`` of moving by ``effect`` from the grid coordinate ``scratch.at`` over grid points."""
-    for k in range(len(effect)):
-        scratch.position[k] = scratch.at[k] + effect[k] * grid.cells[k]
-    n_corners = corners_of(scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
-    for c in range(n_corners):
-        point = scratch.corner_index[c]
-        if scratch.dense[point] == 0.0:
-            scratch.touched[n_touched] = point
-            n_touched += 1
-        scratch.dense[point] += p * scratch.corner_weight[c]
-    return n_touched
-
-
-@inlined
-def next_power(weight):
-    """The least power of two that is not below ``weight``."""
-    return 2.0 ** np.ceil(np.log2(weight))
-
-
-@inner
-def note_predecessor(predecessors, to, point, weight):
-    """Enter ``point`` among those that lead ``to`` a point with a probability of ``weight``; False if the pool must grow.
-
-    The next power of two is noted, so that a little more of the same is no news: to find one among the predecessors
-    takes longer than to work out an entry of a row.
-    """
-    weight = next_power(weight)
-    start = predecessors.start[to]
-    length = predecessors.length[to]
-    for k in range(start, start + length):
-        if predecessors.index[k] == point:
-            predecessors.weight[k] = max(predecessors.weight[k], weight)
-            return True
-    if not reserve(predecessors, to, length + 1):
-        return False
-    end = predecessors.start[to] + length
-    predecessors.index[end] = point
-    predecessors.weight[end] = weight
-    predecessors.length[to] = length + 1
-    return True
-
-
 @part
-def store_row(arrays, pair, point, n_touched, discount, scratch):
-    """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and have predecessors noted.
+def add_own(arrays, outcomes, pair, total, grid, scratch):
+    """Add what a pair's own instances predict; the expected reward, and see ``add_successor``.
 
-    :param discount: 0: the row is left empty
-    :return: False if the predecessors' pool must grow; the row is empty then
+    :param total: weight of all instances of the pair, transferred ones included
     """
-    slot = arrays.rows.start[pair]
-    n_old = arrays.rows.length[pair]
-    for k in range(n_old):
-        to = arrays.rows.index[slot + k]
-        scratch.told[to] = arrays.rows.weight[slot + k]
-        scratch.touched[n_touched + k] = to
-    length = 0
-    room = True
-    for t in range(n_touched):
-        to = scratch.touched[t]
-        if to != point and discount > 0.0:
-            weight = scratch.dense[to] * discount
-            told = scratch.told[to]
-            if weight > told and (told == 0.0 or weight > next_power(told)):
-                room = room and note_predecessor(arrays.predecessors, to, point, weight)
-            arrays.rows.index[slot + length] = to
-            arrays.rows.weight[slot + length] = weight
-            length += 1
-        scratch.dense[to] = 0.0
-    for t in range(n_touched, n_touched + n_old):
-        scratch.told[scratch.touched[t]] = 0.0
-    arrays.rows.length[pair] = length if room else 0
-    return room
-
-
-@part
-def build_row(arrays, instances, grid, gamma, pair, supply, s, scratch):
-    """Turn a pair's instances into its row: R and discounted probabilities of the *other* grid points.
-
-    A grid point is often its own successor. Staying is summed as the geometric series it is: reward and
-    probabilities are divided by 1 - gamma * P(stay), which leaves the fixed point of the value function as it was
-    and saves most of the sweeps. A pair that never leaves gets an infinite reward (of the reward's sign), which the
-    planner cuts to its bounds; so does one whose instances are all that is known of a terminal reward of 0.
-
-    :param s: row of ``supply`` that belongs to the pair; counts only while the pair is not known
-    :return: False if a pool must grow first
-    """
-    n_points = len(arrays.n_optimistic)
+    n_points = grid.shape[0] * grid.strides[0]
     action = pair // n_points
     point = pair - action * n_points
     start = arrays.lists.start[pair]
-    n_own = arrays.lists.length[pair]
-    n_supplied = 0 if arrays.known[pair] else supply.count[s]
-    total = arrays.total[pair] if n_own > 0 else 0.0
-    for j in range(n_supplied):
-        total += supply.weight[s, j]
-    rest = point
-    for k in range(len(grid.shape)):
-        scratch.at[k] = rest // grid.strides[k]
-        rest -= scratch.at[k] * grid.strides[k]
     reward = 0.0
     n_touched = np.int64(0)
-    for k in range(start, start + n_own):
-        i = arrays.lists.index[k]
+    for k in range(start, start + arrays.lists.length[pair]):
+        i = arrays.lists.item[k]
         p = arrays.lists.weight[k] / total
-        reward += p * instances.reward[action, i]
-        if not instances.terminated[action, i]:
-            n_touched = scatter_instance(p, arrays, instances, action, i, point, scratch, grid, n_touched)
-    for j in range(n_supplied):
-        p = supply.weight[s, j] / total
-        reward += p * supply.reward[s, j]
-        if not supply.terminated[s, j]:
-            n_touched = scatter(p, supply.effect[s, j], scratch, grid, n_touched)
-    if not reserve(arrays.rows, pair, n_touched):
-        for t in range(n_touched):
-            scratch.dense[scratch.touched[t]] = 0.0
-        return False
-    leave = 1.0 - gamma * scratch.dense[point]
-    stays_for_ever = leave < 1e-9
-    discount = 0.0 if stays_for_ever else gamma / leave
-    if not store_row(arrays, pair, point, n_touched, discount, scratch):
-        return False
-    if stays_for_ever:
-        arrays.reward[pair] = 0.0 if reward == 0.0 else np.inf * reward
-    else:
-        arrays.reward[pair] = reward / leave
-    return True
+        reward += p * outcomes.reward[action, i]
+        if not outcomes.terminated[action, i]:
+            effect = outcomes.effect[action, i]
+            n_touched = add_instance(p, arrays, effect, action, i, point, scratch, grid, n_touched)
+    return reward, n_touched
 
 
-@compiled
-def settle(arrays, instances, grid, gamma, pairs, done, supply, scratch):
-    """Bring the rows of ``pairs`` up to date with their lists and the supply of transferred instances.
+@part
+def update_rows(arrays, outcomes, mdp, grid, gamma, pairs, transferred, scratch):
+    """Bring the rows of ``pairs`` up to date with their lists and with transferred instances.
 
-    :return: how many of them are done; fewer than all if a pool must grow first
+    :param pairs: (pairs, how many of them are done)
+    :param transferred: a row for each of them, which counts only while the pair is not known
+    :return: how many of them are done; fewer than all if there is no room in the MDP
     """
-    n_points = len(arrays.n_optimistic)
+    pairs, done = pairs
+    n_points = len(mdp.n_optimistic)
     while done < len(pairs):
         pair = pairs[done]
-        has_row = arrays.known[pair] or supply.count[done] > 0
-        if has_row and not build_row(arrays, instances, grid, gamma, pair, supply, done, scratch):
-            return done
-        arrays.heard[pair] = arrays.total[pair]
-        if has_row != arrays.settled[pair]:
-            if not has_row:
-                arrays.rows.length[pair] = 0
-                arrays.reward[pair] = 0.0
-            arrays.settled[pair] = has_row
-            arrays.n_optimistic[pair % n_points] += -1 if has_row else 1
+        n_transferred = 0 if arrays.known[pair] else transferred.length[done]
+        modelled = arrays.known[pair] or n_transferred > 0
+        if modelled:
+            point = pair % n_points
+            coordinates_of(point, grid, scratch.at)
+            total = arrays.total[pair] if arrays.lists.length[pair] > 0 else 0.0
+            for j in range(n_transferred):
+                total += transferred.weight[done, j]
+            reward, n_touched = add_own(arrays, outcomes, pair, total, grid, scratch)
+            for j in range(n_transferred):
+                p = transferred.weight[done, j] / total
+                reward += p * transferred.reward[done, j]
+                if not transferred.terminated[done, j]:
+                    n_touched = add_successor(p, transferred.effect[done, j], scratch, grid, n_touched)
+            if not finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
+                return done
+        arrays.last_total[pair] = arrays.total[pair]
+        set_modelled(mdp, pair, modelled)
         done += 1
     return done
 
 
 @compiled
-def renew_predecessors(arrays):
-    """Forget predecessors that no row needs any more; False if their pool must grow before another call."""
-    arrays.predecessors.length[:] = np.int32(0)
-    n_points = len(arrays.n_optimistic)
-    for pair in range(len(arrays.reward)):
-        if arrays.settled[pair]:
-            start = arrays.rows.start[pair]
-            for k in range(start, start + arrays.rows.length[pair]):
-                to = np.int64(arrays.rows.index[k])
-                if not note_predecessor(arrays.predecessors, to, pair % n_points, arrays.rows.weight[k]):
-                    return False
-    return True
+def update_rows_plain(arrays, outcomes, mdp, grid, gamma, pairs, transferred, scratch):
+    """:func:`update_rows` for callers from Python, with plain tuples."""
+    arrays, outcomes, grid, scratch = as_lists(arrays), Outcomes(*outcomes), GridArrays(*grid), RowScratch(*scratch)
+    return update_rows(arrays, outcomes, as_mdp(mdp), grid, gamma, pairs, TransferredInstances(*transferred), scratch)

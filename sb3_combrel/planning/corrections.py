@@ -1,38 +1,39 @@
 """Corrections of the interpolated value function where the agent makes no progress, in the manner of LRTA*.
 
-Between grid points the interpolated value can promise a way that does not exist: at a joint limit or a wall the grid
-points beyond were fitted to instances that moved freely. Acting greedily on such a promise can hold an agent in place
-for ever. A state to which the agent has come back ``PATIENCE`` times within an episode is such a place. There, when
-the interpolated value exceeds the best action value, that action value is remembered and caps the value of states in
-the same small cell. Each further visit lowers the cap, until another way looks better.
+Between grid points the interpolated value can be far too high: at a joint limit or a wall the grid points beyond were fitted
+to instances that moved freely. Acting greedily on it can keep an agent in place for ever. A state to which the agent has
+returned ``MAX_VISITS`` times within an episode is such a place. There, when the interpolated value exceeds the best action
+value, that action value is stored and caps the value of states in the same small cell. Each further visit lowers the cap,
+until another action looks better.
 
-Where the agent does make progress nothing is corrected: values that are true along the path taken and too hopeful
-beside it would make every other path look better than the one that works.
+Where the agent does make progress nothing is corrected: values that are right along the path taken and too high beside it
+would make every other path look better than the one that works.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inlined, part
-from sb3_combrel.common.kernels import interpolate
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
+from sb3_combrel.planning.grid import interpolate
 
 CELLS_PER_GRID_CELL = 3
-# Box edges, joint limits and round step lengths lie on round numbers. A state on a cell's edge would be remembered on one
-# side of it and looked for, one rounding error later, on the other: for ever without effect.
+# Box edges, joint limits and round step lengths lie on round numbers. A state on a cell's edge would be stored on one side
+# of it and looked up, one rounding error later, on the other: for ever without effect.
 CELL_OFFSET = 0.4142
-PATIENCE = 10
+MAX_VISITS = 10
 VISIT_TABLE_SIZE = 1 << 14
 
 
-class CorrectionArrays(ArrayStruct):
-    """Remembered states, found by an open-addressing hash table of the cells they lie in.
+class CorrectionArrays(NamedTuple):
+    """Corrected states, found by an open-addressing hash table of the small cells they lie in.
 
-    :param table: int32, shape (power of two,): number of a remembered state, -1 for none
-    :param key: int64, shape (capacity,): the cell of each remembered state
+    :param table: int32, shape (power of two,): number of a corrected state, -1 for none
+    :param key: int64, shape (capacity,): the cell of each corrected state
     :param state: float64, shape (capacity, n_variables), unit coordinates: the last state visited in the cell
     :param value: float64, shape (capacity,): the best action value there
-    :param count: int64, shape (1,)
-    :param visit_key: int64, shape (VISIT_TABLE_SIZE,): cells visited lately, hashed with what tells episodes apart
+    :param n_states: int64, shape (1,): how many there are
+    :param visit_key: int64, shape (VISIT_TABLE_SIZE,): cells visited lately, hashed with the number of the episode
     :param visits: int32, same shape: how often
     """
 
@@ -40,48 +41,89 @@ class CorrectionArrays(ArrayStruct):
     key: np.ndarray
     state: np.ndarray
     value: np.ndarray
-    count: np.ndarray
+    n_states: np.ndarray
     visit_key: np.ndarray
     visits: np.ndarray
 
     @classmethod
     def empty(cls, n_variables: int, capacity: int = 256) -> "CorrectionArrays":
-        """Nothing remembered yet."""
+        """
+        Make room for corrections.
+
+        :param n_variables: number of state variables
+        :param capacity: how many there is room for, a power of two
+        """
         return cls(
             table=np.full(4 * capacity, -1, dtype=np.int32),
             key=np.empty(capacity, dtype=np.int64),
             state=np.empty((capacity, n_variables)),
             value=np.empty(capacity),
-            count=np.zeros(1, dtype=np.int64),
+            n_states=np.zeros(1, dtype=np.int64),
             visit_key=np.full(VISIT_TABLE_SIZE, -1, dtype=np.int64),
             visits=np.zeros(VISIT_TABLE_SIZE, dtype=np.int32),
         )
 
     @classmethod
-    def of_rows(cls, key: np.ndarray, value: np.ndarray, state: np.ndarray) -> "CorrectionArrays":
-        """Those given one a row; of rows with the same key the last one is found."""
-        n = len(key)
+    def of_rows(cls, rows: np.ndarray) -> "CorrectionArrays":
+        """
+        Build them from :meth:`rows`; of rows with the same key the last one is found.
+
+        :param rows: float64, shape (n, 2 + n_variables)
+        """
+        n = len(rows)
         capacity = 256
         while capacity < n:
             capacity *= 2
-        held = cls.empty(state.shape[1], capacity)
-        held.key[:n], held.value[:n], held.state[:n] = key, value, state
-        held.count[0] = n
-        note_all(held)
-        return held
+        made = cls.empty(rows.shape[1] - 2, capacity)
+        made.key[:n], made.value[:n], made.state[:n] = rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2:]
+        made.n_states[0] = n
+        _enter_all.call(made)
+        return made
+
+    def rows(self) -> np.ndarray:
+        """Key, value and state of each corrected state, float64, shape (n_states, 2 + n_variables)."""
+        n = int(self.n_states[0])
+        return np.column_stack([self.key[:n], self.value[:n], self.state[:n]])
 
     def with_room(self) -> "CorrectionArrays":
-        """Itself, or a copy of twice the size if one more state would not fit."""
+        """
+        Double the room if one more state would not fit.
+
+        :return: itself, or a copy with the same corrections
+        """
         capacity = len(self.key)
-        n = int(self.count[0])
+        n = int(self.n_states[0])
         if n < capacity:
             return self
         larger = CorrectionArrays.empty(self.state.shape[1], 2 * capacity)
         larger.key[:n], larger.state[:n], larger.value[:n] = self.key, self.state, self.value
-        larger.count[0] = n
-        larger = larger.replace(visit_key=self.visit_key, visits=self.visits)
-        note_all(larger)
+        larger.n_states[0] = n
+        larger = larger._replace(visit_key=self.visit_key, visits=self.visits)
+        _enter_all.call(larger)
         return larger
+
+
+class ValueScratch(NamedTuple):
+    """Work space for values between grid points.
+
+    :param position: float64, shape (n_variables,), grid coordinates; ``corrected``: the same
+    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
+    """
+
+    position: np.ndarray
+    corrected: np.ndarray
+    corner_index: np.ndarray
+    corner_weight: np.ndarray
+
+    @classmethod
+    def for_variables(cls, n_variables: int) -> "ValueScratch":
+        """Make work space for so many state variables."""
+        return cls(
+            position=np.empty(n_variables),
+            corrected=np.empty(n_variables),
+            corner_index=np.empty(2**n_variables, dtype=np.int64),
+            corner_weight=np.empty(2**n_variables),
+        )
 
 
 @inlined
@@ -96,39 +138,42 @@ def cell_key(position, shape):
 
 
 @inlined
-def find_cell(corrections, key):
+def find_cell(table, keys, key):
     """Where in the table ``key`` stands, or the free place where it would."""
-    mask = len(corrections.table) - 1
+    mask = len(table) - 1
     at = (key * 0x9E3779B1 >> 7) & mask
-    while corrections.table[at] >= 0 and corrections.key[corrections.table[at]] != key:
+    while table[at] >= 0 and keys[table[at]] != key:
         at = (at + 1) & mask
     return at
 
 
 @compiled
-def note_all(corrections):
-    """Enter all remembered states in the table."""
-    for m in range(corrections.count[0]):
-        corrections.table[find_cell(corrections, corrections.key[m])] = m
+def enter_all(corrections):
+    """Enter all corrected states in the table."""
+    for m in range(corrections.n_states[0]):
+        corrections.table[find_cell(corrections.table, corrections.key, corrections.key[m])] = m
+
+
+_enter_all = EntryPoint(enter_all)
 
 
 @inlined
-def corrected_value(values, corrections, position, grid, scratch):
-    """The value at ``position`` (unit coordinates times cells): interpolated, and cut by what is remembered there."""
-    value = interpolate(values, position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
-    if corrections.count[0] > 0:
-        m = corrections.table[find_cell(corrections, cell_key(position, grid.shape))]
+def corrected_value(values, corrections, grid, scratch):
+    """The value at ``scratch.position``: interpolated, and capped if the cell has been corrected."""
+    value = interpolate(values, scratch.position, grid, scratch.corner_index, scratch.corner_weight)
+    if corrections.n_states[0] > 0:
+        m = corrections.table[find_cell(corrections.table, corrections.key, cell_key(scratch.position, grid.shape))]
         if m >= 0:
-            value = cut_value(value, m, values, corrections, grid, scratch)
+            value = cap_value(value, m, values, corrections, grid, scratch)
     return value
 
 
 @part
-def cut_value(value, m, values, corrections, grid, scratch):
-    """``value`` cut by what is remembered as number ``m``: as much as the value there was too large."""
-    for k in range(len(scratch.there)):
-        scratch.there[k] = corrections.state[m, k] * grid.cells[k] + grid.margin[k]
-    there = interpolate(values, scratch.there, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
+def cap_value(value, m, values, corrections, grid, scratch):
+    """``value``, lowered by as much as the interpolated value at corrected state ``m`` is too high."""
+    for k in range(len(scratch.corrected)):
+        scratch.corrected[k] = corrections.state[m, k] * grid.cells[k] + grid.margin
+    there = interpolate(values, scratch.corrected, grid, scratch.corner_index, scratch.corner_weight)
     return value + min(0.0, corrections.value[m] - there)
 
 
@@ -136,7 +181,7 @@ def cut_value(value, m, values, corrections, grid, scratch):
 def count_visit(corrections, key, episode):
     """How often the cell was visited in this episode, this visit included.
 
-    A direct-mapped table: where two cells share a place, the later one starts afresh.
+    A direct-mapped table: where two cells share a place, the count of the later one starts at 1.
     """
     tagged = key * 1000003 + episode
     at = (tagged * 0x9E3779B1 >> 7) & (VISIT_TABLE_SIZE - 1)
@@ -149,27 +194,27 @@ def count_visit(corrections, key, episode):
 
 @part
 def visit(values, corrections, state, best_q, visitor, grid, scratch):
-    """Count a visit to ``state``; renew what is remembered of its cell, or start to remember it (see the module).
+    """Count a visit to ``state``; renew the correction of its cell, or add one (see the module).
 
     :param best_q: the largest action value at ``state``
-    :param visitor: (episode, tolerance, patience): a number that tells episodes (of all environments) apart; the excess
-        of the interpolated value that is not yet a wrong promise; visits in an episode that do not count
+    :param visitor: (episode, tolerance, max_visits): a number that tells episodes (of all environments) apart; the excess
+        of the interpolated value that is not corrected; visits in an episode before which nothing is
     """
     for k in range(len(state)):
-        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
+        scratch.position[k] = state[k] * grid.cells[k] + grid.margin
     key = cell_key(scratch.position, grid.shape)
-    at = find_cell(corrections, key)
+    at = find_cell(corrections.table, corrections.key, key)
     m = corrections.table[at]
-    episode, tolerance, patience = visitor
+    episode, tolerance, max_visits = visitor
     visits = count_visit(corrections, key, episode)
     if m < 0:
-        if visits <= patience:
+        if visits <= max_visits:
             return
-        value = interpolate(values, scratch.position, grid.shape, grid.strides, scratch.corner_index, scratch.corner_weight)
+        value = interpolate(values, scratch.position, grid, scratch.corner_index, scratch.corner_weight)
         if value - best_q <= tolerance:
             return
-        m = corrections.count[0]
-        corrections.count[0] = m + 1
+        m = corrections.n_states[0]
+        corrections.n_states[0] = m + 1
         corrections.table[at] = m
         corrections.key[m] = key
     corrections.value[m] = best_q

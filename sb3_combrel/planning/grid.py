@@ -4,20 +4,20 @@ import os
 import warnings
 from collections.abc import Sequence
 
+from typing import NamedTuple
+
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled
-from sb3_combrel.common.kernels import interpolate
+from sb3_combrel.common.compiled import compiled, inlined
 
 
-class GridArrays(ArrayStruct):
+class GridArrays(NamedTuple):
     """What compiled code needs to know of a grid.
 
     :param shape: int64, shape (n_variables,): points along each variable
     :param strides: int64, same shape: what one step along a variable adds to a point's number
     :param cells: float64, same shape: cells per unit
-    :param margin: float64, same shape: cells beyond either end of the unit box
+    :param margin: cells beyond either end of the unit box
 
     A state with unit coordinates u has *grid coordinates* u * cells + margin: whole numbers at the grid points.
     """
@@ -25,13 +25,50 @@ class GridArrays(ArrayStruct):
     shape: np.ndarray
     strides: np.ndarray
     cells: np.ndarray
-    margin: np.ndarray
+    margin: float
+
+
+@inlined
+def corners_of(position, grid, corner_index, corner_weight):
+    """Grid points around ``position`` and their multilinear weights.
+
+    :param position: float64, shape (n_variables,): grid coordinates; clipped into the grid
+    :param corner_index: int64 scratch, shape (2 ** n_variables,)
+    :param corner_weight: float64 scratch of the same shape
+    :return: how many corners have a weight above 0
+    """
+    corner_index[0] = 0
+    corner_weight[0] = 1.0
+    n_corners = 1
+    for k in range(len(position)):
+        last = grid.shape[k] - 1
+        at = min(max(position[k], 0.0), float(last))
+        low = int(at)
+        part = at - low
+        for c in range(n_corners):
+            corner_index[c] += low * grid.strides[k]
+        if part > 0.0:
+            for c in range(n_corners):
+                corner_index[n_corners + c] = corner_index[c] + grid.strides[k]
+                corner_weight[n_corners + c] = corner_weight[c] * part
+                corner_weight[c] *= 1.0 - part
+            n_corners *= 2
+    return n_corners
+
+
+@inlined
+def interpolate(values, position, grid, corner_index, corner_weight):
+    """The value at ``position`` (see :func:`corners_of`), multilinear between the grid points."""
+    value = 0.0
+    for c in range(corners_of(position, grid, corner_index, corner_weight)):
+        value += corner_weight[c] * values[corner_index[c]]
+    return value
 
 
 @compiled
-def interpolate_once(values, position, shape, strides, corner_index, corner_weight):
+def interpolate_once(values, position, grid, corner_index, corner_weight):
     """:func:`interpolate` for callers from Python."""
-    return interpolate(values, position, shape, strides, corner_index, corner_weight)
+    return interpolate(values, position, grid, corner_index, corner_weight)
 
 
 class StateGrid:
@@ -53,9 +90,9 @@ class StateGrid:
         self.resolution = tuple(int(r) for r in per_variable)
         self.margin = margin
         self.n_points = int(np.prod(shape))
-        self.arrays = GridArrays(
-            shape=shape, strides=strides, cells=2.0**per_variable, margin=np.full(n_variables, float(margin))
-        )
+        self.arrays = GridArrays(shape=shape, strides=strides, cells=2.0**per_variable, margin=float(margin))
+        # The same as a plain tuple (see ``common.compiled``).
+        self.plain = tuple(self.arrays)
         self._corner_index = np.empty(2**n_variables, dtype=np.int64)
         self._corner_weight = np.empty(2**n_variables)
 
@@ -71,9 +108,7 @@ class StateGrid:
         :param state: unit coordinates, shape (n_variables,); outside the grid the nearest point of it counts
         """
         position = state * self.arrays.cells + self.margin
-        return interpolate_once(
-            values, position, self.arrays.shape, self.arrays.strides, self._corner_index, self._corner_weight
-        )
+        return interpolate_once(values, position, self.arrays, self._corner_index, self._corner_weight)
 
 
 def default_resolution(n_variables: int, reach: float) -> int:

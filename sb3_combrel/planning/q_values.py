@@ -1,144 +1,124 @@
-"""Q at an exact state: from the instances near it, not from the grid's Q."""
+"""Q at an exact state: from what the model predicts there, not from the grid's Q."""
+
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inlined, part
-from sb3_combrel.common.kernels import near_instances
-from sb3_combrel.planning.corrections import corrected_value, visit
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
+from sb3_combrel.planning.corrections import CorrectionArrays, ValueScratch, corrected_value, visit
+from sb3_combrel.planning.grid import GridArrays
+
+NEVER_LEAVES = 1e-9
 
 
-class QueryScratch(ArrayStruct):
-    """Work space and results of a query at one state.
+class Prediction(NamedTuple):
+    """What a model predicts at one state, one row an action. Unit coordinates.
 
-    :param index: int32, shape (n_actions, list room): kept instances of each action, nearest first
-    :param weight: float64, same shape
-    :param length: int64, shape (n_actions,); ``total``: float64, same shape: sum of the weights
-    :param position: float64, shape (n_variables,); ``there``: the same
-    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
+    :param modelled: bool, shape (n_actions,): the action has a model; the others are optimistic
+    :param weight: float64, shape (n_actions,): weight of the target's own instances behind it
+    :param reward: float64, shape (n_actions,): expected reward
+    :param length: int64, shape (n_actions,): how many successors it has
+    :param probability: float64, shape (n_actions, max_successors); what is missing to 1 ends the episode
+    :param effect: float64, shape (n_actions, max_successors, n_variables): displacement to each successor
     """
 
-    index: np.ndarray
+    modelled: np.ndarray
     weight: np.ndarray
+    reward: np.ndarray
     length: np.ndarray
-    total: np.ndarray
-    position: np.ndarray
-    there: np.ndarray
-    corner_index: np.ndarray
-    corner_weight: np.ndarray
+    probability: np.ndarray
+    effect: np.ndarray
 
     @classmethod
-    def empty(cls, n_actions: int, n_variables: int, room: int) -> "QueryScratch":
-        """Work space for lists of up to ``room`` instances."""
+    def empty(cls, n_actions: int, max_successors: int, n_variables: int) -> "Prediction":
+        """Make room for so many successors of each action; no action has a model."""
         return cls(
-            index=np.empty((n_actions, room), dtype=np.int32),
-            weight=np.empty((n_actions, room)),
+            modelled=np.zeros(n_actions, dtype=np.bool_),
+            weight=np.zeros(n_actions),
+            reward=np.zeros(n_actions),
             length=np.zeros(n_actions, dtype=np.int64),
-            total=np.zeros(n_actions),
-            position=np.empty(n_variables),
-            there=np.empty(n_variables),
-            corner_index=np.empty(2**n_variables, dtype=np.int64),
-            corner_weight=np.empty(2**n_variables),
+            probability=np.zeros((n_actions, max_successors)),
+            effect=np.zeros((n_actions, max_successors, n_variables)),
         )
 
 
-@compiled
-def find_near(instances, state, kernel, query):
-    """Fill ``query`` with the instances that the kernel keeps at ``state``, for every action.
+class ValueFunction(NamedTuple):
+    """The value of any state.
 
-    :param kernel: (breadth, min_weight, min_fraction)
-    :return: the least sum of weights that an action has
+    :param values: float64, shape (n_points,), at the grid points
+    :param corrections: caps on what is interpolated between them
+    :param grid: the arrays of the grid; from Python, ``StateGrid.plain``
+    :param gamma: discount factor
+    :param bounds: (min_value, max_value); an optimistic action has the latter
     """
-    breadth, min_weight, min_fraction = kernel
-    least = np.inf
-    for action in range(len(query.length)):
-        query.length[action], query.total[action] = near_instances(
-            instances,
-            action,
-            state,
-            breadth,
-            min_weight,
-            min_fraction,
-            query.index[action],
-            query.weight[action],
-            query.length[action],
-        )
-        least = min(least, query.total[action])
-    return least
+
+    values: np.ndarray
+    corrections: CorrectionArrays
+    grid: Any
+    gamma: float
+    bounds: tuple[float, float]
+
+    def plain(self) -> tuple[Any, ...]:
+        """The same as plain tuples (see ``common.compiled``)."""
+        return self.values, tuple(self.corrections), self.grid, self.gamma, self.bounds
 
 
 @inlined
-def add_successor(p, state, effect, values, corrections, grid, query):
-    """(undiscounted value, probability to stay) that one instance adds to a backup at ``state``."""
+def moves(state, effect, grid, scratch):
+    """Write where ``effect`` leads from ``state`` to ``scratch.position`` (grid coordinates); whether that is elsewhere."""
     moved = 0.0
     for k in range(len(state)):
         last = float(grid.shape[k] - 1)
-        here = state[k] * grid.cells[k] + grid.margin[k]
+        here = state[k] * grid.cells[k] + grid.margin
         there = min(max(here + effect[k] * grid.cells[k], 0.0), last)
         moved = max(moved, abs(there - here))
-        query.position[k] = there
-    if moved < 1e-9:
-        return 0.0, p
-    return p * corrected_value(values, corrections, query.position, grid, query), 0.0
+        scratch.position[k] = there
+    return moved >= 1e-9
 
 
 @part
-def q_values(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q):
-    """Q of every action at ``state``, from the lists in ``query`` and the supply for it.
+def q_values(prediction, state, function, q, scratch):
+    """Q of every action at ``state``.
 
     An effect of exactly nothing leads back to the state itself, whose value is the maximum sought, not the
-    interpolated one: as in ``build_row``, staying is summed as a geometric series.
+    interpolated one: as in ``finish_row``, staying is summed as a geometric series.
 
-    :param bounds: (min_value, max_value); an optimistic action has the latter
-    :param supply: one row an action; counts where the action's own weights stay below ``threshold``
+    :param function: a ValueFunction
     :param q: receives the values, shape (n_actions,)
     """
     for action in range(len(q)):
-        n_supplied = 0
-        total = query.total[action]
-        if total < threshold:
-            n_supplied = supply.count[action]
-            if n_supplied == 0:
-                q[action] = bounds[1]
-                continue
-            for j in range(n_supplied):
-                total += supply.weight[action, j]
-        reward = 0.0
+        if not prediction.modelled[action]:
+            q[action] = function.bounds[1]
+            continue
         after = 0.0
         stay = 0.0
-        for k in range(query.length[action]):
-            i = query.index[action, k]
-            p = query.weight[action, k] / total
-            reward += p * instances.reward[action, i]
-            if not instances.terminated[action, i]:
-                a, s = add_successor(p, state, instances.effect[action, i], values, corrections, grid, query)
-                after += a
-                stay += s
-        for j in range(n_supplied):
-            p = supply.weight[action, j] / total
-            reward += p * supply.reward[action, j]
-            if not supply.terminated[action, j]:
-                a, s = add_successor(p, state, supply.effect[action, j], values, corrections, grid, query)
-                after += a
-                stay += s
-        leave = 1.0 - gamma * stay
-        if leave >= 1e-9:
-            value = (reward + gamma * after) / leave
+        for k in range(prediction.length[action]):
+            p = prediction.probability[action, k]
+            if moves(state, prediction.effect[action, k], function.grid, scratch):
+                after += p * corrected_value(function.values, function.corrections, function.grid, scratch)
+            else:
+                stay += p
+        leave = 1.0 - function.gamma * stay
+        reward = prediction.reward[action]
+        if leave >= NEVER_LEAVES:
+            value = (reward + function.gamma * after) / leave
         elif reward == 0.0:
             value = 0.0
         else:
             value = np.inf * reward
-        q[action] = min(max(value, bounds[0]), bounds[1])
+        q[action] = min(max(value, function.bounds[0]), function.bounds[1])
 
 
-@compiled
-def choose(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q, visitor):
-    """Action values at a state, from the lists in ``query``, and what is to be remembered of the visit.
+@part
+def evaluate_actions(prediction, state, function, q, visitor, scratch):
+    """Compute the action values at a state, and count and correct the visit there.
 
-    :param visitor: see ``corrections.visit``; an episode of -1: nobody is there, nothing is remembered
+    :param function: a ValueFunction
+    :param q: receives the values, shape (n_actions,)
+    :param visitor: see ``corrections.visit``; an episode of -1: the agent is not there, nothing is counted or corrected
     :return: the best action, -1 if several are
     """
-    q_values(instances, state, threshold, gamma, values, corrections, grid, bounds, supply, query, q)
+    q_values(prediction, state, function, q, scratch)
     best = 0
     ties = 0
     for action in range(1, len(q)):
@@ -148,5 +128,48 @@ def choose(instances, state, threshold, gamma, values, corrections, grid, bounds
         elif q[action] == q[best]:
             ties += 1
     if visitor[0] >= 0:
-        visit(values, corrections, state, q[best], visitor, grid, query)
+        visit(function.values, function.corrections, state, q[best], visitor, function.grid, scratch)
     return -1 if ties > 0 else best
+
+
+@compiled
+def evaluate_actions_plain(prediction, state, function, q, visitor, scratch):
+    """:func:`evaluate_actions` for callers from Python, with plain tuples."""
+    values, corrections, grid, gamma, bounds = function
+    function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds)
+    return evaluate_actions(Prediction(*prediction), state, function, q, visitor, ValueScratch(*scratch))
+
+
+_evaluate_actions = EntryPoint(evaluate_actions_plain)
+# An episode that is none: see ``visitor``.
+NOBODY = (-1, 0.0, 0)
+
+
+class QValues:
+    """
+    Action values at exact states, with work space of their own.
+
+    :param n_actions: number of actions
+    :param n_variables: number of state variables
+    """
+
+    def __init__(self, n_actions: int, n_variables: int):
+        self.q = np.empty(n_actions)
+        self._scratch = tuple(ValueScratch.for_variables(n_variables))
+
+    def compute(
+        self,
+        prediction: Prediction,
+        state: np.ndarray,
+        function: ValueFunction,
+        visitor: tuple[int, float, int] = NOBODY,
+    ) -> int:
+        """
+        Compute :attr:`q` at a state from what the model predicts there.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :param visitor: who is there: (episode, tolerance, max_visits), see ``corrections.visit``
+        :return: the best action, -1 if several are
+        """
+        best: int = _evaluate_actions.call(tuple(prediction), state, function.plain(), self.q, visitor, self._scratch)
+        return best

@@ -11,8 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.sources.recording import TransitionLog
-from sb3_combrel.sources.source_instances import SourceInstances, count_actions
+from sb3_combrel.sources.transitions import TransitionLog, Transitions, count_actions
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -20,14 +19,14 @@ if TYPE_CHECKING:
 _METADATA_KEY = "sb3_combrel"
 
 
-def from_minari(dataset: str | MinariDataset, bounds: Bounds | None = None) -> SourceInstances:
+def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> Transitions:
     """All transitions of a Minari dataset; see :meth:`SourceInstances.from_minari`."""
     minari = _import_minari()
     data = minari.load_dataset(dataset) if isinstance(dataset, str) else dataset
     action_space = data.action_space
     scaling = StateScaling.from_space(data.observation_space, bounds)
     n_actions = count_actions(action_space)
-    log = TransitionLog()
+    log = TransitionLog(giver=f"the dataset {data.id}")
     for episode in data.iterate_episodes():
         states = np.asarray(episode.observations)
         for i, action in enumerate(episode.actions):
@@ -37,18 +36,18 @@ def from_minari(dataset: str | MinariDataset, bounds: Bounds | None = None) -> S
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     env_spec = data.env_spec
     unnamed = {"env": None if env_spec is None else env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
-    return log.instances(scaling, n_actions, kept.get("names", {}), kept.get("origin", unnamed))
+    return log.transitions(scaling, n_actions, kept.get("names", {}), kept.get("origin", unnamed))
 
 
-def to_minari(source: SourceInstances, dataset_id: str, **metadata: Any) -> MinariDataset:
-    """Store source instances as a local Minari dataset; see :meth:`SourceInstances.to_minari`."""
+def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> MinariDataset:
+    """Store transitions as a local Minari dataset; see :meth:`SourceInstances.to_minari`."""
     minari = _import_minari()
     from minari.data_collector import EpisodeBuffer
 
-    # An episode ends at a terminal state and wherever the next instance does not go on from this one.
-    goes_on = (source.next_states[:-1] == source.states[1:]).all(axis=1) & ~source.terminated[:-1]
+    # An episode ends at a terminal state and wherever the next instance does not start where this one ends.
+    continues = (source.next_states[:-1] == source.states[1:]).all(axis=1) & ~source.terminated[:-1]
     episodes = []
-    for rows in np.split(np.arange(len(source)), np.flatnonzero(~goes_on) + 1):
+    for rows in np.split(np.arange(len(source.states)), np.flatnonzero(~continues) + 1):
         truncated = np.zeros(len(rows), dtype=bool)
         truncated[-1] = not source.terminated[rows[-1]]
         episodes.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,12 +10,21 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_combrel.common.checks import as_count, check_count, check_finite, count_text
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.sources.recording import TransitionLog, describe_origin, make_env, task_names
-from sb3_combrel.sources.source_instances import SourceInstances, count_actions
+from sb3_combrel.sources.tasks import describe_origin, make_env, task_names
+from sb3_combrel.sources.transitions import (
+    MAX_STEPS,
+    WHY_MAX_STEPS,
+    TransitionLog,
+    Transitions,
+    check_observation,
+    check_reward,
+    count_actions,
+)
 
 Transition = Callable[[NDArray[Any], int, float, NDArray[Any], bool], object]
-"""Told of each step: state, action (from 0 on), reward, next state (raw units), and whether that is terminal."""
+"""Called with each step: state, action (from 0 on), reward, next state (raw units), and whether that is terminal."""
 
 _MAX_TILES = 10_000_000
 
@@ -26,18 +36,17 @@ class TileCoding:
     :param n_variables: number of state variables
     :param n_tilings: number of grids, each shifted against the others
     :param n_tiles: tiles along each variable of a grid
-    :raises ValueError: if a number is below 1, or if there would be too many tiles to hold
+    :raises ValueError: if a number is below 1, or if there would be too many tiles
     """
 
     def __init__(self, n_variables: int, n_tilings: int = 8, n_tiles: int = 8) -> None:
         for name, number in (("n_tilings", n_tilings), ("n_tiles", n_tiles)):
-            if number < 1:
-                raise ValueError(f"{name} must be at least 1, got {number}")
+            check_count(name, number, max=_MAX_TILES)
         # One more tile along each variable than asked for, as the grids are shifted.
         self.n_features = n_tilings * (n_tiles + 1) ** n_variables
         if self.n_features > _MAX_TILES:
             raise ValueError(
-                f"n_tiles={n_tiles} makes {self.n_features:,} tiles for {n_variables} state variables, more than "
+                f"n_tiles={n_tiles} makes {count_text(self.n_features)} tiles for {n_variables} state variables, more than "
                 f"{_MAX_TILES:,}; choose a smaller n_tiles or n_tilings"
             )
         self.n_tilings = n_tilings
@@ -65,7 +74,7 @@ class QLearning:
     Values begin at ``initial_value``; where rewards are negative, 0 is optimistic and makes the learner explore.
 
     :param env: a task with a Box of a few state variables and a Discrete action space, or its id
-    :param learning_rate: share of the error that one update corrects
+    :param learning_rate: fraction of the error that one update corrects
     :param gamma: discount factor
     :param trace_decay: lambda, the decay of the traces; 0 for one-step Q-learning
     :param epsilon: probability of a random action while learning
@@ -91,10 +100,12 @@ class QLearning:
         bounds: Bounds | None = None,
         seed: int | None = None,
     ) -> None:
-        shares = (("learning_rate", learning_rate), ("gamma", gamma), ("trace_decay", trace_decay), ("epsilon", epsilon))
-        for name, value in shares:
+        fractions = (("learning_rate", learning_rate), ("gamma", gamma), ("trace_decay", trace_decay), ("epsilon", epsilon))
+        for name, value in fractions:
+            check_finite(name, value)
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be between 0 and 1, got {value}")
+        check_finite("initial_value", initial_value)
         self.env = make_env(env)
         self.observation_space = self.env.observation_space
         self.action_space = self.env.action_space
@@ -115,38 +126,46 @@ class QLearning:
         """
         Act and learn. Each call begins with a new episode; the last one may stay unfinished.
 
-        :param total_timesteps: number of steps in the environment
+        :param total_timesteps: number of steps in the environment; a float such as 1e5 may be given
         :param callback: called with every transition
-        :raises ValueError: if ``total_timesteps`` is below 1
+        :raises ValueError: if ``total_timesteps`` is not a whole number of at least 1, or if the environment returns an
+            observation or a reward that is not finite
         """
-        if total_timesteps < 1:
-            raise ValueError(f"total_timesteps must be at least 1, got {total_timesteps}")
+        total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_STEPS)
         steps, seed = 0, self.seed if not self.episode_lengths else None
         while steps < total_timesteps:
             steps += self._episode(total_timesteps - steps, callback, seed)
             seed = None
         return self
 
-    def _episode(self, most_steps: int, callback: Transition | None, seed: int | None) -> int:
-        """Run one episode of at most ``most_steps``; returns its number of steps."""
+    def _episode(self, max_steps: int, callback: Transition | None, seed: int | None) -> int:
+        """Run one episode of at most ``max_steps``; returns its number of steps."""
         state, _ = self.env.reset(seed=seed)
+        check_observation(state, f"at the reset before episode {len(self.episode_lengths) + 1}")
         tiles = self._tiles(state)
         # Dense: for the few variables that tile coding is good for this is quicker than a list of visited tiles.
         traces = np.zeros_like(self.weights)
-        for step in range(1, most_steps + 1):
+        for step in range(1, max_steps + 1):
             values = self._values(tiles)
             greedy = self._argmax(values)
             explore = self._rng.random() < self.epsilon
             action = int(self._rng.integers(self.n_actions)) if explore else greedy
             if values[action] < values[greedy]:
-                # What follows a worse action says nothing of the best way on from the states before it.
+                # What follows an exploratory action is no evidence on the greedy policy from the states before it.
                 traces[:] = 0.0
-            following, reward, terminated, truncated, _ = self.env.step(action + self._first_action)
+            following, given, terminated, truncated, _ = self.env.step(action + self._first_action)
+            when = f"in step {step} of episode {len(self.episode_lengths) + 1}"
+            check_observation(following, when)
+            reward = check_reward(given, when)
             if callback is not None:
-                callback(state, action, float(reward), following, bool(terminated))
+                callback(state, action, reward, following, bool(terminated))
             next_tiles = self._tiles(following)
             best = 0.0 if terminated else float(self._values(next_tiles).max())
-            error = float(reward) + self.gamma * best - values[action]
+            error = reward + self.gamma * best - values[action]
+            if not math.isfinite(error):
+                raise ValueError(
+                    f"the Q-values overflow {when}, at the reward {reward:g}: scale the environment's rewards down"
+                )
             traces *= self.gamma * self.trace_decay
             traces[tiles] = 0.0
             traces[tiles, action] = 1.0
@@ -155,7 +174,7 @@ class QLearning:
             if terminated or truncated:
                 self.episode_lengths.append(step)
                 return step
-        return most_steps
+        return max_steps
 
     def predict(
         self,
@@ -168,8 +187,8 @@ class QLearning:
         Actions in SB3's manner: greedy ones, or with ``deterministic=False`` a random one with probability ``epsilon``.
 
         :param observation: raw units, shape (n_variables,) or (n_states, n_variables)
-        :param state: no use, the learner is not recurrent
-        :param episode_start: no use
+        :param state: ignored, the learner is not recurrent
+        :param episode_start: ignored
         :param deterministic: whether to take greedy actions only
         :return: the action or actions, and ``state``
         """
@@ -192,26 +211,26 @@ class QLearning:
         return int(best[0] if len(best) == 1 else self._rng.choice(best))
 
 
-def learn_source(
-    env: str | gym.Env[Any, Any],
-    n_instances: int = 1000,
-    seed: int | None = None,
-    *,
-    total_timesteps: int = 30_000,
-    method: str = "random",
-    **q_learning: Any,
-) -> SourceInstances:
-    """Learn a source task and keep a sample of all experience; see :meth:`SourceInstances.from_q_learning`."""
-    if not 1 <= n_instances <= total_timesteps:
-        raise ValueError(f"n_instances must be between 1 and total_timesteps={total_timesteps}, got {n_instances}")
+def learn_transitions(
+    env: str | gym.Env[Any, Any], seed: int | None, total_timesteps: int, q_learning: dict[str, Any]
+) -> Transitions:
+    """
+    All transitions of a task while Q-learning learns it.
+
+    :param env: a task, or its id
+    :param seed: seed of the learner and its environment
+    :param total_timesteps: steps of learning
+    :param q_learning: further arguments of :class:`QLearning`
+    :raises ValueError: if an argument is out of range, or if the environment returns something that is not finite
+    """
+    total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
     learner = QLearning(env, seed=seed, **q_learning)
     try:
         log = TransitionLog()
         learner.learn(total_timesteps, log.add)
         origin = describe_origin(learner.env, type(learner).__name__, seed)
         origin |= {"recorded_while_learning": True, "total_timesteps": total_timesteps}
-        experience = log.instances(learner.scaling, learner.n_actions, task_names(learner.env), origin)
-        return experience.subset(n_instances, method, seed)
+        return log.transitions(learner.scaling, learner.n_actions, task_names(learner.env), origin)
     finally:
         if isinstance(env, str):
             learner.env.close()

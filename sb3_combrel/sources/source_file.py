@@ -5,10 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,28 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_combrel.common.files import write_whole
+from sb3_combrel.common.serialisation import damage_text
 
 FORMAT = "sb3_combrel.SourceInstances"
 FORMAT_VERSION = 1
 ARRAY_NAMES = ("states", "actions", "rewards", "next_states", "terminated", "low", "high")
-
-# What the zip, npy, JSON and instance layers raise for bytes that are not what they expect.
-DAMAGE = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 Read = TypeVar("Read")
 
@@ -80,9 +59,10 @@ def read_source(path: str | os.PathLike[str], build: Callable[[dict[str, NDArray
         raise FileNotFoundError(f"there is no source file {file}; write one with SourceInstances.record(...).save(path)")
     try:
         return source_from_bytes(file.read_bytes(), build)
-    except DAMAGE as error:
+    except Exception as error:
+        # Each layer (zip, decompression, npy, JSON, our own checks) has errors of its own kinds for damaged content.
         raise ValueError(
-            f"{file} is damaged or not a file of source instances ({error}); "
+            f"{file} is damaged or not a file of source instances ({damage_text(error)}); "
             "write it again with SourceInstances.record(...).save(path)"
         ) from error
 

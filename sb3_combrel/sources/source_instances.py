@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,23 +15,29 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_combrel.common.checks import as_count
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.sources.source_file import ARRAY_NAMES, DAMAGE, read_source, source_from_bytes, source_to_bytes, write_source
-from sb3_combrel.sources.subsets import covering_rows, random_rows
+from sb3_combrel.common.serialisation import damage_text, register_reader, register_writer
+from sb3_combrel.sources import fitted_rmax_source, minari_datasets, q_learning, recording
+from sb3_combrel.sources.source_file import ARRAY_NAMES, read_source, source_from_bytes, source_to_bytes, write_source
+from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
+from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, flag_array
+from sb3_combrel.sources.transitions import MAX_STEPS, WHY_MAX_STEPS, Transitions, count_actions
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from stable_baselines3.common.vec_env import VecEnv
 
-    from sb3_combrel.sources.recording import Behaviour
-
 Floats = NDArray[np.float64]
+
+# Each action has a name.
+_MAX_ACTIONS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class SourceInstances:
     """
-    Instances <s, a, r, s'> of a source task (Section 3), in raw units, and the spaces they come from.
+    Instances <s, a, r, s'> of a source task (Section 3), in raw units, and the spaces that they come from.
 
     The arrays cannot be written to: one source may serve several transfer methods.
 
@@ -62,24 +69,24 @@ class SourceInstances:
 
     def __post_init__(self) -> None:
         scaling = StateScaling(self.low, self.high)
-        n, d = len(np.atleast_1d(self.states)), scaling.n_variables
+        n, d = len(self.states) if hasattr(self.states, "__len__") else 1, scaling.n_variables
+        object.__setattr__(self, "n_actions", as_count("n_actions", self.n_actions, max=_MAX_ACTIONS))
         if n == 0:
             raise ValueError("states must hold at least one instance, got none: there is nothing to transfer")
         arrays: dict[str, NDArray[Any]] = {
-            "states": _finite("states", self.states, (n, d)),
-            "actions": _whole_numbers(self.actions, n, self.n_actions),
-            "rewards": _finite("rewards", self.rewards, (n,)),
-            "next_states": _finite("next_states", self.next_states, (n, d)),
-            "terminated": _flags(self.terminated, n),
+            "states": finite_array("states", self.states, (n, d)),
+            "actions": action_array(self.actions, n, self.n_actions),
+            "rewards": finite_array("rewards", self.rewards, (n,)),
+            "next_states": finite_array("next_states", self.next_states, (n, d)),
+            "terminated": flag_array(self.terminated, n),
             "low": scaling.low,
             "high": scaling.high,
         }
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-        object.__setattr__(self, "n_actions", int(self.n_actions))
-        object.__setattr__(self, "state_names", _names("state_names", self.state_names, d, "s"))
-        object.__setattr__(self, "action_names", _names("action_names", self.action_names, self.n_actions, "a"))
+        object.__setattr__(self, "state_names", checked_names("state_names", self.state_names, d, "s"))
+        object.__setattr__(self, "action_names", checked_names("action_names", self.action_names, self.n_actions, "a"))
         try:
             object.__setattr__(self, "origin", json.loads(json.dumps(dict(self.origin))))
         except (TypeError, ValueError) as error:
@@ -88,7 +95,7 @@ class SourceInstances:
     @classmethod
     def record(
         cls,
-        model: Behaviour | None,
+        model: recording.Behaviour | None,
         env: str | gym.Env[Any, Any] | VecEnv,
         n_instances: int = 1000,
         seed: int | None = None,
@@ -100,7 +107,7 @@ class SourceInstances:
         Let a behaviour act in the source task and record what happens, from a reset on, through as many episodes as needed.
 
         Where the instances should cover more of the task than one behaviour visits, record more and take a
-        :meth:`subset`, or record with :class:`~sb3_combrel.sources.recording.SourceRecorder` while a model learns.
+        :meth:`subset`, or record with :class:`~sb3_combrel.sources.source_recorder.SourceRecorder` while a model learns.
 
         :param model: an SB3 model or policy (anything with its ``predict``), a function from one state, raw units, shape
             (n_variables,), to an action, or None for random actions
@@ -112,11 +119,11 @@ class SourceInstances:
         :param deterministic: whether an SB3 model takes its deterministic actions
         :param bounds: ``(low, high)`` of the states if the observation space has none
         :raises ValueError: if the spaces are not a Box of shape (n_variables,) and a Discrete, if the observation space is
-            unbounded and ``bounds`` is not given, or if ``n_instances`` is below 1
+            unbounded and ``bounds`` is not given, if ``n_instances`` is not a whole number of at least 1, or if the
+            environment returns an observation or a reward that is not finite
         """
-        from sb3_combrel.sources.recording import record
-
-        return record(model, env, n_instances, seed, deterministic=deterministic, bounds=bounds)
+        recorded = recording.record(model, env, n_instances, seed, deterministic=deterministic, bounds=bounds)
+        return cls(**recorded._asdict())
 
     @classmethod
     def from_q_learning(
@@ -127,7 +134,7 @@ class SourceInstances:
         *,
         total_timesteps: int = 30_000,
         method: str = "random",
-        **q_learning: Any,
+        **learner: Any,
     ) -> SourceInstances:
         """
         Learn the source task with Q-learning and keep a sample of all its experience, as in Section 5.1 of the paper.
@@ -137,12 +144,15 @@ class SourceInstances:
         :param seed: seed of the learner, its environment and the sample
         :param total_timesteps: steps of learning
         :param method: how to choose the instances, see :meth:`subset`
-        :param q_learning: further arguments of :class:`~sb3_combrel.sources.q_learning.QLearning`
-        :raises ValueError: if the spaces do not fit, or if ``n_instances`` exceeds ``total_timesteps``
+        :param learner: further arguments of :class:`~sb3_combrel.sources.q_learning.QLearning`
+        :raises ValueError: if the spaces do not fit, if ``n_instances`` exceeds ``total_timesteps``, if either is not a
+            whole number, or if the environment returns an observation or a reward that is not finite
         """
-        from sb3_combrel.sources.q_learning import learn_source
-
-        return learn_source(env, n_instances, seed, total_timesteps=total_timesteps, method=method, **q_learning)
+        total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
+        n_instances = as_count("n_instances", n_instances, max=total_timesteps, why_max="total_timesteps")
+        check_method(method)
+        learned = q_learning.learn_transitions(env, seed, total_timesteps, learner)
+        return cls(**learned._asdict()).subset(n_instances, method, seed)
 
     @classmethod
     def from_fitted_rmax(
@@ -165,11 +175,13 @@ class SourceInstances:
         :param method: how to choose the instances, see :meth:`subset`; most of the experience is of one path, so by default
             those that cover most
         :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, such as ``max_value``
-        :raises ValueError: if the spaces do not fit, or if a number is below 1
+        :raises ValueError: if the spaces do not fit, if a number is not a whole number of at least 1, or if the
+            environment returns an observation or a reward that is not finite
         """
-        from sb3_combrel.sources.fitted_rmax_learning import learn_source
-
-        return learn_source(env, n_instances, seed, n_episodes=n_episodes, method=method, **learner)
+        n_instances = as_count("n_instances", n_instances, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
+        check_method(method)
+        learned = fitted_rmax_source.learn_transitions(env, seed, n_episodes, learner)
+        return cls(**learned._asdict()).subset(n_instances, method, seed)
 
     @classmethod
     def from_minari(
@@ -188,11 +200,12 @@ class SourceInstances:
         :param seed: seed of the sample
         :param bounds: ``(low, high)`` of the states if the dataset's observation space has none
         :raises ImportError: if Minari is missing
-        :raises ValueError: if the dataset's spaces are not a Box of shape (n_variables,) and a Discrete
+        :raises ValueError: if the dataset's spaces are not a Box of shape (n_variables,) and a Discrete, if it contains
+            something that is not finite, or if ``n_instances`` is not a whole number of at least 1
         """
-        from sb3_combrel.sources.minari_datasets import from_minari
-
-        source = from_minari(dataset, bounds)
+        if n_instances is not None:
+            n_instances = as_count("n_instances", n_instances)
+        source = cls(**minari_datasets.read_dataset(dataset, bounds)._asdict())
         return source if n_instances is None else source.subset(n_instances, seed=seed)
 
     def to_minari(self, dataset_id: str, **metadata: Any) -> MinariDataset:
@@ -205,9 +218,7 @@ class SourceInstances:
         :param metadata: arguments of ``minari.create_dataset_from_buffers`` such as ``author``
         :raises ImportError: if Minari is missing
         """
-        from sb3_combrel.sources.minari_datasets import to_minari
-
-        return to_minari(self, dataset_id, **metadata)
+        return minari_datasets.write_dataset(self._transitions(), dataset_id, **metadata)
 
     @property
     def scaling(self) -> StateScaling:
@@ -236,17 +247,15 @@ class SourceInstances:
         :param n_instances: number of instances to choose; all are taken if there are no more
         :param method: "random", or "covering" for instances of each action that lie as far apart as possible
         :param seed: seed of the choice
-        :raises ValueError: if ``n_instances`` is below 1 or ``method`` is another
+        :raises ValueError: if ``n_instances`` is not a whole number of at least 1, or ``method`` is another
         """
-        if n_instances < 1:
-            raise ValueError(f"n_instances must be at least 1, got {n_instances}")
+        n_instances = as_count("n_instances", n_instances)
+        check_method(method)
         rng = np.random.default_rng(seed)
         if method == "random":
             rows = random_rows(self.terminated, n_instances, rng)
-        elif method == "covering":
-            rows = covering_rows(self.scaling.to_unit(self.states), self.actions, self.terminated, n_instances, rng)
         else:
-            raise ValueError(f"method must be 'random' or 'covering', got {method!r}")
+            rows = covering_rows(self.scaling.to_unit(self.states), self.actions, self.terminated, n_instances, rng)
         chosen = {"method": method, "seed": seed, "chosen_from": len(self)}
         return self._with_rows(rows, {**self.origin, "subset": chosen})
 
@@ -316,8 +325,8 @@ class SourceInstances:
         """
         try:
             return source_from_bytes(content, cls._of_content)
-        except DAMAGE as error:
-            raise ValueError(f"the source instances are damaged ({error})") from error
+        except Exception as error:
+            raise ValueError(f"the source instances are damaged ({damage_text(error)})") from error
 
     @classmethod
     def _of_content(cls, arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> SourceInstances:
@@ -329,63 +338,19 @@ class SourceInstances:
             origin=header["origin"],
         )
 
+    def _transitions(self) -> Transitions:
+        return Transitions(*(getattr(self, name) for name in Transitions._fields))
+
     def _with_rows(self, rows: NDArray[np.int64], origin: Mapping[str, Any]) -> SourceInstances:
-        return SourceInstances(
-            self.states[rows],
-            self.actions[rows],
-            self.rewards[rows],
-            self.next_states[rows],
-            self.terminated[rows],
-            self.low,
-            self.high,
-            self.n_actions,
-            self.state_names,
-            self.action_names,
-            origin,
-        )
+        chosen = {name: getattr(self, name)[rows] for name in ("states", "actions", "rewards", "next_states", "terminated")}
+        return replace(self, **chosen, origin=origin)
 
 
-def count_actions(space: spaces.Space[Any]) -> int:
-    """
-    Number of actions of a discrete action space.
-
-    :param space: the action space
-    :raises ValueError: if it is not a ``Discrete``
-    """
-    if not isinstance(space, spaces.Discrete):
-        raise ValueError(f"the action space must be Discrete, got {space}")
-    return int(space.n)
+def _read(npz: str) -> SourceInstances:
+    return source_from_bytes(base64.b64decode(npz, validate=True), SourceInstances._of_content)
 
 
-def _finite(name: str, values: object, shape: tuple[int, ...]) -> Floats:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have the shape {shape}, got {array.shape}")
-    wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
-    if wrong.size:
-        raise ValueError(f"{name} must be finite, got {array[wrong[0]]} for instance {wrong[0]}")
-    return array
-
-
-def _whole_numbers(actions: object, n: int, n_actions: int) -> NDArray[np.int64]:
-    array = np.array(actions)
-    if array.shape != (n,) or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"actions must be integers of shape ({n},), got {array.dtype} of shape {array.shape}")
-    if array.min() < 0 or array.max() >= n_actions:
-        raise ValueError(f"actions must lie between 0 and n_actions - 1 = {n_actions - 1}, got {array.min()} to {array.max()}")
-    return array.astype(np.int64)
-
-
-def _flags(terminated: object, n: int) -> NDArray[np.bool_]:
-    array = np.array(terminated)
-    if array.shape != (n,) or array.dtype != np.bool_:
-        raise ValueError(f"terminated must be booleans of shape ({n},), got {array.dtype} of shape {array.shape}")
-    return array
-
-
-def _names(name: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
-    if len(names) == 0:
-        return tuple(f"{letter}{i}" for i in range(n))
-    if len(names) != n:
-        raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
-    return tuple(str(each) for each in names)
+register_writer(
+    SourceInstances, lambda source: ("SourceInstances", {"npz": base64.b64encode(source.to_bytes()).decode("ascii")})
+)
+register_reader("SourceInstances", _read)

@@ -9,6 +9,14 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+def check_method(method: str) -> None:
+    """
+    :raises ValueError: if there is no such method of choosing instances
+    """
+    if method not in ("random", "covering"):
+        raise ValueError(f"method must be 'random' or 'covering', got {method!r}")
+
+
 def random_rows(terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Generator) -> Ints:
     """
     A uniform sample without replacement, with at least one terminal instance if there is any.
@@ -38,7 +46,7 @@ def covering_rows(units: Floats, actions: Ints, terminated: NDArray[np.bool_], n
         return np.arange(len(actions))
     rows_of = [np.flatnonzero(actions == action) for action in np.unique(actions)]
     quotas = _equal_quotas(np.array([len(rows) for rows in rows_of]), n_rows)
-    # Selected rows of an action come in the order of selection, so the last one says least.
+    # Selected rows of an action come in the order of selection, so the last one is the least informative.
     chosen = [rows[_farthest_points(units[rows], quota, rng)] for rows, quota in zip(rows_of, quotas, strict=True)]
     return _keep_terminal(np.concatenate(chosen), terminated, rng)
 
@@ -58,7 +66,7 @@ def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator) -> 
 
 
 def _equal_quotas(available: Ints, total: int) -> Ints:
-    """Share ``total`` as equally as what is available allows; what one action lacks goes to the others."""
+    """Divide ``total`` as equally as what is available allows; what one action lacks goes to the others."""
     quotas = np.zeros_like(available)
     for rank, i in enumerate(np.argsort(available, kind="stable")):
         quotas[i] = min(available[i], (total - quotas.sum()) // (len(available) - rank))
@@ -66,7 +74,7 @@ def _equal_quotas(available: Ints, total: int) -> Ints:
 
 
 def _keep_terminal(rows: Ints, terminated: NDArray[np.bool_], rng: np.random.Generator) -> Ints:
-    # Without a terminal instance the goal is unknown to the target task. It takes the place of the last row chosen.
+    # Without a terminal instance nothing of the goal is transferred. It replaces the last row chosen.
     if terminated.any() and not terminated[rows].any():
         rows[-1] = rng.choice(np.flatnonzero(terminated))
     return np.sort(rows)

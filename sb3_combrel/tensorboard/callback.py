@@ -1,4 +1,4 @@
-"""What a learning run shows in TensorBoard: scalars, pictures, tables, settings."""
+"""The dashboard of a learning run in TensorBoard: scalars, pictures, tables, settings."""
 
 from __future__ import annotations
 
@@ -14,35 +14,40 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
+from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.tensorboard import readings
+from sb3_combrel.tensorboard.history import ChoiceHistory
+from sb3_combrel.tensorboard.hyperparameters import METRICS, hyperparameters
+from sb3_combrel.tensorboard.layout import LAYOUT
+from sb3_combrel.tensorboard.mapping_table import mapping_table
+from sb3_combrel.tensorboard.plane import Plane, VariablePair, numbered, plane_through
+from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 
 if TYPE_CHECKING:
+    # TensorBoard's writer and matplotlib take a second to import: only where there is a log.
     from torch.utils.tensorboard import SummaryWriter
 
-    from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
-    from sb3_combrel.tensorboard.history import ChoiceHistory
-    from sb3_combrel.tensorboard.plane import Plane, VariablePair
-    from sb3_combrel.transfer.mapping_transfer import VirtualSourceTransfer
-
-# Half a second a set: a few per cent of the time where a step takes a third of a millisecond.
+# A set takes half a second: a few per cent of the time where a step takes a third of a millisecond.
 DEFAULT_PICTURE_FREQ = 50_000
-# Of one that nobody asked for. With the first set matplotlib is loaded; it took up to two seconds on a busy machine.
+# Of a dashboard that the user did not ask for. Matplotlib is loaded with the first set, which took up to two seconds.
 DEFAULT_PICTURE_SHARE = 0.05
 FIRST_PICTURES_SECONDS = 1.5
 
 
 class DashboardCallback(BaseCallback):
     """
-    Shows in TensorBoard what Fitted R-Max knows and what transfer does for it.
+    Shows in TensorBoard what Fitted R-Max has learned and what was transferred.
 
-    ``FittedRMax.learn`` adds one by itself where there is a TensorBoard log (``tensorboard_log``, or a logger of the
+    ``FittedRMax.learn`` adds one where there is a TensorBoard log (``tensorboard_log``, or a logger of the
     user's with that format) and none was given. Its pictures are left out where they would take more than a twentieth of
-    the time, so runs of less than half a minute have none. Give one to choose what is shown. Without such a log it does
+    the time, so runs of less than half a minute have none. Pass one to choose what is shown. Without such a log it does
     nothing; what is learned is the same in any case.
 
     - Scalars, with every log of the algorithm (``log_interval``): ``rollout/``, ``time/``, ``model/``, ``planner/`` and
       ``transfer/``, and a page of custom scalars on which runs with and without transfer can be compared.
-    - Pictures: V and the greedy policy over two state variables; the source action that stands for each target action
-      (Figure 4 of the COMBREL paper); which state mappings were chosen when. They need matplotlib.
+    - Pictures: V and the greedy policy over two state variables; the source action that each target action is
+      mapped to (Figure 4 of the COMBREL paper); which state mappings were chosen when. They need matplotlib.
     - Text: the mappings used most (Table 2 of that paper). HPARAMS: the settings.
 
     :param picture_freq: environment steps between two sets of pictures and tables; the last set comes at the end of
@@ -51,9 +56,9 @@ class DashboardCallback(BaseCallback):
         None for the first two
     :param at: state (raw units) through which the pictures' plane goes: the values of all other variables; None for the
         middle of the state space
-    :param scalar_share: part of the time that scalars may take. A log that would exceed it has ``rollout/`` and ``time/``
+    :param scalar_share: fraction of the time that scalars may take. A log that would exceed it has ``rollout/`` and ``time/``
         only; 1 for all of them in every log.
-    :param picture_share: the same for pictures, each set of them whole or not at all; 1 for all that ``picture_freq`` says
+    :param picture_share: the same for pictures, each set complete or not at all; 1 for one every ``picture_freq`` steps
     :param verbose: verbosity level, as in any callback
     :raises ValueError: if ``picture_freq`` is below 1 or a share not in (0, 1]; when learning starts, if variables or state
         do not fit the task
@@ -80,10 +85,12 @@ class DashboardCallback(BaseCallback):
         self.picture_share = picture_share
         self._writer: SummaryWriter | None = None
 
+    model: FittedRMax  # type: ignore[assignment]
+
     @property
-    def policy(self) -> FittedRMaxPolicy:
-        """The policy that learns."""
-        return self.model.policy  # type: ignore[return-value]
+    def agent(self) -> FittedRMaxAgent:
+        """The agent of the algorithm."""
+        return self.model.agent
 
     def _on_training_start(self) -> None:
         self._writer = tensorboard_writer(self.logger)
@@ -91,11 +98,11 @@ class DashboardCallback(BaseCallback):
             return
         self._check_pictures()
         self._planes = self._make_planes()
-        self._transfer = _with_ways(self.policy)
+        self._transfer = _with_mappings(self.agent)
         self._history = _new_history(self._transfer)
         self._shown_at = self.model.num_timesteps
         self._next_pictures = self._following_pictures()
-        self.policy.timed = True
+        self.agent.timed = True
         self._mark_time()
         self._started = time.perf_counter()
         self._log_began: float | None = None
@@ -110,25 +117,20 @@ class DashboardCallback(BaseCallback):
             )
 
     def _make_planes(self) -> list[Plane]:
-        from sb3_combrel.tensorboard.plane import numbered, plane_through
-
-        policy = self.policy
-        if self.at is not None and np.shape(self.at) != (policy.scaling.n_variables,):
-            raise ValueError(f"at must hold {policy.scaling.n_variables} numbers, one a state variable, got {self.at!r}")
-        names = policy.state_names
+        agent = self.agent
+        if self.at is not None and np.shape(self.at) != (agent.task.scaling.n_variables,):
+            raise ValueError(f"at must be {agent.task.scaling.n_variables} numbers, one a state variable, got {self.at!r}")
+        names = agent.task.state_names
         return [
-            plane_through(policy.model.grid, policy.scaling, names, pair, self.at) for pair in numbered(self.variables, names)
+            plane_through(agent.grid, agent.task.scaling, names, pair, self.at) for pair in numbered(self.variables, names)
         ]
 
     def _write_settings(self) -> None:
         from torch.utils.tensorboard.summary import hparams
 
-        from sb3_combrel.tensorboard.hyperparameters import METRICS, hyperparameters
-        from sb3_combrel.tensorboard.layout import LAYOUT
-
         assert self._writer is not None
         self._writer.add_custom_scalars(LAYOUT)
-        settings = hyperparameters(self.model)  # type: ignore[arg-type]
+        settings = hyperparameters(self.model)
         file_writer = self._writer._get_file_writer()
         for summary in hparams(settings, metric_dict=dict.fromkeys(METRICS, 0.0)):
             file_writer.add_summary(summary)
@@ -136,50 +138,46 @@ class DashboardCallback(BaseCallback):
     # ----------------------------------------------------------------- scalars
 
     def _on_rollout_end(self) -> None:
-        """The algorithm logs after this: add what takes some work to find out."""
+        """Add scalars to the log that the algorithm writes after this."""
         if self._writer is None:
             return
         self._log_began = time.perf_counter()
         affordable = self.scalar_share * (self._log_began - self._started)
-        self.policy.reporting = self.scalar_share == 1.0 or self._spent + self._last_log <= affordable
-        if self.policy.reporting:
+        self.model.logs_statistics = self.scalar_share == 1.0 or self._spent + self._last_log <= affordable
+        if self.model.logs_statistics:
             self._record_readings()
 
     def _on_rollout_start(self) -> None:
-        """The algorithm has logged."""
+        """Note the time that the log has taken."""
         if self._writer is not None and self._log_began is not None:
-            # What a log without these scalars takes is the user's choice of log_interval, and not charged to them.
-            if self.policy.reporting:
+            # The time of a log without these scalars depends on the user's log_interval, and does not count.
+            if self.model.logs_statistics:
                 self._last_log = time.perf_counter() - self._log_began
                 self._spent += self._last_log
 
     def _record_readings(self) -> None:
-        from sb3_combrel.tensorboard.readings import bellman_residual
-
-        self.logger.record("planner/residual", bellman_residual(self.policy))
+        self.logger.record("planner/residual", readings.bellman_residual(self.agent))
         self.logger.record("planner/time_share", self._planning_share())
-        if self.policy.transfer is not None:
-            arrays = self.policy.model.arrays
-            self.logger.record("transfer/pairs_settled", int((arrays.settled & ~arrays.known).sum()))
+        if self.agent.transfer is not None:
+            modelled = self.agent.mdp.arrays.modelled & ~self.agent.model.known
+            self.logger.record("transfer/pairs_modelled", int(modelled.sum()))
         self._note_choices()
 
     def _mark_time(self) -> None:
-        self._marked = time.perf_counter(), self.policy.planning_seconds
+        self._marked = time.perf_counter(), self.agent.planning_seconds
 
     def _planning_share(self) -> float:
-        """Part of the time since the last log that the planner took, transferred instances for it included."""
+        """Compute the fraction of the time since the last log that planning took, transferred instances included."""
         since, planning_before = self._marked
         self._mark_time()
         now, planning = self._marked
         return (planning - planning_before) / max(now - since, 1e-9)
 
     def _note_choices(self) -> None:
-        from sb3_combrel.tensorboard.readings import mean_compliance
-
         if self._transfer is None or self._history is None:
             return
         self._history.note(self.num_timesteps, self._transfer.choices())
-        compliance = mean_compliance(self._transfer)
+        compliance = readings.mean_compliance(self._transfer)
         if compliance is not None:
             self.logger.record("transfer/compliance", compliance)
 
@@ -191,7 +189,7 @@ class DashboardCallback(BaseCallback):
         return True
 
     def _following_pictures(self) -> float:
-        """The next multiple of ``picture_freq``."""
+        """Return the next multiple of ``picture_freq``."""
         if self.picture_freq is None:
             return float("inf")
         return (self.model.num_timesteps // self.picture_freq + 1) * self.picture_freq
@@ -199,7 +197,7 @@ class DashboardCallback(BaseCallback):
     def _on_training_end(self) -> None:
         if self._writer is None:
             return
-        self.policy.timed, self.policy.reporting = False, True
+        self.agent.timed, self.model.logs_statistics = False, True
         if self.model.num_timesteps > self._shown_at:
             self._show()
         self._writer.flush()
@@ -220,11 +218,9 @@ class DashboardCallback(BaseCallback):
         affordable = self.picture_share * (time.perf_counter() - self._started)
         return self.picture_share == 1.0 or self._spent_on_pictures + self._last_pictures <= affordable
 
-    def _write_table(self, transfer: VirtualSourceTransfer) -> None:
-        from sb3_combrel.tensorboard.mapping_table import mapping_table
-
+    def _write_table(self, transfer: MappingTransfer) -> None:
         assert self._writer is not None
-        table = mapping_table(transfer, self.policy.action_names)
+        table = mapping_table(transfer, self.agent.task.action_names)
         self._writer.add_text("transfer/most_chosen_mappings", table, self._shown_at)
 
     def _write_pictures(self) -> None:
@@ -232,10 +228,10 @@ class DashboardCallback(BaseCallback):
 
         for plane in self._planes:
             over = "_".join(name for name in plane.names if name)
-            self._write_picture(f"value_and_policy/{over}", pictures.value_and_policy(self.policy, plane))
+            self._write_picture(f"value_and_policy/{over}", pictures.value_and_policy(self.agent, plane))
             if self._history is not None:
                 assert self._transfer is not None
-                picture = pictures.source_actions(self.policy, self._transfer, plane)
+                picture = pictures.source_actions(self.agent, self._transfer, plane)
                 self._write_picture(f"source_action/{over}", picture)
         if self._history is not None:
             assert self._transfer is not None
@@ -248,7 +244,7 @@ class DashboardCallback(BaseCallback):
 
 
 def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
-    """The writer behind a logger's TensorBoard format; None if it has no such format."""
+    """Return the writer of a logger's TensorBoard format; None if it has no such format."""
     for output in logger.output_formats:
         if isinstance(output, TensorBoardOutputFormat):
             return output.writer
@@ -257,10 +253,11 @@ def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
 
 def with_dashboard(callback: MaybeCallback, logger: Logger) -> MaybeCallback:
     """
-    The same callback(s) and a :class:`DashboardCallback` where there is a TensorBoard log and none is among them.
+    Add a :class:`DashboardCallback` to callbacks where there is a TensorBoard log and none is among them.
 
     :param callback: what the user gave to ``learn``
-    :param logger: where the algorithm will log to
+    :param logger: the algorithm's logger
+    :return: what ``learn`` uses in place of ``callback``
     """
     if tensorboard_writer(logger) is None or _has_dashboard(callback):
         return callback
@@ -286,15 +283,11 @@ def _has_dashboard(callback: Any) -> bool:
     return isinstance(callback, DashboardCallback)
 
 
-def _with_ways(policy: FittedRMaxPolicy) -> VirtualSourceTransfer | None:
-    """The transfer method, if it is one of those whose mappings can be shown."""
-    from sb3_combrel.transfer.mapping_transfer import VirtualSourceTransfer
-
-    return policy.transfer if isinstance(policy.transfer, VirtualSourceTransfer) else None
+def _with_mappings(agent: FittedRMaxAgent) -> MappingTransfer | None:
+    """Return the transfer method, if it is one of those whose mappings can be shown."""
+    return agent.transfer if isinstance(agent.transfer, MappingTransfer) else None
 
 
-def _new_history(transfer: VirtualSourceTransfer | None) -> ChoiceHistory | None:
-    """Where to keep what it chose; None for a method that makes no choice of one mapping."""
-    from sb3_combrel.tensorboard.history import ChoiceHistory
-
+def _new_history(transfer: MappingTransfer | None) -> ChoiceHistory | None:
+    """Make a history of the choices; None for a method that does not choose one mapping."""
     return ChoiceHistory() if transfer is not None and transfer.makes_choices else None

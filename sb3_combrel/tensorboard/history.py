@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-MOST_COLUMNS = 200
+MAX_COLUMNS = 200
 
 
 class ChoiceHistory:
     """
     How many pairs of the sample chose each candidate, at times spread over the run so far.
 
-    When there are too many times, every second one is dropped, and from then on half as many are noted.
+    When there are too many times, every second one is dropped, and from then on half as many are added.
 
-    ``steps`` holds the times, in environment steps; ``counts`` for each of them the number of pairs of each candidate.
+    ``steps`` are the times, in environment steps; ``counts`` has for each of them the number of pairs of each candidate.
     """
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class ChoiceHistory:
 
     def note(self, step: int, choices: np.ndarray) -> None:
         """
-        Take down a time.
+        Add a time, unless it is left out.
 
         :param step: environment steps so far
         :param choices: each pair's candidate, -1 for none, int64
@@ -35,12 +35,12 @@ class ChoiceHistory:
             self.steps.append(step)
             self.counts.append(np.bincount(choices[choices >= 0]).astype(np.int32))
         self._n_offered += 1
-        if len(self.steps) >= MOST_COLUMNS:
+        if len(self.steps) >= MAX_COLUMNS:
             self.steps, self.counts = self.steps[::2], self.counts[::2]
             self._every *= 2
 
     def table(self) -> np.ndarray:
-        """The counts, shape (n_candidates that were ever chosen and those before them, n_times)."""
+        """Return the counts as one array, shape (largest number of a candidate that was ever chosen + 1, n_times)."""
         table = np.zeros((max(map(len, self.counts), default=0), len(self.counts)), dtype=np.int64)
         for column, counts in enumerate(self.counts):
             table[: len(counts), column] = counts

@@ -1,4 +1,4 @@
-"""The page of TensorBoard's Custom Scalars tab that puts runs without transfer, with TIMBREL and with COMBREL side by side."""
+"""The page of TensorBoard's Custom Scalars tab on which runs without transfer, with TIMBREL and with COMBREL are compared."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ def _chart(*tags: str) -> list[object]:
     return ["Multiline", [f"^{tag}$" for tag in tags]]
 
 
-# One curve a run in every chart of the first page: runs of different methods then lie over each other.
+# Every chart of the first page has one curve for each run, so that runs of different methods can be compared.
 LAYOUT: dict[str, dict[str, list[object]]] = {
     "No transfer, TIMBREL, COMBREL": {
         "return of an episode": _chart("rollout/ep_rew_mean"),
         "steps of an episode": _chart("rollout/ep_len_mean"),
         "pairs known from own data (share)": _chart("model/known"),
-        "pairs settled by transfer (share)": _chart("model/transferred"),
+        "pairs modelled by transfer (share)": _chart("model/transferred"),
         "pairs still optimistic (share)": _chart("model/optimistic"),
         "steps per second": _chart("time/fps"),
     },

@@ -5,31 +5,32 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 
-from sb3_combrel.transfer.mapping_transfer import VirtualSourceTransfer
+from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 
 ROWS = 9
-"""As many as the paper shows; the others are added up."""
+"""As many as in the paper; the others are summed."""
 
 
-def mapping_table(transfer: VirtualSourceTransfer, action_names: Sequence[str]) -> str:
+def mapping_table(transfer: MappingTransfer, action_names: Sequence[str]) -> str:
     """
-    For each target action the share, in per cent, of its transfers that each way of mapping it made, as Markdown.
+    Make a table of each mapping's share, in per cent, in the transfers of each target action, as Markdown.
 
-    A row is a source action together with the source variables that stand for the target's; the rest of a mapping plays
-    no part in the transfers of a target action. What counts is every decision that used transferred instances.
+    A row is a source action with the pairs of target and source variables; the other source actions of a mapping have no
+    effect on the transfers of a target action. Every step of the agent's that used transferred instances counts.
 
     :param transfer: a bound transfer method
     :param action_names: names of the target's actions
+    :return: the table, or a sentence if nothing was transferred
     """
     uses = transfer.uses()
     if not uses:
-        return "No decision has used transferred instances so far (or those of many mappings at once)."
+        return "No step has used transferred instances so far (or only those of many mappings at once)."
     shares: dict[str, Counter[int]] = defaultdict(Counter)
     by_action: Counter[int] = Counter()
     for candidate, n in uses.items():
-        way = transfer.way(candidate)
-        shares[f"{way.source_action} with {way.state_mapping}"][way.target_action] += n
-        by_action[way.target_action] += n
+        parts = transfer.candidate(candidate)
+        shares[f"{parts.source_action} with {parts.state_mapping}"][parts.target_action] += n
+        by_action[parts.target_action] += n
     ranked = sorted(shares.items(), key=lambda item: -item[1].total())
     rest = sum((counts for _, counts in ranked[ROWS:]), Counter())
     rows = [*ranked[:ROWS], *([("Others", rest)] if rest else []), ("Total", by_action)]
@@ -47,11 +48,11 @@ def _row(counts: Counter[int], of: Counter[int], n_actions: int) -> list[str]:
     return [*cells, f"{100 * counts.total() / of.total():.1f}"]
 
 
-def _commonest(transfer: VirtualSourceTransfer, uses: dict[int, int], action_names: Sequence[str]) -> str:
-    """The source action that most often stood for each target action."""
-    votes: dict[int, Counter[str]] = defaultdict(Counter)
+def _commonest(transfer: MappingTransfer, uses: dict[int, int], action_names: Sequence[str]) -> str:
+    """Return the source action to which each target action was mapped most often, as a sentence."""
+    counts: dict[int, Counter[str]] = defaultdict(Counter)
     for candidate, n in uses.items():
-        way = transfer.way(candidate)
-        votes[way.target_action][way.source_action] += n
-    parts = [f"{name}<-{votes[a].most_common(1)[0][0]}" for a, name in enumerate(action_names) if votes[a]]
-    return f"Most often: {', '.join(parts)}."
+        parts = transfer.candidate(candidate)
+        counts[parts.target_action][parts.source_action] += n
+    pairs = [f"{name}<-{counts[a].most_common(1)[0][0]}" for a, name in enumerate(action_names) if counts[a]]
+    return f"Most often: {', '.join(pairs)}."

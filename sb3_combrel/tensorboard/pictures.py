@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,74 +12,72 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.plane import Plane
 from sb3_combrel.tensorboard.readings import action_values
-from sb3_combrel.transfer.mapping_transfer import VirtualSourceTransfer
+from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 
-if TYPE_CHECKING:
-    from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
-
-#: Okabe and Ito's colours, which the colour-blind can tell apart too; more actions begin anew.
+#: Okabe and Ito's colours, which the colour-blind can distinguish too; they are repeated where there are more actions.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#555555")
-NOTHING = "#EEEEEE"
+NONE_COLOUR = "#EEEEEE"
 
-PANELS_IN_A_ROW = 3
-MOST_ROWS = 14
+PANELS_PER_ROW = 3
+MAX_ROWS = 14
 DPI = 90
 
 
-def value_and_policy(policy: FittedRMaxPolicy, plane: Plane) -> np.ndarray:
+def value_and_policy(agent: FittedRMaxAgent, plane: Plane) -> np.ndarray:
     """
-    V at the grid points of a plane, and the greedy action of the model there.
+    Draw V at the grid points of a plane, and the greedy action of the model there.
 
-    :param policy: the policy to show
+    :param agent: the agent to show
     :param plane: where
     :return: RGB, uint8, shape (height, width, 3)
     """
     figure = Figure(figsize=(8.6, 3.4), dpi=DPI)
     left, right = figure.subplots(1, 2)
     figure.subplots_adjust(left=0.08, right=0.79, bottom=0.14, top=0.84, wspace=0.3)
-    values = policy.planner.values[plane.points]
+    values = agent.planner.values[plane.points]
     # V between grid points is interpolated, so the picture is too.
     image = left.imshow(values, origin="lower", extent=plane.extent, aspect="auto", interpolation="bilinear")
     _few_ticks(left)
     figure.colorbar(image, ax=left, ticks=MaxNLocator(4)).ax.tick_params(labelsize=8)
     _label(left, plane, "value V")
-    _show_numbers(right, greedy_actions(policy, plane.points), plane, policy.n_actions)
+    _show_numbers(right, greedy_actions(agent, plane.points), plane, agent.task.n_actions)
     _label(right, plane, "greedy action")
-    _legend(figure, policy.action_names, "an action without\na model: it is tried", "target action")
+    _legend(figure, agent.task.action_names, "an action without\na model", "target action")
     if plane.held:
         figure.suptitle(f"at {plane.held}", fontsize=9)
     return _pixels(figure)
 
 
-def greedy_actions(policy: FittedRMaxPolicy, points: np.ndarray) -> np.ndarray:
+def greedy_actions(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
     """
-    The action with the highest Q at grid points, -1 where one is optimistic.
+    Find the action with the highest Q at grid points, -1 where one is optimistic.
 
-    :param policy: the policy to ask
+    :param agent: the agent
     :param points: int64, any shape
     :return: int64, same shape
     """
-    q = action_values(policy, points)
+    q = action_values(agent, points)
     return np.where(np.isnan(q).any(axis=0), -1, np.nan_to_num(q, nan=-np.inf).argmax(axis=0))
 
 
-def source_actions(policy: FittedRMaxPolicy, transfer: VirtualSourceTransfer, plane: Plane) -> np.ndarray:
+def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Plane) -> np.ndarray:
     """
-    The source action that stands for each target action, over a plane (Figure 4 of the COMBREL paper).
+    Draw the source action that each target action is mapped to, over a plane (Figure 4 of the COMBREL paper).
 
-    A dot marks a grid point where the target's own instances suffice, so that nothing is transferred any more.
+    A dot marks a grid point where the target's own instances suffice, so that nothing is transferred.
 
-    :param policy: the policy to show
+    :param agent: the agent to show
     :param transfer: its transfer method
     :param plane: where
     :return: RGB, uint8, shape (height, width, 3)
     """
-    names, numbers = chosen_source_actions(transfer, plane.points, policy.n_actions)
-    n_columns = min(policy.n_actions, PANELS_IN_A_ROW)
-    n_rows = -(-policy.n_actions // n_columns)
+    names, numbers = chosen_source_actions(transfer, plane.points, agent.task.n_actions)
+    n_columns = min(agent.task.n_actions, PANELS_PER_ROW)
+    n_rows = -(-agent.task.n_actions // n_columns)
     figure = Figure(figsize=(2.05 * n_columns + 1.9, 2.1 * n_rows + 0.75), dpi=DPI)
     axes = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
     height, width = figure.get_figheight(), figure.get_figwidth()
@@ -88,12 +85,12 @@ def source_actions(policy: FittedRMaxPolicy, transfer: VirtualSourceTransfer, pl
         left=0.6 / width, right=1 - 1.45 / width, bottom=0.5 / height, top=1 - 0.6 / height, wspace=0.1, hspace=0.3
     )
     for action, panel in enumerate(axes.flat):
-        if action >= policy.n_actions:
+        if action >= agent.task.n_actions:
             panel.set_visible(False)
             continue
         _show_numbers(panel, numbers[action], plane, len(names))
-        _mark_known(panel, policy, plane, action)
-        panel.set_title(policy.action_names[action], fontsize=9)
+        _mark_known(panel, agent, plane, action)
+        panel.set_title(agent.task.action_names[action], fontsize=9)
     for panel in axes[-1]:
         panel.set_xlabel(plane.names[0], fontsize=8)
     for panel in axes[:, 0]:
@@ -106,9 +103,9 @@ def source_actions(policy: FittedRMaxPolicy, transfer: VirtualSourceTransfer, pl
     return _pixels(figure)
 
 
-def chosen_source_actions(transfer: VirtualSourceTransfer, points: np.ndarray, n_actions: int) -> tuple[list[str], np.ndarray]:
+def chosen_source_actions(transfer: MappingTransfer, points: np.ndarray, n_actions: int) -> tuple[list[str], np.ndarray]:
     """
-    The source action chosen for every target action at points of the sample.
+    Find the source action chosen for every target action at points of the sample.
 
     :param transfer: a transfer method that makes choices
     :param points: int64, any shape
@@ -119,13 +116,13 @@ def chosen_source_actions(transfer: VirtualSourceTransfer, points: np.ndarray, n
     chosen = transfer.choices().reshape(n_actions, -1)[:, points]
     found = np.full(chosen.shape, -1, dtype=np.int64)
     for candidate in np.unique(chosen[chosen >= 0]):
-        found[chosen == candidate] = names.index(transfer.way(int(candidate)).source_action)
+        found[chosen == candidate] = names.index(transfer.candidate(int(candidate)).source_action)
     return names, found
 
 
-def state_mappings(history: ChoiceHistory, transfer: VirtualSourceTransfer) -> np.ndarray:
+def state_mappings(history: ChoiceHistory, transfer: MappingTransfer) -> np.ndarray:
     """
-    Which share of the choices fell on each state mapping, as the run went on.
+    Draw the share of the choices that each state mapping had, over the run.
 
     :param history: the choices so far, at one time at least
     :param transfer: the transfer method that made them
@@ -150,9 +147,9 @@ def state_mappings(history: ChoiceHistory, transfer: VirtualSourceTransfer) -> n
     return _pixels(figure)
 
 
-def state_mapping_shares(history: ChoiceHistory, transfer: VirtualSourceTransfer) -> tuple[list[str], np.ndarray]:
+def state_mapping_shares(history: ChoiceHistory, transfer: MappingTransfer) -> tuple[list[str], np.ndarray]:
     """
-    The state mappings chosen most, by name, and their shares of the choices at each time.
+    Find the state mappings chosen most, by name, and their shares of the choices at each time.
 
     :param history: the choices so far
     :param transfer: the transfer method that made them
@@ -162,12 +159,12 @@ def state_mapping_shares(history: ChoiceHistory, transfer: VirtualSourceTransfer
     table = history.table()
     by_name: dict[str, np.ndarray] = {}
     for candidate in np.flatnonzero(table.sum(axis=1)):
-        name = transfer.way(int(candidate)).state_mapping
+        name = transfer.candidate(int(candidate)).state_mapping
         by_name[name] = by_name.get(name, np.zeros(table.shape[1])) + table[candidate]
     ranked = sorted(by_name.items(), key=lambda item: -item[1].sum())
-    if len(ranked) > MOST_ROWS:
-        others = np.sum([counts for _, counts in ranked[MOST_ROWS - 1 :]], axis=0)
-        ranked = [*ranked[: MOST_ROWS - 1], ("others", others)]
+    if len(ranked) > MAX_ROWS:
+        others = np.sum([counts for _, counts in ranked[MAX_ROWS - 1 :]], axis=0)
+        ranked = [*ranked[: MAX_ROWS - 1], ("others", others)]
     names = [name for name, _ in ranked]
     counts = np.array([counts for _, counts in ranked]).reshape(len(names), table.shape[1])
     return names, counts / np.maximum(counts.sum(axis=0), 1.0)
@@ -177,20 +174,20 @@ def state_mapping_shares(history: ChoiceHistory, transfer: VirtualSourceTransfer
 
 
 def _show_numbers(axes: Axes, numbers: np.ndarray, plane: Plane, n_colours: int) -> None:
-    """Draw a colour for each number, and nothing's colour for -1."""
-    palette = np.array([*(to_rgb(COLOURS[k % len(COLOURS)]) for k in range(n_colours)), to_rgb(NOTHING)])
+    """Draw a colour for each number, and light grey for -1."""
+    palette = np.array([*(to_rgb(COLOURS[k % len(COLOURS)]) for k in range(n_colours)), to_rgb(NONE_COLOUR)])
     axes.imshow(palette[numbers], origin="lower", extent=plane.extent, aspect="auto", interpolation="nearest")
     _few_ticks(axes)
 
 
 def _few_ticks(axes: Axes) -> None:
-    """Two or three an axis: most of the time that a picture takes goes into its ticks."""
+    """Draw two or three ticks on an axis: most of the time that a picture takes is spent on ticks."""
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_locator(MaxNLocator(3))
 
 
-def _mark_known(axes: Axes, policy: FittedRMaxPolicy, plane: Plane, action: int) -> None:
-    known = policy.model.arrays.known[plane.points + action * policy.model.grid.n_points]
+def _mark_known(axes: Axes, agent: FittedRMaxAgent, plane: Plane, action: int) -> None:
+    known = agent.model.known[plane.points + action * agent.grid.n_points]
     rows, columns = np.nonzero(known)
     left, right, bottom, top = plane.extent
     n_rows, n_columns = known.shape
@@ -201,7 +198,7 @@ def _mark_known(axes: Axes, policy: FittedRMaxPolicy, plane: Plane, action: int)
 
 def _legend(figure: Figure, names: Sequence[str], for_none: str, title: str) -> None:
     colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
-    patches = [Patch(color=c, label=name) for c, name in zip((*colours, NOTHING), (*names, for_none), strict=True)]
+    patches = [Patch(color=c, label=name) for c, name in zip((*colours, NONE_COLOUR), (*names, for_none), strict=True)]
     figure.legend(handles=patches, loc="center right", frameon=False, fontsize=8, title=title, title_fontsize=8)
 
 
@@ -213,7 +210,7 @@ def _label(axes: Axes, plane: Plane, title: str) -> None:
 
 
 def _pixels(figure: Figure) -> np.ndarray:
-    # Agg by itself, and not by pyplot: that one's figures and back end belong to the user.
+    # Agg directly, without pyplot, whose figures and back end belong to the user.
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

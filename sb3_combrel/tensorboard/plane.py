@@ -1,4 +1,4 @@
-"""A plane through the grid of states: two state variables, the others held."""
+"""A plane through the grid of states: two variables vary, the others are constant."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ VariablePair = tuple[int | str, int | str]
 
 class Plane(NamedTuple):
     """
-    The grid points of a plane, and what a picture of it says.
+    The grid points of a plane, and the texts for a picture of it.
 
     :param points: numbers of the grid points, int64, shape (points along the second variable, along the first)
     :param names: names of the two variables; the second is empty for a task with one variable
     :param extent: edges of the picture in raw units: left, right, bottom, top; half a cell beyond the outer points
-    :param held: the other variables and their values, in words
+    :param held: the other variables and their values, as text
     """
 
     points: np.ndarray
@@ -38,7 +38,7 @@ def plane_through(
     at: ArrayLike | None = None,
 ) -> Plane:
     """
-    The plane of two variables through a state, moved to the nearest grid points; a margin of the grid is left out.
+    Find the plane of two variables through the grid points nearest to a state; a margin of the grid is left out.
 
     :param grid: the grid
     :param scaling: raw <-> unit coordinates
@@ -73,10 +73,11 @@ def _edges(grid: StateGrid, scaling: StateScaling, variable: int) -> tuple[float
 
 def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> list[tuple[int, int]]:
     """
-    Pairs of state variables as pairs of numbers.
+    Turn pairs of state variables into pairs of numbers.
 
     :param variables: pairs of names or numbers; None for the first two variables
     :param names: of all state variables
+    :return: one pair for each of ``variables``
     :raises ValueError: if an entry is not a pair of two different variables
     """
     if variables is None:

@@ -5,27 +5,27 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sb3_combrel.common.scaling import StateScaling
 
 if TYPE_CHECKING:
-    from sb3_combrel.common.transferred import Supply
+    from sb3_combrel.common.transferred import TransferredInstances
 
 
 @dataclass(frozen=True)
 class TargetTask:
-    """The target task, as a transfer method sees it.
+    """
+    The target task, as a transfer method sees it.
 
     :param scaling: raw <-> unit coordinates
     :param n_actions: number of actions
-    :param sample_states: the finite sample of states, unit coordinates, shape (n_points, n_variables); pair
-        ``action * n_points + point`` is a state-action pair of it
-    :param exploration_threshold: weight that settles a pair
+    :param sample_states: the finite sample of states that is planned with, unit coordinates, shape (n_points, n_variables)
+    :param exploration_threshold: weight that own and transferred instances of a state-action pair must reach together
     :param min_weight: instances with less weight do not count
-    :param min_fraction: nearest first, an instance counts while it has this part of the weight before it
+    :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
     :param state_names: names of the state variables, for display
     :param action_names: names of the actions, for display
     """
@@ -46,58 +46,97 @@ class TargetTask:
 
 
 class Transfer(ABC):
-    """A transfer method: it observes the target task, and supplies translated source instances.
+    """
+    A transfer method: it observes transitions of the target task, and returns instances for states and actions of it.
 
-    It is asked for instances of a pair only while the target's own instances do not settle that pair. A transfer
-    object given to an algorithm is a description; the algorithm binds a copy of it to its task.
+    It is asked where the target's own instances do not suffice. A transfer object given to an algorithm is a description:
+    the algorithm binds a copy of it to its task. Only :meth:`transferred` and :meth:`observe` have to be written. States
+    and effects are in unit coordinates of the target throughout.
     """
 
-    @abstractmethod
-    def bind(self, target: TargetTask, rng: np.random.Generator) -> None:
-        """Get ready to transfer to ``target``.
+    #: The target task and the random number generator, from :meth:`bind` on.
+    task: TargetTask | None = None
+    rng: np.random.Generator
 
-        :param rng: source of all chance
-        :raises ValueError: if source or mappings do not fit the target
+    #: Arguments of the constructor under the names that they had before: a file may still have them.
+    renamed_arguments: ClassVar[dict[str, str]] = {}
+
+    def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         """
+        Prepare for a target task; what was learned of another one is forgotten.
+
+        :param task: the target task
+        :param rng: generator of all random numbers that the method draws; predictions must draw none
+        :raises ValueError: if the method does not fit the task
+        """
+        self.task = task
+        self.rng = rng
+
+    @abstractmethod
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        """
+        Return instances for states and actions.
+
+        :param states: unit coordinates, shape (n, n_variables)
+        :param actions: int64, shape (n,)
+        :param own_weight: sum of the kernel weights of the target's own instances there, shape (n,)
+        :return: for each pair instances whose weights and ``own_weight`` together reach ``task.exploration_threshold``, or
+            none, which leaves it optimistic; good until the next call
+        """
+
+    def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        """
+        Return instances for states of the finite sample, as :meth:`transferred`; a method may store results by state.
+
+        :param points: rows of ``task.sample_states``, int64, shape (n,)
+        :param actions: int64, shape (n,)
+        :param own_weight: shape (n,)
+        """
+        assert self.task is not None
+        return self.transferred(self.task.sample_states[points], actions, own_weight)
 
     @abstractmethod
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
-        """Take notice of a transition of the target task (unit coordinates)."""
-
-    @abstractmethod
-    def lowest_reward(self) -> float:
-        """The lowest reward among all that can be supplied; known once bound."""
-
-    def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it
-        """Take notice that an episode has ended, by its time limit or (not ``truncated``) in a terminal state."""
-
-    @abstractmethod
-    def renewed(self, known: np.ndarray) -> np.ndarray:
-        """The pairs for which :meth:`supply` has something else to say than when it was last asked; int64.
-
-        :param known: pairs that need nothing and are left out, bool, shape (n_pairs,)
         """
-
-    @abstractmethod
-    def supply(self, pairs: np.ndarray, own_weight: np.ndarray, known: np.ndarray) -> Supply:
-        """Translated instances for pairs of the sample.
-
-        :param pairs: shape (n,)
-        :param own_weight: sum of the weights of each pair's own instances, shape (n,)
-        :param known: pairs that need none, bool, shape (n,)
-        :return: for each pair instances that together with its own reach the threshold, or none; good until the next call
-        """
-
-    @abstractmethod
-    def supply_at(self, state: np.ndarray, own_weight: np.ndarray) -> Supply:
-        """The same at an exact state, one row an action; good until the next call.
+        Take in a transition of the target task.
 
         :param state: unit coordinates, shape (n_variables,)
-        :param own_weight: shape (n_actions,); actions that reach the threshold need nothing
+        :param action: from 0 on
+        :param reward: raw
+        :param next_state: unit coordinates
+        :param terminated: the episode ended in a terminal state; a time limit is none
         """
 
+    def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it
+        """
+        Take in the end of an episode.
+
+        :param truncated: it ended by its time limit, not in a terminal state
+        """
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        """
+        Say where the instances may differ from those returned before; called after each transition and each episode.
+
+        :param known: bool, shape (n_actions, n_points): pairs whose own instances suffice, which may be left out
+        :return: True: everywhere; False: nowhere; or bool, shape (n_actions, n_points). By default everywhere
+        """
+        return True
+
+    def note_use(self, transferred: TransferredInstances) -> None:  # noqa: B027 - a method may well ignore it
+        """
+        Take in that the agent acts on the instances last returned by :meth:`transferred`, at one state with every action.
+
+        Not called for predictions: what is counted here are the agent's own steps.
+        """
+
+    def lowest_reward(self) -> float:
+        """Return the lowest reward among all instances that may be transferred; called once bound."""
+        return 0.0
+
     def arguments(self) -> dict[str, Any]:
-        """The constructor's arguments that make this object anew, unbound; a saved model is rebuilt from them.
+        """
+        Return the constructor's arguments that make this object, unbound; from them a saved model is rebuilt.
 
         By default the attributes that bear the arguments' names. They may be numbers, text, arrays, source instances,
         mappings, sets of mappings, and sequences and dicts of these; arrays and tuples come back as lists.
@@ -107,16 +146,21 @@ class Transfer(ABC):
         # A constructor that takes *args or **kwargs fails here as well, unless it keeps them by these names.
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
-    def saved_arrays(self) -> dict[str, np.ndarray]:
-        """What was learned since it was bound, float64, to be saved with a model.
+    def get_state(self) -> dict[str, np.ndarray]:
+        """
+        Return what was learned since it was bound, float64, to be saved with a model.
 
         Names and shapes stay the same, but for the number of rows of arrays with several axes.
         """
         return {}
 
-    def restore(self, saved: dict[str, np.ndarray]) -> None:  # noqa: B027 - nothing saved, nothing to restore
-        """Take up what :meth:`saved_arrays` gave; called on a freshly bound object."""
+    def set_state(self, state: dict[str, np.ndarray]) -> None:  # noqa: B027 - nothing saved, nothing to restore
+        """
+        Restore what :meth:`get_state` returned; called on an object that was just bound.
+
+        Afterwards every pair of the sample is asked for once more: :meth:`changed` need not report this.
+        """
 
     def statistics(self) -> dict[str, float]:
-        """Figures for the logger, by name."""
+        """Return figures for the logger, by name."""
         return {}

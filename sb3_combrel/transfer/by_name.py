@@ -15,7 +15,7 @@ SAVED = "transfer"
 
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
     """
-    A transfer object of the algorithm's own, from whatever the user gave.
+    Make a transfer object of the algorithm's own from what the user gave.
 
     :param transfer: None; a transfer object, which is copied; a class or its dotted name; or a dict of one entry, from
         the (dotted) name to the arguments, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``
@@ -49,7 +49,7 @@ def _method(name: str) -> Any:
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
     """
-    A transfer object as plain data, for a file; :func:`restore_transfer` makes it anew.
+    Describe a transfer object as plain data, for a file; :func:`restore_transfer` makes it again.
 
     Of an object that plain data cannot describe only the name is kept, with a warning.
 
@@ -72,7 +72,7 @@ def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
 
 def restore_transfer(transfer: Any) -> Any:
     """
-    The transfer object that :func:`describe_transfer` described; anything else is returned as it is.
+    Make the transfer object that :func:`describe_transfer` described; anything else is returned as it is.
 
     A file may come from anyone: nothing is imported, only classes that are defined already are considered.
 
@@ -88,7 +88,9 @@ def restore_transfer(transfer: Any) -> Any:
             f"the model was saved with the transfer method {name}, which {missing} pass it again, load(..., transfer=...)"
         )
     try:
-        return found[-1](**from_plain(arguments))
+        given = from_plain(arguments)
+        renamed = found[-1].renamed_arguments
+        return found[-1](**{renamed.get(argument, argument): value for argument, value in given.items()})
     except TypeError as error:
         raise ValueError(f"what was saved of the transfer method {name} does not fit it ({error})") from error
 

@@ -1,4 +1,4 @@
-"""Compliance: how probable target transitions are under the source task, seen through mappings (Eqs. 1-6).
+"""Compliance: how probable target transitions are under the source task, mapping by mapping (Eqs. 2, 3, 5 and 6).
 
 For a transition with target action a, compliance depends on the state mapping and on the one source action that a
 maps to. A table [state mapping, source action] for each transition therefore holds the compliance of every pair of a
@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, inner_fast, part
-from sb3_combrel.common.instances import InstanceArrays
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.transfer.candidates import MappingTable
 
 
 class Bandwidths(NamedTuple):
-    """Bandwidths delta of phi(x) = exp(-x^2 / delta), in unit coordinates (reward: raw).
+    """
+    Bandwidths delta of phi(x) = exp(-x^2 / delta), in unit coordinates (reward: raw).
 
     :param start: of the distance between the states where two transitions start (delta_sa)
     :param outcome: of the distance between outcomes (delta_s')
@@ -30,36 +31,27 @@ class Bandwidths(NamedTuple):
 
 
 class RewardCounts(NamedTuple):
-    """The rewards of source instances.
+    """
+    The rewards of source instances.
 
     :param value: the different ones, raw, shape (n,)
-    :param part: which part of all instances has each of them, same shape
+    :param fraction: which fraction of all instances has each of them, same shape
     """
 
     value: np.ndarray
-    part: np.ndarray
+    fraction: np.ndarray
 
     @classmethod
-    def of_instances(cls, source: InstanceArrays) -> "RewardCounts":
-        """Those of all source actions."""
-        rewards = [source.reward[action, :n] for action, n in enumerate(source.count)]
+    def of_instances(cls, source: Instances) -> "RewardCounts":
+        """Count those of all source actions."""
+        rewards = [source.reward[action, :n] for action, n in enumerate(source.size)]
         value, count = np.unique(np.concatenate(rewards), return_counts=True)
         return cls(value, count / count.sum())
 
 
-class MappingTable(ArrayStruct):
-    """State mappings for compiled code, one a row.
-
-    :param index: int64, shape (n_state_mappings, n_target_variables): source variable of each target variable, -1 for none
-    :param sign: float64, same shape: -1 where the variable is mirrored
+class ComplianceScratch(NamedTuple):
     """
-
-    index: np.ndarray
-    sign: np.ndarray
-
-
-class ComplianceScratch(ArrayStruct):
-    """Work space, and the state mappings in the form that the inner loop reads.
+    Work space, and the state mappings in the form that the inner loop reads.
 
     A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses.
 
@@ -69,12 +61,12 @@ class ComplianceScratch(ArrayStruct):
     :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are
         ``factors[first[m] : first[m + 1]]``
     :param factors: int64
-    :param state: float64, shape (n_source_actions, n_source_variables, most): the source instances' states, variable by
+    :param state: float64, shape (n_source_actions, n_source_variables, n): the source instances' states, variable by
         variable: the inner loops read them in a row; ``effect``: the same of their effects
-    :param start: float64, shape (n_factors, most): kernel of where a transition and each source instance start
+    :param start: float64, shape (n_factors, n): kernel of where a transition and each source instance start
     :param outcome: the same for outcomes
-    :param reward: float64, shape (most,): the same for rewards
-    :param weight: float64, shape (most,): product of a mapping's start kernels; ``hit``: of its outcome kernels
+    :param reward: float64, shape (n,): the same for rewards
+    :param weight: float64, shape (n,): product of a mapping's start kernels; ``hit``: of its outcome kernels
     :param still: float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
     """
 
@@ -93,35 +85,35 @@ class ComplianceScratch(ArrayStruct):
     still: np.ndarray
 
     @classmethod
-    def for_mappings(cls, mappings: MappingTable, source: InstanceArrays) -> "ComplianceScratch":
-        """Work space for a table of state mappings and the instances of a source."""
-        most = int(source.count.max())
+    def for_mappings(cls, mappings: MappingTable, source: Instances) -> "ComplianceScratch":
+        """Make work space for a table of state mappings and the instances of a source."""
+        largest = int(source.size.max())
         number: dict[tuple[int, int, bool], int] = {}
         first, factors = [0], []
-        for index, sign in zip(mappings.index, mappings.sign, strict=True):
+        for index, sign in zip(mappings.variable, mappings.sign, strict=True):
             for v in np.flatnonzero(index >= 0):
                 factors.append(number.setdefault((int(v), int(index[v]), bool(sign[v] < 0.0)), len(number)))
             first.append(len(factors))
-        n_mappings, keys = len(mappings.index), list(number)
+        n_mappings, keys = len(mappings.variable), list(number)
         return cls(
             variable=np.array([v for v, _, _ in keys], dtype=np.int64),
             source=np.array([k for _, k, _ in keys], dtype=np.int64),
             mirrored=np.array([m for _, _, m in keys], dtype=np.bool_),
             first=np.array(first, dtype=np.int64),
             factors=np.array(factors, dtype=np.int64),
-            state=np.ascontiguousarray(source.state[:, :most].transpose(0, 2, 1)),
-            effect=np.ascontiguousarray(source.effect[:, :most].transpose(0, 2, 1)),
-            start=np.empty((len(keys), most)),
-            outcome=np.empty((len(keys), most)),
-            reward=np.empty(most),
-            weight=np.empty(most),
-            hit=np.empty(most),
+            state=np.ascontiguousarray(source.state[:, :largest].transpose(0, 2, 1)),
+            effect=np.ascontiguousarray(source.effect[:, :largest].transpose(0, 2, 1)),
+            start=np.empty((len(keys), largest)),
+            outcome=np.empty((len(keys), largest)),
+            reward=np.empty(largest),
+            weight=np.empty(largest),
+            hit=np.empty(largest),
             still=np.empty(n_mappings),
         )
 
 
-# Below this sum of kernel weights (a tenth of one instance at a distance of sqrt(2.3 delta)) nothing is near enough to
-# say anything: normalized, a far instance would look as good as a near one.
+# Below this sum of kernel weights (that of one instance at a distance of sqrt(2.3 delta)) no instance is near enough to be
+# evidence: normalized, a far instance would look as good as a near one.
 LEAST_EVIDENCE = 0.1
 
 
@@ -163,16 +155,16 @@ def _exponentiate(row, n):
 @inner_fast
 def _squares(at, of_source, bandwidth, row, n):
     """Write to ``row`` the squared distances of ``at`` from what the source instances have, over the bandwidth."""
-    part = 1.0 / bandwidth
+    scale = 1.0 / bandwidth
     for j in range(n):
         apart = at - of_source[j]
-        row[j] = apart * apart * part
+        row[j] = apart * apart * scale
 
 
 @inner_fast
 def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
     """Fill ``scratch.start``, ``outcome`` and ``reward`` for all source instances of ``action``."""
-    n = source.count[action]
+    n = source.size[action]
     for f in range(len(scratch.variable)):
         v = scratch.variable[f]
         k = scratch.source[f]
@@ -190,7 +182,7 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
 
 @inner_fast
 def _mapping_compliance(m, n, scratch):
-    """Compliance through state mapping ``m``, but for its unmapped variables, with ``n`` instances of one action."""
+    """Return the compliance through state mapping ``m`` with ``n`` instances, but for the factor of unmapped variables."""
     for j in range(n):
         scratch.weight[j] = 1.0
         scratch.hit[j] = 1.0
@@ -211,43 +203,49 @@ def _mapping_compliance(m, n, scratch):
 
 @part
 def _still_factors(effect, mappings, bandwidth, still):
-    """Outcome kernel of each mapping's unmapped variables, which are predicted not to change."""
-    for m in range(mappings.index.shape[0]):
+    """Write to ``still`` the outcome kernel of each mapping's unmapped variables, which are predicted not to change."""
+    for m in range(mappings.variable.shape[0]):
         missed = 0.0
         for v in range(len(effect)):
-            if mappings.index[m, v] < 0:
+            if mappings.variable[m, v] < 0:
                 missed += effect[v] * effect[v]
         still[m] = np.exp(-missed / bandwidth)
 
 
 @compiled
 def transition_compliance(state, effect, reward, source, mappings, bandwidths, scratch, table):
-    """Compliance of one target transition with the source through every state mapping, for every source action (Eq. 5).
+    """
+    Compute the compliance of one target transition through every state mapping, for every source action (Eq. 5).
 
-    The transition function's part is the mean of phi(d(s', s + (s_j' - s_j))) weighted by w_ij (Eq. 2), the reward
+    The transition function's factor is the mean of phi(d(s', s + (s_j' - s_j))) weighted by w_ij (Eq. 2), the reward
     function's the mean of phi(|r - r_j|), both over the source instances of one action. Z^P and Z^R are left out: they
     are the same for all mappings, and would hide what is to be compared if they were not. An unmapped variable adds
     nothing to where a transition starts, and is predicted not to change.
 
     :param state: unit coordinates of the target, shape (n_target_variables,)
     :param effect: next state minus state, same shape
-    :param source: InstanceArrays of the source, in its own unit coordinates
+    :param source: Instances of the source, in its own unit coordinates
     :param scratch: ComplianceScratch for ``mappings``
     :param table: receives the compliances, shape (n_state_mappings, n_source_actions); 0 where no instance is near
     """
     _still_factors(effect, mappings, bandwidths.outcome, scratch.still)
-    for action in range(len(source.count)):
+    for action in range(len(source.size)):
         _kernel_factors(state, effect, reward, source, action, bandwidths, scratch)
-        for m in range(mappings.index.shape[0]):
-            table[m, action] = scratch.still[m] * _mapping_compliance(m, source.count[action], scratch)
+        for m in range(mappings.variable.shape[0]):
+            table[m, action] = scratch.still[m] * _mapping_compliance(m, source.size[action], scratch)
 
 
-def standstill_compliance(effect: np.ndarray, reward: float, rewards: RewardCounts, bandwidths: Bandwidths) -> float:
-    """Compliance of one target transition with a world in which nothing moves, and rewards are the source's anywhere.
-
-    What a mapping is worth: one that predicts worse than this has nothing to say about the target.
+def no_change_compliance(effect: np.ndarray, reward: float, rewards: RewardCounts, bandwidths: Bandwidths) -> float:
     """
-    rewarded = rewards.part @ np.exp(-((reward - rewards.value) ** 2) / bandwidths.reward)
+    Return the compliance of one target transition with the no-change baseline.
+
+    It predicts that no variable changes, and any of the source's rewards, each as often as it occurs there. A mapping that
+    predicts worse than this is of no use.
+
+    :param effect: next state minus state, shape (n_target_variables,)
+    :param reward: raw
+    """
+    rewarded = rewards.fraction @ np.exp(-((reward - rewards.value) ** 2) / bandwidths.reward)
     return float(np.exp(-(effect @ effect) / bandwidths.outcome) * rewarded)
 
 
@@ -259,7 +257,8 @@ def compliance_table(states, effects, rewards, source, mappings, bandwidths, scr
 
 
 def task_compliance(tables: np.ndarray, actions: np.ndarray, state_index: int, action_mapping: np.ndarray) -> float:
-    """Compliance of the whole target sample with one virtual source task (Eq. 6, all mappings equally likely).
+    """
+    Return the compliance of the whole target sample with one virtual source task (Eq. 6, all mappings equally likely).
 
     :param tables: shape (n_transitions, n_state_mappings, n_source_actions)
     :param actions: target action of each transition, shape (n_transitions,)
@@ -268,8 +267,9 @@ def task_compliance(tables: np.ndarray, actions: np.ndarray, state_index: int, a
     return float(tables[np.arange(len(actions)), state_index, np.asarray(action_mapping)[actions]].mean())
 
 
-def default_bandwidths(source: InstanceArrays) -> Bandwidths:
-    """Bandwidths that suit a source, whatever the task.
+def default_bandwidths(source: Instances) -> Bandwidths:
+    """
+    Choose bandwidths from a source's instances.
 
     The start bandwidth is the squared distance to about the 20th instance of the same action (their median): that many
     share in the prediction. The outcome bandwidth is the mean squared effect: an outcome missed by as much as things
@@ -278,7 +278,7 @@ def default_bandwidths(source: InstanceArrays) -> Bandwidths:
     from scipy.spatial import cKDTree
 
     distances, effects, rewards = [], [], []
-    for action, n in enumerate(source.count):
+    for action, n in enumerate(source.size):
         if n > 1:
             states = source.state[action, :n]
             nth = min(20, n - 1) + 1

@@ -1,17 +1,19 @@
-"""Compiled loops of COMBREL's vote: the nearest target transitions choose a candidate by compliance (Algorithm 1)."""
+"""Compiled loops of COMBREL's selection: the nearest target transitions choose a candidate by compliance (Algorithm 1)."""
+
+from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
 from sb3_combrel.common.compiled import compiled, inner
 
 
-class Ballots(ArrayStruct):
-    """What the measured target transitions have to say; transition i speaks about the candidates of its action only.
+class ComplianceCache(NamedTuple):
+    """
+    Compliance of target transitions, computed once; that of transition i is with the candidates of its action only.
 
     :param compliance: float64, shape (n_transitions, most candidates of an action): with each of them, in their order
-    :param least: float64, shape (n_transitions,): what the compliances of the voters must exceed in the mean
-    :param measured: bool, shape (n_transitions,): whether this is known of the transition
+    :param least: float64, shape (n_transitions,): what the mean compliance of the nearest transitions must exceed
+    :param measured: bool, shape (n_transitions,): whether the compliance has been computed
     :param total: float64 scratch, shape (most candidates of an action,)
     """
 
@@ -21,20 +23,20 @@ class Ballots(ArrayStruct):
     total: np.ndarray
 
     @classmethod
-    def empty(cls, most_candidates: int, capacity: int = 64) -> "Ballots":
-        """Room for ``capacity`` transitions."""
+    def empty(cls, max_candidates: int, capacity: int = 64) -> "ComplianceCache":
+        """Make room for ``capacity`` transitions."""
         return cls(
-            compliance=np.empty((capacity, most_candidates)),
+            compliance=np.empty((capacity, max_candidates)),
             least=np.empty(capacity),
             measured=np.zeros(capacity, dtype=np.bool_),
-            total=np.empty(most_candidates),
+            total=np.empty(max_candidates),
         )
 
-    def with_room(self, i: int) -> "Ballots":
-        """Itself, or a copy of twice the size if transition ``i`` would not fit."""
+    def with_room(self, i: int) -> "ComplianceCache":
+        """Return itself, or a copy of twice the size if transition ``i`` would not fit."""
         if i < len(self.least):
             return self
-        return self.replace(
+        return self._replace(
             compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
             least=np.concatenate([self.least, np.empty_like(self.least)]),
             measured=np.concatenate([self.measured, np.zeros_like(self.measured)]),
@@ -42,12 +44,13 @@ class Ballots(ArrayStruct):
 
 
 @compiled
-def note_neighbor(i, state, sample_states, near, distance, due):
-    """Enter transition ``i`` at every sample state that has it among its nearest.
+def add_to_sample(i, state, sample_states, near, distance, due):
+    """
+    Add transition ``i`` to the nearest ones of every sample state that has it among them.
 
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
     :param distance: squared distances to them, the limit for none, updated
-    :param due: bool, shape (n_points,): becomes True where it entered: a vote is due there
+    :param due: bool, shape (n_points,): becomes True where it was added: the choice there has to be renewed
     """
     n_points, d = sample_states.shape
     last = near.shape[1] - 1
@@ -57,13 +60,13 @@ def note_neighbor(i, state, sample_states, near, distance, due):
             along = sample_states[p, v] - state[v]
             apart += along * along
         if apart < distance[p, last]:
-            insert_neighbor(i, apart, near[p], distance[p])
+            add_neighbor(i, apart, near[p], distance[p])
             due[p] = True
 
 
 @inner
-def insert_neighbor(i, apart, near, distance):
-    """Enter a transition among the nearest of one state, the nearest first; the last one leaves."""
+def add_neighbor(i, apart, near, distance):
+    """Add a transition to the nearest of one state, the nearest first; the last one leaves."""
     k = len(near) - 1
     while k > 0 and distance[k - 1] > apart:
         distance[k] = distance[k - 1]
@@ -73,23 +76,54 @@ def insert_neighbor(i, apart, near, distance):
     near[k] = i
 
 
+@compiled
+def find_nearest(states, actions, own_weight, threshold, recorded, listed, n_listed, limit, near, distance):
+    """
+    Find the nearest transitions of exact states and actions (line 17).
+
+    :param states: shape (n, n_variables); ``actions``: shape (n,)
+    :param own_weight: shape (n,); where it reaches ``threshold`` none are needed, and none are found
+    :param recorded: states of the recorded transitions
+    :param listed: int64, shape (n_actions, capacity): the transitions that count for each action; the first ``n_listed``
+    :param limit: squared distance from which on a transition does not count
+    :param near: receives the transitions, the nearest first, -1 for none, shape (at least n, n_neighbors)
+    :param distance: float64 scratch, same shape
+    """
+    last = near.shape[1] - 1
+    for r in range(len(actions)):
+        near[r] = -1
+        distance[r] = limit
+        if own_weight[r] >= threshold:
+            continue
+        action = actions[r]
+        for n in range(n_listed[action]):
+            i = listed[action, n]
+            apart = 0.0
+            for v in range(states.shape[1]):
+                along = recorded[i, v] - states[r, v]
+                apart += along * along
+            if apart < distance[r, last]:
+                add_neighbor(i, apart, near[r], distance[r])
+
+
 @inner
-def elect(near, compliance, least, n_candidates, draw, total):
-    """The candidate that the transitions ``near`` choose; -1 if none has more than the least in the mean.
+def choose_one(near, compliance, least, n_candidates, draw, total):
+    """
+    Choose a candidate by the mean compliance of the transitions ``near``; -1 if none exceeds the least (lines 19-20).
 
     :param n_candidates: of the action
-    :param draw: a random number from [0, 1): each that has enough is chosen with a probability in proportion to its mean
-        compliance; below 0: the one with the highest is (of equal ones the first)
-    :param total: see ``Ballots``
+    :param draw: a random number from [0, 1): each candidate that exceeds the least is chosen with a probability in
+        proportion to its mean compliance; below 0: the one with the highest is (of equal ones the first)
+    :param total: see ``ComplianceCache``
     """
     bar = 0.0
     total[:n_candidates] = 0.0
     for k in range(len(near)):
-        voter = near[k]
-        if voter >= 0:
-            bar += least[voter]
+        i = near[k]
+        if i >= 0:
+            bar += least[i]
             for c in range(n_candidates):
-                total[c] += compliance[voter, c]
+                total[c] += compliance[i, c]
     best = -1
     highest = bar
     mass = 0.0
@@ -112,52 +146,30 @@ def elect(near, compliance, least, n_candidates, draw, total):
 
 
 @compiled
-def vote(pairs, near, ballots, first, draws, choice):
-    """Renew the choice of some pairs; those for which it changed are moved to the front of ``pairs``.
+def choose(rows, actions, near, cache, first, draws, choice):
+    """
+    Renew the choices of some rows; those for which it changed are moved to the front of ``rows``.
 
-    :param pairs: of an action and one of n_points states, ``action * n_points + point``
-    :param near: int64, shape (n_actions * n_points, n_neighbors): the transitions that vote, -1 for none
+    :param rows: int64, shape (n,): rows of ``near`` and ``choice``
+    :param actions: int64, shape (n,): their actions
+    :param near: int64, shape (at least n, n_neighbors): nearest transitions, -1 for none
+    :param cache: ComplianceCache, in which they are measured
     :param first: see ``CandidateArrays``
-    :param draws: a random number for each of ``pairs``; or nothing, shape (0,): the best is chosen (see ``elect``)
-    :param choice: int64, shape (n_actions * n_points,), updated
+    :param draws: a random number for each of ``rows``; or nothing, shape (0,): the best is chosen (see ``choose_one``)
+    :param choice: int64: candidates, -1 for none, updated
     :return: how many changed
     """
-    n_points = len(choice) // (len(first) - 1)
     n_changed = 0
-    for f in range(len(pairs)):
-        pair = pairs[f]
-        action = pair // n_points
-        draw = draws[f] if len(draws) > 0 else -1.0
+    for k in range(len(rows)):
+        row = rows[k]
+        action = actions[k]
+        draw = draws[k] if len(draws) > 0 else -1.0
         n_candidates = first[action + 1] - first[action]
-        chosen = elect(near[pair], ballots.compliance, ballots.least, n_candidates, draw, ballots.total)
+        chosen = choose_one(near[row], cache.compliance, cache.least, n_candidates, draw, cache.total)
         if chosen >= 0:
             chosen += first[action]
-        if chosen != choice[pair]:
-            choice[pair] = chosen
-            pairs[n_changed] = pair
+        if chosen != choice[row]:
+            choice[row] = chosen
+            rows[n_changed] = row
             n_changed += 1
     return n_changed
-
-
-@compiled
-def find_voters(state, missing, states, actions, n, limit, near, distance):
-    """The transitions that vote at an exact state, for every action with ``missing``; no one for the others.
-
-    :param states: target transitions' states, of which the first ``n`` may vote; ``actions``: their actions
-    :param limit: squared distance from which on a transition does not vote
-    :param near: receives the transitions, the nearest first, -1 for none, shape (n_actions, n_neighbors)
-    :param distance: float64 scratch, same shape
-    """
-    near[:] = -1
-    distance[:] = limit
-    last = near.shape[1] - 1
-    for i in range(n):
-        action = actions[i]
-        if not missing[action]:
-            continue
-        apart = 0.0
-        for v in range(len(state)):
-            along = states[i, v] - state[v]
-            apart += along * along
-        if apart < distance[action, last]:
-            insert_neighbor(i, apart, near[action], distance[action])

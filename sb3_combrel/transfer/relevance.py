@@ -1,26 +1,65 @@
-"""Relevance: which source instances are fit to be transferred (Eqs. 4 and 7)."""
+"""Relevance: which source instances are to be transferred first (Eqs. 4 and 7)."""
 
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner
+from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.compliance import Bandwidths
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+
+
+def renew_relevance(
+    candidates: Candidates,
+    transitions: RecordedTransitions,
+    n_used: int,
+    bandwidths: Bandwidths,
+    mu: float,
+    values: np.ndarray,
+) -> None:
+    """
+    Compute the relevance of all source instances, through every candidate, to recorded target transitions.
+
+    :param candidates: the candidates of every target action
+    :param transitions: the target transitions, of which the first ``n_used`` count
+    :param bandwidths: of Eq. 2
+    :param mu: fraction of the weight of Eq. 4
+    :param values: receives the relevances, shape (n_candidates, most instances of an action)
+    """
+    for c, origin in enumerate(candidates.origins):
+        rows = np.flatnonzero(transitions.actions[:n_used] == origin.target_action)
+        row = candidates.arrays.row[c]
+        relevance(
+            transitions.states[rows],
+            transitions.effects[rows],
+            transitions.rewards[rows],
+            candidates.instances,
+            candidates.arrays.action[c],
+            candidates.table.variable[row],
+            candidates.table.sign[row],
+            bandwidths,
+            mu,
+            np.empty(len(rows)),
+            values[c],
+        )
 
 
 @compiled
-def relevance(states, effects, rewards, source, action, index, sign, bandwidths, mu, weight, merit):
-    """Relevance of the source instances of one action, seen through one state mapping, to the target's transitions.
+def relevance(states, effects, rewards, source, action, index, sign, bandwidths, mu, weight, values):
+    """
+    Compute the relevance of the source instances of one action, through one state mapping, to target transitions.
 
     rho_j = exp(-((lambda_j - 1) / d_j)^2). lambda_j is the compliance of instance j with the target's transitions:
     weights normalized over these, so a perfectly compliant instance has 1. d_j is the mean distance to the nearest
-    transitions, as many as make up the part ``mu`` of the weight (Eq. 4). Without transitions everything is relevant.
+    transitions, as many as make up the fraction ``mu`` of the weight (Eq. 4). Without transitions everything is relevant.
 
     :param states: target states of one target action, unit coordinates, shape (n, n_target_variables)
     :param effects: next states minus states; ``rewards``: shape (n,)
     :param index: source variable of each target variable, -1 for none; ``sign``: -1 where mirrored
     :param weight: float64 scratch, shape (n,)
-    :param merit: receives the relevances, at least as many as ``source.count[action]``
+    :param values: receives the relevances, at least as many as ``source.size[action]``
     """
     n, d = states.shape
-    for j in range(source.count[action]):
+    for j in range(source.size[action]):
         total = 0.0
         transition = 0.0
         rewarded = 0.0
@@ -42,17 +81,18 @@ def relevance(states, effects, rewards, source, action, index, sign, bandwidths,
             off = rewards[i] - source.reward[action, j]
             rewarded += w * np.exp(-off * off / bandwidths.reward)
         if total < 1e-300:
-            merit[j] = 1.0
+            values[j] = 1.0
             continue
         compliance = (transition / total) * (rewarded / total)
         distance = _mean_distance(weight, total, mu, bandwidths.start)
         off = compliance - 1.0
-        merit[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
+        values[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
 
 
 @inner
 def _mean_distance(weight, total, mu, bandwidth):
-    """d_j of Eq. 4: mean distance of the heaviest transitions that together make up ``mu`` of the weight.
+    """
+    Return d_j of Eq. 4: mean distance of the heaviest transitions that together make up ``mu`` of the weight.
 
     The weights are used up; distances are read back from them.
     """

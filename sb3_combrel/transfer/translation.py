@@ -1,49 +1,117 @@
-"""Compiled loops that pick source instances for target pairs and translate them."""
+"""The translator: source instances become instances of the target, as many as a state-action pair lacks."""
+
+from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.array_struct import ArrayStruct
-from sb3_combrel.common.compiled import compiled, inner, part
-from sb3_combrel.common.instances import BLOCK
+from sb3_combrel.common.compiled import EntryPoint, compiled, part
+from sb3_combrel.common.instances import BLOCK, Instances
+from sb3_combrel.common.kernels import list_room
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import Candidates
+
+MAX_TRANSFERRED = 32
+
+# Columns of the scratch arrays of the selected instances.
+_INSTANCE, _CANDIDATE = 0, 1
+_RANK, _WEIGHT = 0, 1
 
 
-class CandidateArrays(ArrayStruct):
-    """The ways to see the source from each target action: candidates ``first[a]`` to ``first[a + 1]`` are of action a.
+class SourceArrays(NamedTuple):
+    """
+    Source instances by action, as the translator reads them (see ``Instances``).
 
-    :param first: int64, shape (n_target_actions + 1,)
-    :param row: int64, shape (n_candidates,): state mapping, a row of the mapping table
-    :param action: int64, shape (n_candidates,): source action
+    :param state: float64, shape (n_actions, capacity, n_variables); ``effect``: the same
+    :param reward: float64, shape (n_actions, capacity); ``terminated``: bool, same shape
+    :param size: int64, shape (n_actions,)
+    :param block_low: float64, shape (n_actions, n_variables, n_blocks): boxes around blocks; ``block_high``: the same
     """
 
-    first: np.ndarray
+    state: np.ndarray
+    effect: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    size: np.ndarray
+    block_low: np.ndarray
+    block_high: np.ndarray
+
+    @classmethod
+    def of_instances(cls, instances: Instances) -> SourceArrays:
+        """Take what is needed of the instances, without a copy."""
+        return cls(*(getattr(instances, name) for name in cls._fields))
+
+
+class CandidateMappings(NamedTuple):
+    """
+    What each candidate is, for compiled code.
+
+    :param row: int64, shape (n_candidates,): state mapping, a row of ``variable``; ``action``: same shape, source action
+    :param variable: int64, shape (n_state_mappings, n_target_variables): source variable, -1 for none
+    :param sign: float64, same shape: -1 where mirrored
+    """
+
     row: np.ndarray
     action: np.ndarray
+    variable: np.ndarray
+    sign: np.ndarray
 
 
 class TransferRules(NamedTuple):
-    """When and how instances are transferred.
+    """
+    When and how instances are transferred.
 
-    :param threshold: weight that settles a pair
+    :param threshold: weight that own and transferred instances must reach together
     :param breadth: kernel breadth of transferred instances, unit coordinates
     :param min_weight: lighter instances do not count
-    :param min_fraction: nearest first, an instance counts while it has this part of the weight before it
-    :param believe_terminal: whether an instance that ended a source episode ends the target's
-    :param by_merit: whether the instances come in the order of their merit (relevance), not of their distance
+    :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
+    :param transfer_terminals: whether an instance that ended a source episode ends the target's
+    :param by_relevance: whether instances come in the order of their relevance, not of their distance
     """
 
     threshold: float
     breadth: float
     min_weight: float
     min_fraction: float
-    believe_terminal: bool
-    by_merit: bool
+    transfer_terminals: bool
+    by_relevance: bool
+
+
+class TranslationScratch(NamedTuple):
+    """
+    Work space: the instances selected at one state, best first, with room for one more than are ever needed.
+
+    :param number: int64, shape (room, 2): instance and candidate
+    :param value: float64, shape (room, 2): what it is ranked by, and its weight
+    :param variable: int64, shape (n_variables,): source variables that a candidate compares with
+    :param at: float64, same shape: where the state lies along each
+    :param gap: float64, shape (n_blocks,): squared distances of the blocks' boxes
+    """
+
+    number: np.ndarray
+    value: np.ndarray
+    variable: np.ndarray
+    at: np.ndarray
+    gap: np.ndarray
+
+    @classmethod
+    def empty(cls, max_instances: int, n_variables: int, n_blocks: int) -> TranslationScratch:
+        """Make work space for ``max_instances`` a state."""
+        return cls(
+            number=np.empty((max_instances + 1, 2), dtype=np.int64),
+            value=np.empty((max_instances + 1, 2)),
+            variable=np.empty(n_variables, dtype=np.int64),
+            at=np.empty(n_variables),
+            gap=np.empty(n_blocks),
+        )
 
 
 @part
-def consider(j, candidate, w, merit, own, kept, rules, best):
-    """Enter an instance into the list of the best, heaviest (or worthiest) first, and cut what is not needed any more.
+def consider(j, candidate, weight, rank, own, kept, rules, number, value):
+    """
+    Add an instance to the list of the selected, the highest rank first, and cut what is not needed any more.
 
     An instance is needed while those before it and ``own`` do not reach the threshold, and while it has at least
     ``min_fraction`` of their weight. These sums only grow, so what is cut once would be cut for ever.
@@ -51,164 +119,197 @@ def consider(j, candidate, w, merit, own, kept, rules, best):
     :param kept: how many are in the list
     :return: how many are now, and the least weight with which a further instance could enter (by weight)
     """
-    most = len(best.weight) - 1
+    room = len(value) - 1
     k = kept
-    while k > 0 and best.merit[k - 1] < merit:
-        best.index[k] = best.index[k - 1]
-        best.weight[k] = best.weight[k - 1]
-        best.merit[k] = best.merit[k - 1]
-        best.candidate[k] = best.candidate[k - 1]
+    while k > 0 and value[k - 1, _RANK] < rank:
+        number[k, _INSTANCE] = number[k - 1, _INSTANCE]
+        number[k, _CANDIDATE] = number[k - 1, _CANDIDATE]
+        value[k, _RANK] = value[k - 1, _RANK]
+        value[k, _WEIGHT] = value[k - 1, _WEIGHT]
         k -= 1
-    best.index[k] = j
-    best.weight[k] = w
-    best.merit[k] = merit
-    best.candidate[k] = candidate
+    number[k, _INSTANCE] = j
+    number[k, _CANDIDATE] = candidate
+    value[k, _RANK] = rank
+    value[k, _WEIGHT] = weight
     total = own
-    for k in range(min(kept + 1, most)):
-        if not rules.by_merit and best.weight[k] < rules.min_fraction * total:
-            # Heavier than the last of the list, one need not have that part of the last's weight as well.
-            return k, min(rules.min_fraction * total, best.weight[k - 1]) if k > 0 else rules.min_fraction * total
-        total += best.weight[k]
+    for k in range(min(kept + 1, room)):
+        if not rules.by_relevance and value[k, _WEIGHT] < rules.min_fraction * total:
+            # Heavier than the last of the list, one need not have that fraction of the last's weight as well.
+            enters = rules.min_fraction * total
+            return k, min(enters, value[k - 1, _WEIGHT]) if k > 0 else enters
+        total += value[k, _WEIGHT]
         if total >= rules.threshold:
-            return k + 1, best.weight[k]
-    return min(kept + 1, most), best.weight[most - 1] if kept + 1 >= most else 0.0
+            return k + 1, value[k, _WEIGHT]
+    return min(kept + 1, room), value[room - 1, _WEIGHT] if kept + 1 >= room else 0.0
 
 
-@inner
-def gather(state, source, row, action, mappings, rules, merit, own, kept, best, candidate):
-    """Enter the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` into ``best``.
+@part
+def gather(state, source, action, variable, sign, rules, relevance, own, kept, scratch, candidate):
+    """
+    Add the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` to the selected.
 
-    :param merit: relevance of the candidate's instances; read only if ``rules.by_merit``
-    :param best: BestInstances, of which ``kept`` are filled
+    :param action: source action of the candidate; ``variable``, ``sign``: its state mapping
+    :param relevance: of the candidate's instances; read only if ``rules.by_relevance``
+    :param scratch: TranslationScratch, of which ``kept`` are filled
     :return: how many are now
     """
     scale = -1.0 / (rules.breadth * rules.breadth)
     far = np.log(rules.min_weight) / scale
     n_mapped = 0
     for v in range(len(state)):
-        k = mappings.index[row, v]
+        k = variable[v]
         if k >= 0:
-            mirrored = mappings.sign[row, v] < 0.0
-            best.variable[n_mapped] = k
-            best.at[n_mapped] = 1.0 - state[v] if mirrored else state[v]
+            mirrored = sign[v] < 0.0
+            scratch.variable[n_mapped] = k
+            scratch.at[n_mapped] = 1.0 - state[v] if mirrored else state[v]
             n_mapped += 1
-    nearest_block = measure_blocks(source, action, n_mapped, best)
+    size = source.size[action]
+    low, high = source.block_low[action], source.block_high[action]
+    nearest_block = measure_blocks(low, high, size, n_mapped, scratch.variable, scratch.at, scratch.gap)
     nearest = far
-    # What is in the nearest block keeps most other blocks out.
-    for turn in range(-1, (source.count[action] + BLOCK - 1) // BLOCK):
+    # The instances in the nearest block exclude most other blocks.
+    for turn in range(-1, (size + BLOCK - 1) // BLOCK):
         block = nearest_block if turn < 0 else turn
-        if turn == nearest_block or source.gap[block] > nearest:
+        if turn == nearest_block or scratch.gap[block] > nearest:
             continue
-        for j in range(block * BLOCK, min(source.count[action], (block + 1) * BLOCK)):
+        for j in range(block * BLOCK, min(size, (block + 1) * BLOCK)):
             apart = 0.0
             for m in range(n_mapped):
-                along = best.at[m] - source.state[action, j, best.variable[m]]
+                along = scratch.at[m] - source.state[action, j, scratch.variable[m]]
                 apart += along * along
             if apart <= nearest:
-                w = np.exp(apart * scale)
-                kept, least = consider(j, candidate, w, merit[j] if rules.by_merit else w, own, kept, rules, best)
-                if least > rules.min_weight and not rules.by_merit:
+                weight = np.exp(apart * scale)
+                rank = relevance[j] if rules.by_relevance else weight
+                kept, least = consider(j, candidate, weight, rank, own, kept, rules, scratch.number, scratch.value)
+                if least > rules.min_weight and not rules.by_relevance:
                     nearest = np.log(least) / scale * (1 + 1e-12)
     return kept
 
 
 @part
-def measure_blocks(source, action, n_mapped, best):
-    """Write to ``source.gap`` the squared distance of each block's box, in the mapped variables; the nearest block."""
+def measure_blocks(low, high, size, n_mapped, variable, at, gap):
+    """Write to ``gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
     nearest_block = 0
-    for block in range((source.count[action] + BLOCK - 1) // BLOCK):
-        gap = 0.0
+    for block in range((size + BLOCK - 1) // BLOCK):
+        total = 0.0
         for m in range(n_mapped):
-            k = best.variable[m]
-            below = source.block_low[action, k, block] - best.at[m]
-            above = best.at[m] - source.block_high[action, k, block]
+            k = variable[m]
+            below = low[k, block] - at[m]
+            above = at[m] - high[k, block]
             outside = below if below > above else above
             if outside > 0.0:
-                gap += outside * outside
-        source.gap[block] = gap
-        if gap < source.gap[nearest_block]:
+                total += outside * outside
+        gap[block] = total
+        if total < gap[nearest_block]:
             nearest_block = block
     return nearest_block
 
 
 @part
-def write_row(s, own, kept, source, ways, mappings, rules, best, supply):
-    """Write the best instances to row ``s`` of ``supply``, if they and ``own`` reach the threshold."""
+def write_row(s, own, kept, source, mappings, rules, number, value, transferred):
+    """Write the selected instances to row ``s`` of ``transferred``, if they and ``own`` reach the threshold."""
     total = own
     for n in range(kept):
-        total += best.weight[n]
-    supply.count[s] = 0
+        total += value[n, _WEIGHT]
     if total < rules.threshold:
         return
-    supply.count[s] = kept
+    transferred.length[s] = kept
     for n in range(kept):
-        row = ways.row[best.candidate[n]]
-        action = ways.action[best.candidate[n]]
-        j = best.index[n]
-        supply.weight[s, n] = best.weight[n]
-        supply.reward[s, n] = source.reward[action, j]
-        supply.terminated[s, n] = rules.believe_terminal and source.terminated[action, j]
-        for v in range(mappings.index.shape[1]):
-            k = mappings.index[row, v]
-            supply.effect[s, n, v] = mappings.sign[row, v] * source.effect[action, j, k] if k >= 0 else 0.0
+        j = number[n, _INSTANCE]
+        row = mappings.row[number[n, _CANDIDATE]]
+        action = mappings.action[number[n, _CANDIDATE]]
+        transferred.weight[s, n] = value[n, _WEIGHT]
+        transferred.reward[s, n] = source.reward[action, j]
+        transferred.terminated[s, n] = rules.transfer_terminals and source.terminated[action, j]
+        for v in range(mappings.variable.shape[1]):
+            k = mappings.variable[row, v]
+            transferred.effect[s, n, v] = mappings.sign[row, v] * source.effect[action, j, k] if k >= 0 else 0.0
 
 
 @compiled
-def translate(states, own, first, last, source, ways, mappings, rules, merit, best, supply):
-    """Supply instances to a number of pairs (see ``Transfer.supply``).
+def translate(states, own, first, last, source, mappings, rules, relevance, scratch, transferred):
+    """
+    Translate instances for states and actions (see ``Transfer.transferred``).
 
     :param states: unit coordinates, shape (n, n_variables)
-    :param own: weight of each pair's own instances, shape (n,)
-    :param first: first candidate that each pair may draw from; ``last``: one past the last (none if equal)
-    :param merit: relevance, shape (n_candidates, most instances of an action); or (1, 0) if not used
-    :param best: BestInstances
+    :param own: weight of the target's own instances there, shape (n,)
+    :param first: first candidate whose instances may be used; ``last``: one past the last (none if equal); shape (n,)
+    :param source: SourceArrays; ``mappings``: CandidateMappings
+    :param relevance: shape (n_candidates, most instances of an action); or (1, 0) if not used
+    :param transferred: receives them, at least n rows
     """
     for s in range(len(own)):
-        supply.count[s] = 0
+        transferred.length[s] = 0
         if own[s] >= rules.threshold:
             continue
         kept = np.int64(0)
         for c in range(first[s], last[s]):
+            row = mappings.row[c]
             kept = gather(
                 states[s],
                 source,
-                ways.row[c],
-                ways.action[c],
-                mappings,
+                mappings.action[c],
+                mappings.variable[row],
+                mappings.sign[row],
                 rules,
-                merit[c] if rules.by_merit else merit[0],
+                relevance[c] if rules.by_relevance else relevance[0],
                 own[s],
                 kept,
-                best,
+                scratch,
                 c,
             )
-        write_row(s, own[s], kept, source, ways, mappings, rules, best, supply)
+        write_row(s, own[s], kept, source, mappings, rules, scratch.number, scratch.value, transferred)
 
 
-class BestInstances(ArrayStruct):
-    """Work space for the instances needed at one state, best first, with room for one more than are ever needed.
+class Translator:
+    """
+    Translates instances of selected candidates, with the arrays that this takes.
 
-    :param index: int64, shape (room,); ``weight``, ``merit``: float64; ``candidate``: int64
-    :param variable: int64, shape (n_variables,): source variables that a candidate compares with; ``at``: float64, same
-        shape: where the state lies along each
+    :param candidates: the candidates of every target action
+    :param task: the target task
+    :param breadth: kernel breadth of transferred instances, unit coordinates
+    :param transfer_terminals: see ``TransferRules``; ``by_relevance``: the same
     """
 
-    index: np.ndarray
-    weight: np.ndarray
-    merit: np.ndarray
-    candidate: np.ndarray
-    variable: np.ndarray
-    at: np.ndarray
-
-    @classmethod
-    def empty(cls, most: int, n_variables: int) -> "BestInstances":
-        """Work space for ``most`` instances."""
-        room = most + 1
-        return cls(
-            index=np.empty(room, dtype=np.int64),
-            weight=np.empty(room),
-            merit=np.empty(room),
-            candidate=np.empty(room, dtype=np.int64),
-            variable=np.empty(n_variables, dtype=np.int64),
-            at=np.empty(n_variables),
+    def __init__(
+        self, candidates: Candidates, task: TargetTask, *, breadth: float, transfer_terminals: bool, by_relevance: bool
+    ):
+        self.rules = TransferRules(
+            threshold=task.exploration_threshold,
+            breadth=breadth,
+            min_weight=task.min_weight,
+            min_fraction=task.min_fraction,
+            transfer_terminals=transfer_terminals,
+            by_relevance=by_relevance,
         )
+        largest = int(candidates.instances.size.max())
+        self.relevance = np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0))
+        self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
+        self._source = SourceArrays.of_instances(candidates.instances)
+        self._mappings = CandidateMappings(candidates.arrays.row, candidates.arrays.action, *candidates.table)
+        n_blocks = (largest + BLOCK - 1) // BLOCK
+        self._scratch = TranslationScratch.empty(self._max_instances, task.n_variables, max(1, n_blocks))
+        self._transferred = TransferredInstances.empty(task.n_actions, task.n_variables, self._max_instances)
+        self._translate = EntryPoint(translate)
+
+    def set_breadth(self, breadth: float) -> None:
+        """Translate with another kernel breadth from now on."""
+        self.rules = self.rules._replace(breadth=breadth)
+
+    def __call__(
+        self, states: np.ndarray, own_weight: np.ndarray, first: np.ndarray, last: np.ndarray
+    ) -> TransferredInstances:
+        """
+        Translate instances for states and actions (see ``Transfer.transferred``).
+
+        :param states: unit coordinates, shape (n, n_variables)
+        :param own_weight: shape (n,)
+        :param first: first candidate whose instances may be used; ``last``: one past the last; shape (n,)
+        :return: instances, in arrays that the next call uses again
+        """
+        if len(own_weight) > len(self._transferred.length):
+            self._transferred = TransferredInstances.empty(2 * len(own_weight), states.shape[1], self._max_instances)
+        transferred = self._transferred
+        arrays = self._source, self._mappings, self.rules, self.relevance, self._scratch, transferred
+        self._translate(states, own_weight, first, last, *arrays)
+        return transferred

@@ -1,4 +1,4 @@
-"""Fitted R-Max as RL-Zoo builds it: from a configuration file, with sources that are learnt when they are missing."""
+"""Fitted R-Max as RL-Zoo builds it: from a configuration file, with sources that are learnt if they are missing."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 from sb3_combrel.zoo.sources import with_arguments, with_sources
 
-MOST_PAIRS = 2_000_000
-"""State-action pairs of the grid beyond which "finer" is no finer: some 1.5 GB."""
+MAX_PAIRS = 2_000_000
+"""State-action pairs of the grid beyond which "finer" is not applied: about 1.5 GB."""
 
 
 class ZooFittedRMax(FittedRMax):
     """
     :class:`~sb3_combrel.FittedRMax` whose ``transfer`` may name a source task that has yet to be learnt.
 
-    A model that it saves holds the source instances, not the name of their file: it can be loaded on other machines, and
+    A model that it saves contains the source instances, not the name of their file: it can be loaded on other machines, and
     with ``FittedRMax.load`` as well.
 
     ``resolution`` may also be "coarser" or "finer": than the one of ``None``, which suits the task and the breadth, by a
-    factor of two a variable (no finer than some 1.5 GB allow).
+    factor of two a variable (if that takes less than about 1.5 GB).
 
-    :param policy: "FittedRMaxPolicy"; must be given, as RL-Zoo cannot go on with a trained agent without it
+    :param policy: "FittedRMaxPolicy"; must be given, as RL-Zoo needs it to continue with a trained agent
     :param env: the environment to learn from
-    :param transfer_kwargs: arguments of the transfer method that take the place of those in ``transfer``, so that a study
+    :param transfer_kwargs: arguments of the transfer method that replace those in ``transfer``, so that a study
         or ``--hyperparams`` can change one of them
     :param kwargs: all other arguments of :class:`~sb3_combrel.FittedRMax`
-    :raises ValueError: if ``policy`` is missing, a source cannot be had, or an argument is out of range
+    :raises ValueError: if ``policy`` is missing, a source can neither be read nor learnt, or an argument is out of range
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class ZooFittedRMax(FittedRMax):
         super().__init__(policy, env, **kwargs)
 
     def _setup_model(self) -> None:
-        # Here and not in the constructor: when RL-Zoo resumes, load() brings the arguments in behind its back.
+        # Not in the constructor: when RL-Zoo resumes, load() sets the arguments after it.
         self.transfer = with_sources(with_arguments(restore_transfer(self.transfer), self.transfer_kwargs))
         self.transfer_kwargs = None
         try:
@@ -66,15 +66,16 @@ class ZooFittedRMax(FittedRMax):
         super()._setup_model()
 
     def _relative_resolution(self, wanted: str) -> int:
-        """The number for "coarser" or "finer"."""
+        """Compute the resolution for "coarser" or "finer"."""
         if wanted not in ("coarser", "finer"):
             raise ValueError(f'resolution must be a whole number, one for each variable, "coarser" or "finer", got {wanted!r}')
         if not isinstance(self.action_space, spaces.Discrete):
             raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         n_actions = int(self.action_space.n)
-        suited, *_ = fitting_grid(n_variables, n_actions, None, self._breadth(), self.min_weight).resolution
+        breadth = self.settings.breadth_for(n_variables)
+        suited, *_ = fitting_grid(n_variables, n_actions, None, breadth, self.min_weight).resolution
         if wanted == "coarser":
             return max(1, suited - 1)
         n_pairs = (2 ** (suited + 1) + 1) ** n_variables * n_actions
-        return suited + 1 if n_pairs <= MOST_PAIRS else suited
+        return suited + 1 if n_pairs <= MAX_PAIRS else suited

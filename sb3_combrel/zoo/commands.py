@@ -34,7 +34,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     Run one of RL-Zoo's commands.
 
-    What is wrong with a configuration file or an argument is said in one sentence; ``--verbose 2`` shows where it arose.
+    An error in a configuration file or an argument is reported in one sentence; ``--verbose 2`` shows the traceback.
 
     :param args: command and its arguments, those of the process by default
     :return: exit status: 0, or 1 if something was wrong, or 2 if there is no such command
@@ -48,7 +48,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except _what_users_cause() as error:
         if _is_verbose(rest):
             raise
-        print(f"sb3_combrel.zoo: {_in_words(error)}", file=sys.stderr)
+        print(f"sb3_combrel.zoo: {_message_of(error)}", file=sys.stderr)
         return 1
 
 
@@ -73,18 +73,18 @@ def _run_script(command: str) -> None:
     trained_models, real_call = rl_zoo3.utils.get_trained_models, subprocess.call
 
     def by_file_name(log_folder: str) -> dict[str, tuple[str, Any]]:
-        """RL-Zoo's benchmark looks for runs by the id of their task, which is no file name if it has a namespace."""
+        """Find runs by file name: RL-Zoo's benchmark uses the id of their task, which is none if it has a namespace."""
         from huggingface_sb3 import EnvironmentName
 
         return {name: (algo, EnvironmentName(env_id)) for name, (algo, env_id) in trained_models(log_folder).items()}
 
     def enjoy_here(call: Any, **options_of_call: Any) -> int:
-        """RL-Zoo's benchmark calls ``python enjoy.py``, which only exists in a clone of RL-Zoo."""
+        """Replace the call of ``python enjoy.py``, which exists in a clone of RL-Zoo only, by this package's ``enjoy``."""
         if list(call[:2]) != ["python", "enjoy.py"]:
             return real_call(call, **options_of_call)
-        words = [str(getattr(word, "gym_id", word)) for word in call[2:]]
+        arguments = [str(getattr(argument, "gym_id", argument)) for argument in call[2:]]
         options = ["--gym-packages", *packages] if packages else []
-        return subprocess.run([sys.executable, "-m", "sb3_combrel.zoo", "enjoy", *words, *options], check=False).returncode
+        return subprocess.run([sys.executable, "-m", "sb3_combrel.zoo", "enjoy", *arguments, *options], check=False).returncode
 
     with (
         mock.patch.object(rl_zoo3.utils, "get_trained_models", by_file_name),
@@ -94,7 +94,7 @@ def _run_script(command: str) -> None:
 
 
 def _without_gym_packages(args: list[str]) -> tuple[list[str], list[str]]:
-    """What follows ``--gym-packages``, and the other arguments."""
+    """Separate the packages after ``--gym-packages`` from the other arguments."""
     if "--gym-packages" not in args:
         return [], args
     at = args.index("--gym-packages")
@@ -114,7 +114,7 @@ def _what_users_cause() -> tuple[type[Exception], ...]:
     return (*usual, YAMLError)
 
 
-def _in_words(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in OF_EXTRA:
         return NEEDS_EXTRA.format(missing=error.name)
     return str(error) or type(error).__name__

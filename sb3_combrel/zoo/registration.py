@@ -1,4 +1,4 @@
-"""What RL-Zoo must know of this package: algorithms, samplers of hyperparameters, environments."""
+"""Registration with RL-Zoo: algorithms, samplers of hyperparameters, environments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ALGORITHMS = {
     "combrel": sample_combrel_params,
 }
 """
-Names for ``--algo``, and what draws hyperparameters for each.
+Names for ``--algo``, and the function that draws hyperparameters for each.
 
 All are Fitted R-Max; each has its own configuration file, log folder and column in tables.
 """
@@ -24,7 +24,7 @@ All are Fitted R-Max; each has its own configuration file, log folder and column
 
 def register() -> None:
     """
-    Add the algorithms to RL-Zoo's tables and the environments to Gymnasium; doing it twice does no harm.
+    Add the algorithms to RL-Zoo's tables and the environments to Gymnasium; may be called more than once.
 
     :raises ImportError: if RL-Zoo is not installed
     """

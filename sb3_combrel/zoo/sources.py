@@ -1,4 +1,4 @@
-"""Sources in configuration files: a file of instances, or a task that is learnt first, once, and kept."""
+"""Sources in configuration files: a file of instances, or a task that is learnt once, before the target task."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ DEFAULT_RECIPE: Mapping[str, Any] = {"n_instances": 1000, "total_timesteps": 30_
 
 def with_sources(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Any:
     """
-    The same transfer with its sources at hand.
+    Replace sources in a description of a transfer method by source instances.
 
     :param transfer: as :class:`~sb3_combrel.FittedRMax` takes it; in a dict, ``source`` may be what :func:`find_source`
         takes, or a list of such
-    :raises ValueError: if a source cannot be had
+    :return: the description with source instances; anything that is not a dict unchanged
+    :raises ValueError: if a source can neither be read nor learnt
     """
     if not isinstance(transfer, dict) or len(transfer) != 1:
         return transfer
@@ -42,11 +43,11 @@ def with_sources(transfer: Transfer | type[Transfer] | dict[str, Any] | str | No
 
 def with_arguments(transfer: Any, arguments: Mapping[str, Any] | None) -> Any:
     """
-    The same transfer with other arguments.
+    Replace arguments in a description of a transfer method.
 
     :param transfer: as a configuration file gives it
-    :param arguments: take the place of those of the same names; None for none
-    :raises ValueError: if there are arguments, and no transfer method with a name that they could go to
+    :param arguments: new values by name; None for none
+    :raises ValueError: if there are arguments but no transfer method given by name
     """
     if not arguments:
         return transfer
@@ -61,10 +62,10 @@ def with_arguments(transfer: Any, arguments: Mapping[str, Any] | None) -> Any:
 
 def find_source(source: Any) -> SourceInstances:
     """
-    Source instances, from a file or from a task.
+    Read source instances from a file, or learn a task for them.
 
-    :param source: source instances; the path of a file of them; the id of an environment, learnt as
-        :data:`DEFAULT_RECIPE` says; or a recipe: a dict with ``env``, the id, and arguments of
+    :param source: source instances; the path of a file of them; the id of an environment, learnt with
+        :data:`DEFAULT_RECIPE`; or a recipe: a dict with ``env``, the id, and arguments of
         :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
         :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
     :raises ValueError: if it is none of these
@@ -91,9 +92,10 @@ def find_source(source: Any) -> SourceInstances:
 
 def learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     """
-    Instances of a task learnt by Q-learning or Fitted R-Max; the second time they are read from a file.
+    Learn a task by Q-learning or Fitted R-Max and return instances of it; read them from a file if that was done before.
 
-    Processes that begin at once each learn it; as the seed is theirs too, so is the result, and no file is half written.
+    Processes that start at the same time each learn the task, with the same seed and so with the same result; files are
+    written completely or not at all.
 
     :param recipe: see :func:`find_source`
     :raises ValueError: if the task cannot be learnt so
@@ -118,7 +120,7 @@ def learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
 
 def cache_file(recipe: Mapping[str, Any]) -> Path:
     """
-    Where the instances of a recipe are kept: in the folder that the variable SB3_COMBREL_CACHE names, or ~/.cache/sb3_combrel.
+    Return the file for the instances of a recipe, in the folder SB3_COMBREL_CACHE (a variable), or ~/.cache/sb3_combrel.
 
     :param recipe: see :func:`learn_or_read`
     """

@@ -5,10 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from sb3_combrel.mappings.named_sets import MappingSet
-from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel import MappingSet, SourceInstances
+from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
 from sb3_combrel.transfer.compliance import ComplianceScratch, compliance_table, default_bandwidths
-from sb3_combrel.transfer.mapping_transfer import stacked_instances, stacked_table
 
 N_TRANSITIONS = 3000
 SETS = {"injective (12 x 243)": (MappingSet.injective, 12), "all (50 x 243)": (MappingSet.all, 50)}
@@ -36,6 +35,6 @@ def test_compliance_of_3000_transitions_with_every_mapping(benchmark, name):
         table,
         default_bandwidths(instances),
         ComplianceScratch.for_mappings(table, instances),
-        np.empty((N_TRANSITIONS, len(table.index), len(instances.count))),
+        np.empty((N_TRANSITIONS, len(table.variable), len(instances.size))),
     )
     benchmark.pedantic(compliance_table, args=arguments, rounds=5, warmup_rounds=1)

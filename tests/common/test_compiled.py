@@ -1,29 +1,33 @@
-"""A compiled function called with the same types every time."""
+"""Compiled functions: how Python calls them, what their first call does, and what the import leaves alone."""
 
 import copy
 import gc
+import os
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from sb3_combrel.common.compiled import SameTypes
+from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 
 
-def test_it_gives_what_the_function_gives_and_survives_copies():
+def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
     states = np.array([[0.5, 3.0], [-2.0, 1.0]])
     low, ranges = np.array([0.0, 1.0]), np.array([2.0, 4.0])
-    scale = SameTypes(scale_into_box)
+    scale = EntryPoint(scale_into_box)
     for again in (scale, scale, copy.deepcopy(scale), pickle.loads(pickle.dumps(scale))):
-        units, expected = np.empty_like(states), np.empty_like(states)
-        assert again(states, low, ranges, units) == scale_into_box(states, low, ranges, expected)
-        np.testing.assert_array_equal(units, expected)
+        for call in (again, again.call):
+            units, expected = np.empty_like(states), np.empty_like(states)
+            assert call(states, low, ranges, units) == scale_into_box(states, low, ranges, expected)
+            np.testing.assert_array_equal(units, expected)
 
 
-def test_states_are_scaled_as_by_the_scaling_and_moved_into_the_box():
+def test_scale_into_box_is_to_unit_moved_into_the_box():
     scaling = StateScaling(np.array([-1.0, 0.0, 10.0]), np.array([1.0, 5.0, 11.0]))
     states = np.random.default_rng(0).uniform([-2.0, -1.0, 9.5], [2.0, 6.0, 11.5], (100, 3))
     units = np.empty_like(states)
@@ -34,42 +38,126 @@ def test_states_are_scaled_as_by_the_scaling_and_moved_into_the_box():
     assert scale_into_box(np.full((1, 3), np.nan), scaling.low, scaling.high - scaling.low, units[:1])
 
 
-@pytest.fixture
-def collecting():
-    """Garbage collection as tests expect it, whatever happens."""
-    yield
+# ------------------------------------------------------------- garbage collection
+
+
+@pytest.fixture(params=[True, False])
+def collecting(request):
+    """Garbage collection on and off; on again afterwards."""
+    (gc.enable if request.param else gc.disable)()
+    yield request.param
     gc.enable()
 
 
-@pytest.mark.parametrize("before", (True, False))
-def test_no_garbage_is_collected_while_ours_is_compiled_and_then_as_before(collecting, monkeypatch, before):
-    seen = []
-    called = gc.disable
-    monkeypatch.setattr(gc, "disable", lambda: (called(), seen.append(gc.isenabled())))
-    if not before:
-        called()
-
-    def inner(x):
-        return x + 1
-
-    inner.__module__ = "sb3_combrel.inner"
-    inner = njit(inner)
-
-    def outer(x):
-        return inner(x) * 2
-
-    assert njit(outer)(1) == 4  # not ours, but what it calls is
-    assert seen == [False] and gc.isenabled() == before
-    outer.__module__ = "sb3_combrel.outer"
-    assert njit(outer)(1.0) == 4.0
-    assert seen == [False, False] and gc.isenabled() == before
+def test_garbage_collection_waits_during_the_first_call_of_an_entry_point_only(collecting):
+    entry = EntryPoint(gc.isenabled)
+    assert entry.call() is False
+    assert gc.isenabled() == collecting
+    assert entry.call() == entry() == collecting
 
 
-def test_garbage_is_collected_again_when_ours_does_not_compile(collecting):
-    def wrong(x):
-        return x.nothing
+def test_garbage_collection_is_as_before_when_the_function_does_not_compile(collecting):
+    entry = EntryPoint(njit(lambda x: x.nothing))
+    for _ in range(2):
+        with pytest.raises(TypingError, match="nothing"):
+            entry.call(1)
+        assert gc.isenabled() == collecting
 
-    wrong.__module__ = "sb3_combrel.wrong"
-    with pytest.raises(TypingError, match="nothing"):
-        njit(wrong)(1)
-    assert gc.isenabled()
+
+def test_garbage_collection_is_as_before_when_the_function_raises(collecting):
+    def fail():
+        raise RuntimeError("on purpose")
+
+    with pytest.raises(RuntimeError, match="on purpose"):
+        EntryPoint(fail).call()
+    assert gc.isenabled() == collecting
+
+
+# ------------------------------------------------------------------ announcement
+
+MESSAGE = "sb3_combrel: compiling"
+
+
+def run(code, cache):
+    """What a fresh Python process prints to stdout and stderr, with compiled code cached in ``cache``."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
+
+
+COMPILE_TWO = """
+import gc
+import numpy as np
+from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.instances import Instances, put_instance_at
+from sb3_combrel.common.scaling import scale_into_box
+
+one = np.zeros((1, 1))
+EntryPoint(scale_into_box).call(one, np.zeros(1), np.ones(1), one.copy())
+EntryPoint(scale_into_box).call(one.astype(np.float32), np.zeros(1), np.ones(1), one.copy())
+instances = Instances.empty(1, 1)
+put_instance_at.call(instances, (0, 0, np.zeros(1), np.ones(1), -1.0, False))
+assert instances.size[0] == 1 and gc.isenabled()
+"""
+
+
+@pytest.mark.integration
+def test_compilation_is_announced_once_and_what_is_cached_is_not_announced(tmp_path):
+    _, printed = run(COMPILE_TWO, tmp_path)
+    assert printed.count(MESSAGE) == 1
+    _, printed = run(COMPILE_TWO, tmp_path)
+    assert MESSAGE not in printed
+
+
+OTHER_PEOPLE_S_FUNCTIONS = """
+import gc
+import threading
+import types
+
+import sb3_combrel
+from numba import njit
+from numba.core import event
+from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel.common.compiled import EntryPoint
+
+def plus(x):
+    return x + 1
+
+def without_module():
+    function = types.FunctionType(plus.__code__, {})
+    function.__module__ = None
+    return njit(function)
+
+def of_another_module():
+    function = types.FunctionType(plus.__code__, {})
+    function.__module__ = "somebody.elses"
+    return njit(function)
+
+seen = []
+
+class Listener(event.Listener):
+    def on_start(self, event):
+        seen.append(gc.isenabled())
+    def on_end(self, event):
+        pass
+
+with event.install_listener("numba:compile", Listener()):
+    for make in (without_module, of_another_module):
+        assert make()(1) == 2
+    assert seen == [True, True], "garbage is collected as ever"
+
+# Also while a function of the package is compiling, which others may do in another thread, or within it.
+def call_others():
+    return [make()(1) for make in (without_module, of_another_module)]
+
+assert EntryPoint(call_others).call() == [2, 2]
+print("fine")
+"""
+
+
+@pytest.mark.integration
+def test_the_import_leaves_the_compilation_of_other_people_s_functions_alone(tmp_path):
+    printed, errors = run(OTHER_PEOPLE_S_FUNCTIONS, tmp_path)
+    assert printed == "fine\n"
+    assert MESSAGE not in errors, "only functions of this package are announced"

@@ -26,7 +26,7 @@ def put(env, state):
         physics.set_car(*state)
 
 
-def test_it_goes_the_same_way_as_the_fast_environment():
+def test_the_adapter_gives_the_same_episodes_as_the_fast_environment():
     env = adapted(task_kwargs={"start": "fixed"})
     fast = gymnasium.make("combrel/MountainCar4D-v0", start="fixed")
     np.testing.assert_array_equal(env.reset(seed=0)[0], fast.reset(seed=0)[0])
@@ -38,19 +38,19 @@ def test_it_goes_the_same_way_as_the_fast_environment():
         assert ours[1:] == theirs[1:]
 
 
-def test_the_checkers_have_nothing_to_say():
+def test_sb3s_checker_finds_no_fault_in_an_adapted_environment():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_sb3_env(adapted())
 
 
-def test_the_specs_bounds_are_taken_when_none_are_given():
+def test_observation_bounds_default_to_those_of_the_spec():
     env = adapted(low=None, high=None)
     assert env.observation_space.shape == (4,)
     assert np.all(np.isinf(env.observation_space.low))
 
 
-def test_a_seed_decides_the_starts():
+def test_a_seed_determines_the_starts_of_an_adapted_environment():
     env, other = adapted(), adapted()
     first = [env.reset(seed=5)[0], env.reset()[0]]
     assert np.array_equal(first, [other.reset(seed=5)[0], other.reset()[0]])
@@ -59,7 +59,7 @@ def test_a_seed_decides_the_starts():
 
 
 @pytest.mark.parametrize(("state", "end"), [(NEARLY, (True, False)), (((-0.5,), (0.0,)), (False, True))])
-def test_the_last_step_truncates_unless_the_task_ends_on_it(state, end):
+def test_the_last_step_of_the_time_limit_truncates_unless_the_task_ends_on_it(state, end):
     env = adapted("climb_2d", LOW[::2], HIGH[::2], {"time_limit": 1})
     env.reset(seed=0)
     put(env, state)
@@ -78,7 +78,7 @@ def test_steps_outside_an_episode_are_errors():
         env.step(0)
 
 
-def test_unknown_options_are_errors():
+def test_unknown_reset_options_are_errors():
     with pytest.raises(ValueError, match="options of reset must be empty"):
         adapted().reset(options={"start": "fixed"})
 
@@ -90,7 +90,8 @@ def test_continuous_actions_are_errors():
         DmControlEnv(suite.load("cartpole", "balance"))
 
 
-def test_it_draws_and_can_be_closed_twice():
+@pytest.mark.integration
+def test_an_adapted_environment_draws_and_can_be_closed_twice():
     env = adapted(render_mode="rgb_array", width=64, height=48)
     env.reset(seed=0)
     assert env.render().shape == (48, 64, 3)
@@ -98,7 +99,7 @@ def test_it_draws_and_can_be_closed_twice():
     env.close()
 
 
-def test_registering_again_changes_nothing():
+def test_registering_the_environments_again_changes_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         register_envs()

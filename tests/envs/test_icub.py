@@ -50,7 +50,7 @@ class TestHits:
 
     @pytest.mark.slow
     @pytest.mark.parametrize(("env_id", "least", "most"), [(TORSO, 0.04, 0.08), (ARM, 0.01, 0.04)])
-    def test_random_commands_seldom_hit_it(self, env_id, least, most):
+    def test_random_commands_seldom_hit_the_ball(self, env_id, least, most):
         # The standard error of 400 episodes is 0.012 (torso) and 0.008 (arm).
         assert least <= hits_of_random_actions(env_id, 400) <= most
 
@@ -60,14 +60,14 @@ class TestHits:
         steps = [environment.step(action) for action in plan_of(TORSO)]
         assert steps[-1].last() and environment.physics.ball_displacement() > icub_tasks.HIT_DISTANCE
 
-    def test_the_ball_lies_still_until_then(self):
+    def test_the_ball_lies_still_until_it_is_hit(self):
         environment = combrel_envs.load("icub", "arm_strike")
         environment.reset()
         for action in plan_of(ARM)[:-1]:
             environment.step(action)
             assert environment.physics.ball_displacement() == 0.0
 
-    def test_a_hand_that_presses_on_the_table_gathers_no_force(self):
+    def test_the_force_of_a_hand_on_the_table_does_not_grow(self):
         env = gymnasium.make(TORSO, start=(0, 0), max_episode_steps=10_000)
         env.reset()
         physics = env.unwrapped.environment.physics
@@ -177,11 +177,11 @@ class TestSpaces:
 
         source = SourceInstances.record(None, TORSO, n_instances=20, seed=0)
         model = FittedRMax(ARM, transfer=COMBREL(source), max_value=100, resolution=3, model_breadth=0.4, seed=0)
-        assert model.policy.state_names[0] == "r_shoulder_pitch" and model.policy.action_names[0] == "T1-"
+        assert model.agent.task.state_names[0] == "r_shoulder_pitch" and model.agent.task.action_names[0] == "T1-"
         assert source.state_names == ("torso_pitch", "torso_yaw") and source.action_names[3] == "S2+"
 
     @pytest.mark.parametrize("env_id", [*IDS, *NOISY.values()])
-    def test_the_checkers_have_nothing_to_say(self, env_id):
+    def test_the_checkers_find_no_fault(self, env_id):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             check_sb3_env(gymnasium.make(env_id))
@@ -242,9 +242,9 @@ class TestOptions:
         np.testing.assert_allclose(env.reset()[0], (-36, 44, -14, 60), atol=1e-5)
 
 
-class TestDmControlFace:
+class TestDmControl:
     @pytest.mark.parametrize("env_id", IDS)
-    def test_both_faces_go_the_same_way(self, env_id):
+    def test_both_interfaces_give_the_same_episodes(self, env_id):
         environment = combrel_envs.load("icub", TASKS[env_id])
         ours = [environment.reset()] + [environment.step(action) for action in plan_of(env_id)]
         theirs = replay(env_id, plan_of(env_id))
@@ -332,7 +332,7 @@ class TestBadInput:
             ({"start": (0, 51)}, "torso_yaw must lie between"),
         ],
     )
-    def test_wrong_reset_options_are_errors_and_the_next_episode_is_as_ever(self, options, message):
+    def test_wrong_reset_options_are_errors_and_do_not_change_the_next_episode(self, options, message):
         env = gymnasium.make(TORSO)
         env.reset()
         with pytest.raises(ValueError, match=message):
@@ -344,6 +344,7 @@ class TestBadInput:
         with pytest.raises(ModuleNotFoundError, match=r"look='meshes' needs icub_models.*'sb3-combrel\[icub\]'"):
             gymnasium.make(TORSO, look="meshes")
 
+    @pytest.mark.integration
     def test_without_opengl_all_but_pictures_works_and_the_error_says_what_to_do(self):
         code = f"""
 import combrel_envs, gymnasium

@@ -11,6 +11,8 @@ from helpers.icub_plans import ARM, IDS, TASKS, TORSO, observations, plan_of
 import combrel_envs
 from combrel_envs import icub_tasks
 
+pytestmark = pytest.mark.integration
+
 ASSETS = Path(combrel_envs.__file__).parent / "assets"
 # Of the robot, what must be seen; of the hand, the geom that strikes.
 PARTS = ("head", "chest", "r_forearm", "l_forearm", "r_fingers", "ball", "table_top")
@@ -76,14 +78,14 @@ class TestPictures:
 
 class TestMeshes:
     @pytest.mark.parametrize("env_id", IDS)
-    def test_they_change_nothing_but_the_look(self, env_id):
+    def test_meshes_change_nothing_but_the_look(self, env_id):
         needs_meshes("meshes")
         rng = np.random.default_rng(0)
         actions = rng.integers(gymnasium.make(env_id).action_space.n, size=200).tolist()
         for sequence in (plan_of(env_id), actions):
             assert observations(env_id, sequence, look="meshes") == observations(env_id, sequence)
 
-    def test_they_lie_where_the_primitives_are(self):
+    def test_meshes_lie_where_the_primitives_are(self):
         needs_meshes("meshes")
         plain, shaped = (combrel_envs.load("icub", "arm_strike", {"look": look}).physics for look in icub_tasks.LOOKS)
         for physics in (plain, shaped):
@@ -97,7 +99,7 @@ class TestMeshes:
 
 
 class TestDrawing:
-    def test_it_doesnt_change_the_episode(self):
+    def test_drawing_doesnt_change_the_episode(self):
         actions = plan_of(TORSO)
         env = gymnasium.make(TORSO, render_mode="rgb_array", width=64, height=48)
         drawn = [env.reset()[0].tolist()]

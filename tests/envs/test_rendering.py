@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.parametrize("broken", [False, True])
 def test_triton_is_loaded_before_dm_control_loads_mesa(broken, tmp_path):

@@ -10,6 +10,7 @@ from sb3_combrel.experiments import breadths
 from sb3_combrel.experiments.statistics import episodes_to_reach, steps_to_reach
 
 
+@pytest.mark.integration
 def test_the_experiment_writes_a_line_for_each_run_and_a_table(tmp_path):
     breadths.run_experiment(tmp_path, 1, 6, (0.2,), 1, Console(record=True, width=200))
     with (tmp_path / "summary.csv").open(newline="") as file:

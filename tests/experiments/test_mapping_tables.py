@@ -1,4 +1,4 @@
-"""Tables of the mappings used, and the most frequent one, from the words that runs leave."""
+"""Tables of the mappings used, and the most frequent one, from the files of runs."""
 
 from collections import Counter
 

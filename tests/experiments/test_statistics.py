@@ -35,7 +35,7 @@ def test_a_saving_is_the_difference_of_the_means():
     assert 0.0 < saved.p_value < 0.05
 
 
-def test_the_interval_of_a_saving_holds_the_truth_as_often_as_it_says():
+def test_the_interval_of_a_saving_contains_the_true_value_as_often_as_its_confidence():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(1000):

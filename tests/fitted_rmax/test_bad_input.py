@@ -1,4 +1,4 @@
-"""What happens to arguments, environments and files that cannot work: an error that says what to change, in time."""
+"""Arguments, environments and files that cannot work are refused in time, with an error that names what to change."""
 
 import warnings
 
@@ -13,9 +13,9 @@ from sb3_combrel.common.checks import check_resolution
 
 
 class Scripted(gym.Env):
-    """A line to walk along; what it answers can be spoilt from step ``spoilt_from`` on.
+    """A line to walk along; what it returns can be spoilt from step ``spoilt_from`` on.
 
-    :param spoil: called with (observation, reward) and returns what the environment answers instead
+    :param spoil: called with (observation, reward) and returns what the environment returns instead
     """
 
     def __init__(self, n_variables=2, spoil=None, spoilt_from=5, reward=-1.0, action_space=None, space=None):
@@ -43,13 +43,13 @@ class Scripted(gym.Env):
 
 
 @pytest.mark.parametrize("actions", [spaces.Box(-1.0, 1.0, (1,)), spaces.MultiDiscrete([2, 2]), spaces.MultiBinary(2)])
-def test_actions_must_be_discrete(actions):
+def test_fitted_rmax_refuses_actions_that_are_not_discrete(actions):
     with pytest.raises(ValueError, match="Discrete"):
         FittedRMax(Scripted(action_space=actions))
 
 
 @pytest.mark.parametrize(
-    ("space", "says"),
+    ("space", "message"),
     [
         (spaces.Dict({"a": spaces.Box(0.0, 1.0, (2,))}), "FlattenObservation"),
         (spaces.Box(0, 255, (64, 64, 3), dtype=np.uint8), "images"),
@@ -57,16 +57,16 @@ def test_actions_must_be_discrete(actions):
         (spaces.Discrete(4), "Box"),
     ],
 )
-def test_observations_must_be_a_vector(space, says):
-    with pytest.raises(ValueError, match=says):
+def test_fitted_rmax_refuses_observations_that_are_no_vector(space, message):
+    with pytest.raises(ValueError, match=message):
         FittedRMax(Scripted(space=space))
 
 
-def test_infinite_bounds_need_the_bounds_argument():
+def test_infinite_observation_bounds_need_the_bounds_argument():
     with pytest.raises(ValueError, match=r"bounds=\(low, high\)"):
         FittedRMax("CartPole-v1")
     model = FittedRMax("CartPole-v1", bounds=([-2.6, -3.0, -0.23, -3.2], [2.6, 3.0, 0.23, 3.2]), resolution=3, seed=0)
-    assert model.policy.model.grid.n_points == 9**4
+    assert model.agent.grid.n_points == 9**4
 
 
 @pytest.mark.parametrize(
@@ -78,17 +78,22 @@ def test_bounds_that_do_not_fit_are_refused(bounds):
         FittedRMax(Scripted(), bounds=bounds)
 
 
+def states_and_effects(model):
+    """Of all instances, unit coordinates."""
+    rows = model.agent.model.instances.rows()
+    d = (rows.shape[1] - 3) // 2
+    return rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d]
+
+
 def test_observations_outside_the_bounds_count_as_the_boundary_with_one_warning():
     model = FittedRMax(Scripted(spoil=lambda obs, reward: (obs + 5.0, reward)), seed=0)
     with pytest.warns(UserWarning, match="outside the bounds") as caught:
         model.learn(40)
     assert sum("outside the bounds" in str(w.message) for w in caught) == 1
-    instances = model.policy.model.instances
-    for action in range(2):
-        states = instances.state[action, : instances.count[action]]
-        ends = states + instances.effect[action, : instances.count[action]]
-        assert ((states >= 0.0) & (states <= 1.0)).all()
-        assert (np.abs(ends - 0.5) <= 0.5 + 1e-12).all()
+    states, effects = states_and_effects(model)
+    assert len(states) == 40
+    assert ((states >= 0.0) & (states <= 1.0)).all()
+    assert (np.abs(states + effects - 0.5) <= 0.5 + 1e-12).all()
 
 
 def test_observations_within_the_bounds_give_no_warning():
@@ -107,8 +112,8 @@ def test_observations_that_are_not_finite_are_refused(value):
     model = FittedRMax(Scripted(spoil=spoil), seed=0)
     with pytest.raises(ValueError, match=r"observation.*not finite"):
         model.learn(40)
-    assert model.policy.model.n_instances == 4, "what came before is kept"
-    assert np.isfinite(model.policy.model.instances.effect[:, :2]).all()
+    assert model.agent.model.n_instances == 4, "what came before is kept"
+    assert all(np.isfinite(array).all() for array in states_and_effects(model))
     with pytest.raises(ValueError, match=r"observation.*not finite"):
         model.predict(np.array([0.0, value]))
 
@@ -118,8 +123,8 @@ def test_rewards_that_are_not_finite_are_refused(value):
     model = FittedRMax(Scripted(spoil=lambda obs, reward: (obs, value)), seed=0)
     with pytest.raises(ValueError, match=r"reward.*not finite"):
         model.learn(40)
-    assert model.policy.model.n_instances == 4, "what came before is kept"
-    assert np.isfinite(model.policy.planner.values).all()
+    assert model.agent.model.n_instances == 4, "what came before is kept"
+    assert np.isfinite(model.agent.planner.values).all()
 
 
 # --------------------------------------------------------------------- arguments
@@ -173,7 +178,7 @@ def test_total_timesteps_must_be_at_least_1(steps):
         model.learn(steps)
 
 
-def test_numpy_numbers_are_numbers():
+def test_arguments_may_be_numpy_numbers():
     model = FittedRMax(
         Scripted(),
         model_breadth=np.float32(0.2),
@@ -187,7 +192,7 @@ def test_numpy_numbers_are_numbers():
     check_resolution(np.array([3, 4]), 2)
 
 
-def test_learning_without_an_environment_says_how_to_give_one(tmp_path):
+def test_learn_without_an_environment_names_set_env(tmp_path):
     FittedRMax(Scripted(), seed=0).learn(20).save(tmp_path / "model")
     model = FittedRMax.load(tmp_path / "model")
     with pytest.raises(ValueError, match="set_env"):
@@ -233,7 +238,7 @@ def saved(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil", "says"),
+    ("name", "spoil", "message"),
     [
         ("instances", lambda t: t[:, :-1], "instances"),
         ("instances", lambda t: t[0], "instances"),
@@ -241,11 +246,11 @@ def saved(tmp_path):
         ("known", lambda t: t[1:], "known"),
     ],
 )
-def test_parameters_of_the_wrong_shape_are_refused_and_change_nothing(saved, name, spoil, says):
+def test_parameters_of_the_wrong_shape_are_refused_and_change_nothing(saved, name, spoil, message):
     model = FittedRMax.load(saved)
     before = model.get_parameters()
     damaged = {"policy": {**before["policy"], name: spoil(before["policy"][name])}}
-    with pytest.raises(RuntimeError, match=says):
+    with pytest.raises(RuntimeError, match=message):
         model.set_parameters(damaged)
     after = model.get_parameters()
     for key, value in before["policy"].items():

@@ -1,4 +1,4 @@
-"""Fitted R-Max learns to strike the ball, with the torso and with the arm, however narrow its kernel is."""
+"""Fitted R-Max learns to strike the ball, with the torso and with the arm, also with a narrow kernel."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from test_learning import SEEDS, lengths_of_episodes
 
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
-from sb3_combrel.models.kernel_average import EPISODES_OF_PATIENCE
+from sb3_combrel.fitted_rmax.agent import DECAY_AFTER_EPISODES
 
 TORSO, ARM = "combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0"
 
@@ -18,14 +18,14 @@ def lengths(env_id, n_episodes, seed, **kwargs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_torso_is_learnt_within_thirty_episodes(seed):
+def test_the_torso_is_learned_within_thirty_episodes(seed):
     """The shortest plan has 25 commands."""
     assert np.median(lengths(TORSO, 30, seed, model_breadth=0.1)[-5:]) <= 27
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_arm_is_learnt_within_sixty_episodes(seed):
+def test_the_arm_is_learned_within_sixty_episodes(seed):
     """The shortest plans have 27 to 29 commands."""
     assert np.median(lengths(ARM, 60, seed, model_breadth=0.2)[-5:]) <= 32
 
@@ -38,33 +38,44 @@ def test_exploration_ends_though_the_kernel_is_narrow():
     assert np.median(steps[-10:]) <= 45
 
 
-def test_time_limits_make_the_model_content_with_less():
-    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(400).policy.model
-    known = model.arrays.known.copy()
-    assert len(model.lower_threshold(EPISODES_OF_PATIENCE)) == 0, "patience must be at an end first"
-    weights = model.arrays.total[~known]
-    newly_known = model.lower_threshold(EPISODES_OF_PATIENCE + 40)
-    assert 0.0 < model.exploration_threshold < 0.5
-    assert len(newly_known) == (weights >= model.exploration_threshold).sum() > 0
-    assert not known[newly_known].any()
-    model.lower_threshold(10**6)
-    assert (model.arrays.known == (model.arrays.total >= model.min_weight)).all(), "any instance that counts will do"
+def end_episodes(agent, n):
+    """End ``n`` episodes by their time limit."""
+    for _ in range(n):
+        agent.end_episode(truncated=True)
+
+
+def test_time_limits_lower_the_threshold_of_the_model():
+    agent = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(400).agent
+    known = agent.model.known.copy()
+    end_episodes(agent, DECAY_AFTER_EPISODES - agent.n_truncated)
+    np.testing.assert_array_equal(agent.model.known, known)
+    assert agent.statistics()["model/threshold"] == 1.0, "the first ones change nothing"
+    end_episodes(agent, 40)
+    threshold = agent.statistics()["model/threshold"]
+    assert threshold == pytest.approx(0.98**40)
+    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= threshold))
+    assert agent.model.known.sum() > known.sum()
+    np.testing.assert_array_equal(agent.mdp.arrays.modelled, agent.model.known)
+    agent.n_truncated = 10**6
+    end_episodes(agent, 1)
+    min_weight = agent.settings.min_weight
+    assert (agent.model.known == (agent.model.own_weight >= min_weight)).all(), "in the end any instance that counts suffices"
 
 
 def test_the_lowered_threshold_is_saved(tmp_path):
     model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(50)
-    for _ in range(EPISODES_OF_PATIENCE + 3):
-        model.policy.end_episode(truncated=True)
+    end_episodes(model.agent, DECAY_AFTER_EPISODES + 3)
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model")
-    assert loaded.policy.model.exploration_threshold == model.policy.model.exploration_threshold < 1.0
-    np.testing.assert_array_equal(loaded.policy.model.arrays.known, model.policy.model.arrays.known)
+    threshold = model.agent.statistics()["model/threshold"]
+    assert loaded.agent.statistics()["model/threshold"] == threshold < 1.0
+    np.testing.assert_array_equal(loaded.agent.model.known, model.agent.model.known)
 
 
-def test_combrel_on_the_arm_runs():
+def test_combrel_transfers_from_the_torso_to_the_arm():
     source = SourceInstances.from_fitted_rmax(TORSO, 200, seed=0, n_episodes=6, max_value=100.0)
     assert source.terminated.any()
     assert len(source) == 200
-    model = FittedRMax(make_vec_env(ARM), transfer=COMBREL(source, voting_radius=0.4), max_value=100.0, seed=0)
+    model = FittedRMax(make_vec_env(ARM), transfer=COMBREL(source, neighbor_radius=0.4), max_value=100.0, seed=0)
     model.learn(300)
-    assert model.policy.transfer.mapping_counts(), "nothing was transferred"
+    assert model.agent.transfer.mapping_counts(), "nothing was transferred"

@@ -55,12 +55,12 @@ def test_mountain_car_2d_is_learned_within_ten_episodes():
     assert lengths[10:].mean() <= 135
 
 
-def test_mountain_car_4d_finds_the_goal_in_its_first_episode():
+def test_the_goal_of_mountain_car_4d_is_found_in_the_first_episode():
     assert mountain_car_4d(0, 1)[0] < 1100
 
 
 @pytest.mark.slow
-def test_mountain_car_2d_as_fast_as_the_original():
+def test_mountain_car_2d_is_learned_as_fast_as_by_the_original():
     """Its authors' program: 163 to 166 steps over the first ten episodes, 115 to 120 from then on."""
     runs = np.array([mountain_car_2d(seed, 50) for seed in SEEDS])
     assert runs[:, :10].mean() <= 170
@@ -68,7 +68,7 @@ def test_mountain_car_2d_as_fast_as_the_original():
 
 
 @pytest.mark.slow
-def test_mountain_car_4d_as_fast_as_the_prototype():
+def test_mountain_car_4d_is_learned_as_fast_as_by_the_prototype():
     runs = np.array([mountain_car_4d(seed, 60) for seed in SEEDS])
     assert (runs[:, 0] < 1100).all()
     assert runs[:, 40:60].mean() <= 230
@@ -84,14 +84,14 @@ def returns_in_evaluation(env_id, steps, seed, n_episodes=100, **kwargs):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_mountain_car_v0_with_default_parameters(seed):
+def test_mountain_car_v0_is_solved_with_default_parameters(seed):
     """Solved is -110."""
     assert returns_in_evaluation("MountainCar-v0", 3000, seed).mean() >= -110
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_cart_pole(seed):
+def test_cart_pole_is_solved(seed):
     """Solved is 475. A pole falls anywhere alike: with wide bounds for the position, its instances count farther along it."""
     returns = returns_in_evaluation(
         "CartPole-v1",

@@ -1,4 +1,4 @@
-"""An evaluation that goes round in circles notices it, where its caller lets it remember."""
+"""An evaluation that is caught in a loop notices it, where its caller hands on the state that ``predict`` returns."""
 
 import numpy as np
 import pytest
@@ -6,13 +6,13 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_combrel.fitted_rmax.loop_detection import HOPEFUL, TRUSTING, TRYING, EpisodeMemory
+from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
-from sb3_combrel.planning.corrections import PATIENCE
+from sb3_combrel.planning.corrections import MAX_VISITS
 
 
 def modes(steps, gamma):
-    """The way to act at each of some (cell, value, reward), and after the last."""
+    """How actions are chosen at each of some (cell, value, reward), and after the last."""
     memory, seen = EpisodeMemory(), []
     for cell, value, reward in steps:
         seen.append(memory.mode)
@@ -21,77 +21,76 @@ def modes(steps, gamma):
 
 
 @given(st.floats(0.8, 1.0), st.floats(0.01, 100.0), st.integers(1, 7), st.booleans())
-def test_who_goes_round_in_circles_tries_one_way_after_another(gamma, size, n_cells, sparse):
-    """Costs on the way to somewhere, or a reward that is far away: the value should rise, and doesn't."""
+def test_an_episode_caught_in_a_loop_changes_how_actions_are_chosen_again_and_again(gamma, size, n_cells, sparse):
+    """Costs along the way, or a reward that is far away: the value should rise, and doesn't."""
     if sparse and gamma > 0.99:
         gamma = 0.99
     value, reward = (size, 0.0) if sparse else (-size, -size)
-    seen = modes([(n % n_cells, value, reward) for n in range(n_cells * (3 * PATIENCE + 10))], gamma)
-    assert seen[: n_cells * PATIENCE] == [TRUSTING] * n_cells * PATIENCE
+    seen = modes([(n % n_cells, value, reward) for n in range(n_cells * (3 * MAX_VISITS + 10))], gamma)
+    assert seen[: n_cells * MAX_VISITS] == [EXPLOIT] * n_cells * MAX_VISITS
     changes = [mode for mode, before in zip(seen[1:], seen[:-1], strict=True) if mode != before]
-    assert changes[:3] == [HOPEFUL, TRYING, TRUSTING]
+    assert changes[:3] == [OPTIMISTIC, EXPLORE, EXPLOIT]
 
 
 @given(st.floats(0.9, 1.0), st.floats(0.6, 1.5))
-def test_who_makes_progress_has_no_doubts(gamma, part):
-    """However small the steps are: values rise by what is hoped for, or by a little less."""
+def test_an_episode_that_makes_progress_is_not_caught_in_a_loop(gamma, fraction):
+    """However small the steps are: values rise by what is expected, or by a little less."""
     value, steps = -60.0, []
     for _ in range(40):
         steps.append(("here", value, -1.0))
-        value += part * (1.0 + (1.0 - gamma) * value)
-    assert set(modes(steps, gamma)) == {TRUSTING}
+        value += fraction * (1.0 + (1.0 - gamma) * value)
+    assert set(modes(steps, gamma)) == {EXPLOIT}
 
 
-def test_a_pole_in_balance_stays_there():
+def test_a_pole_in_balance_is_not_caught_in_a_loop():
     """Each step brings 1, and what is to come is worth 100, with a discount of 0.99; the model errs by some percent."""
     values = np.random.default_rng(0).normal(97.0, 3.0, size=1000)
-    assert set(modes([("upright", value, 1.0) for value in values], 0.99)) == {TRUSTING}
+    assert set(modes([("upright", value, 1.0) for value in values], 0.99)) == {EXPLOIT}
 
 
-def test_another_place_is_another_matter():
-    assert set(modes([(n, -50.0, -1.0) for n in range(1000)], 1.0)) == {TRUSTING}
+def test_steps_in_different_cells_are_no_loop():
+    assert set(modes([(n, -50.0, -1.0) for n in range(1000)], 1.0)) == {EXPLOIT}
 
 
 # ------------------------------------------------------------------ through predict
 
-
-@pytest.fixture
-def policy():
-    """Knows, wrongly, that action 0 leads on at 0.3; of action 1 it knows nothing."""
-    line = spaces.Box(0.0, 1.0, (1,), dtype=np.float64)
-    policy = FittedRMaxPolicy(line, spaces.Discrete(2), model_breadth=0.1, resolution=3, rng=np.random.default_rng(0))
-    for _ in range(3):
-        policy.learn_from(np.array([0.3]), 0, -1.0, np.array([0.32]), False)
-    return policy
-
-
 HERE = np.array([0.3])
 
 
-def test_what_does_not_come_true_is_not_tried_for_ever(policy):
+@pytest.fixture
+def policy():
+    """Its model predicts, wrongly, that action 0 leads on at 0.3; action 1 is unknown."""
+    line = spaces.Box(0.0, 1.0, (1,), dtype=np.float64)
+    policy = FittedRMaxPolicy(line, spaces.Discrete(2), model_breadth=0.1, resolution=3, rng=np.random.default_rng(0))
+    for _ in range(3):
+        policy.agent.update(HERE, 0, -1.0, np.array([0.32]), False)
+    return policy
+
+
+def test_predict_with_a_state_tries_another_action_where_it_is_caught_in_a_loop(policy):
     state, actions = None, []
-    for _ in range(4 * PATIENCE):
+    for _ in range(4 * MAX_VISITS):
         action, state = policy.predict(HERE, state, deterministic=True)
         actions.append(int(action))
-    assert actions[: PATIENCE + 1] == [0] * (PATIENCE + 1) and 1 in actions
+    assert actions[: MAX_VISITS + 1] == [0] * (MAX_VISITS + 1) and 1 in actions
 
 
-def test_who_remembers_nothing_always_does_the_same(policy):
-    actions = {int(policy.predict(HERE, deterministic=True)[0]) for _ in range(4 * PATIENCE)}
+def test_predict_without_a_state_always_chooses_the_same_action(policy):
+    actions = {int(policy.predict(HERE, deterministic=True)[0]) for _ in range(4 * MAX_VISITS)}
     assert actions == {0}
 
 
-def test_a_new_episode_begins_without_doubts(policy):
+def test_predict_forgets_visits_when_an_episode_begins(policy):
     state = None
-    for step in range(4 * PATIENCE):
-        action, state = policy.predict(HERE, state, np.array([step % PATIENCE == 0]), deterministic=True)
+    for step in range(4 * MAX_VISITS):
+        action, state = policy.predict(HERE, state, np.array([step % MAX_VISITS == 0]), deterministic=True)
         assert action == 0
 
 
-def test_each_environment_has_a_memory_of_its_own(policy):
+def test_predict_counts_visits_of_each_environment_by_itself(policy):
     state, acted = None, []
-    for step in range(4 * PATIENCE):
-        elsewhere = [step / (4 * PATIENCE)]
+    for step in range(4 * MAX_VISITS):
+        elsewhere = [step / (4 * MAX_VISITS)]
         actions, state = policy.predict(np.array([HERE, elsewhere]), state, np.zeros(2, dtype=bool), deterministic=True)
         alone = policy.predict(np.array([elsewhere]), deterministic=True)[0]
         assert actions[1] == alone[0]
@@ -99,7 +98,7 @@ def test_each_environment_has_a_memory_of_its_own(policy):
     assert 1 in acted
 
 
-def test_a_state_of_something_else_is_refused(policy):
+def test_predict_refuses_a_state_that_it_did_not_return_for_as_many_observations(policy):
     _, of_one = policy.predict(HERE, deterministic=True)
     for wrong in (of_one, (np.zeros(2),), ()):
         with pytest.raises(ValueError, match="state must be None or what predict returned for 2 observation"):
@@ -107,5 +106,5 @@ def test_a_state_of_something_else_is_refused(policy):
     assert policy.predict(np.array([HERE, HERE]), deterministic=True)[0].tolist() == [0, 0]
 
 
-def test_sampling_remembers_nothing(policy):
+def test_predict_returns_no_state_if_it_is_not_deterministic(policy):
     assert policy.predict(HERE, deterministic=False)[1] is None

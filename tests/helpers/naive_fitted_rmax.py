@@ -1,7 +1,7 @@
 """Fitted R-Max again, written from its definition in plain loops: slow, obvious, and independent of the package.
 
-Nothing is incremental: every list, row and value is computed from all instances seen. The one piece of memory is which
-pairs were known before, because "a pair once known stays known" speaks of the past.
+Nothing is incremental: every list, row and value is computed from all instances seen. Only which pairs were known before is
+stored, because a pair that was known once stays known.
 """
 
 import itertools
@@ -58,13 +58,13 @@ class NaiveGrid:
 
     def corners(self, unit):
         """{point: weight} of multilinear interpolation; what lies outside the grid is clipped to its edge."""
-        ways = []
+        by_variable = []
         for u, cells, n in zip(unit, self.cells, self.shape, strict=True):
             at = min(max(u * cells + self.margin, 0.0), n - 1.0)
             low = min(math.floor(at), n - 2)
-            ways.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
+            by_variable.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
         corners = {}
-        for corner in itertools.product(*ways):
+        for corner in itertools.product(*by_variable):
             weight = math.prod(w for _, w in corner)
             if weight > 0.0:
                 corners[self.number[tuple(c for c, _ in corner)]] = weight
@@ -98,8 +98,11 @@ class NaiveFittedRMax:
             if sum(w for _, w in self.list_of(action, point)) >= self.threshold:
                 self.known[action, point] = True
 
+    def kept_at(self, state, action):
+        return kept_instances(state, self.instances[action], *self.kernel)
+
     def list_of(self, action, point):
-        return kept_instances(self.grid.unit(point), self.instances[action], *self.kernel)
+        return self.kept_at(self.grid.unit(point), action)
 
     def row(self, action, point):
         """(R, {successor: probability}) of a pair, self-loop included and undiscounted."""
@@ -112,28 +115,28 @@ class NaiveFittedRMax:
             reward += w / total * instance.reward
             if instance.terminated:
                 continue
-            for to, part in self.grid.corners(self.grid.unit(point) + instance.effect).items():
-                successors[to] = successors.get(to, 0.0) + w / total * part
+            for to, fraction in self.grid.corners(self.grid.unit(point) + instance.effect).items():
+                successors[to] = successors.get(to, 0.0) + w / total * fraction
         return reward, successors
 
     def matrices(self):
         """R (n_actions, n_points) and P (n_actions, n_points, n_points) of the known pairs, zero elsewhere."""
         rewards = np.zeros((self.n_actions, self.n_points))
-        chances = np.zeros((self.n_actions, self.n_points, self.n_points))
+        probabilities = np.zeros((self.n_actions, self.n_points, self.n_points))
         for action, point in zip(*np.nonzero(self.known), strict=True):
             rewards[action, point], successors = self.row(action, point)
             for to, p in successors.items():
-                chances[action, point, to] = p
-        return rewards, chances
+                probabilities[action, point, to] = p
+        return rewards, probabilities
 
-    def optimal_values(self, min_value, tolerance=1e-12, most_sweeps=200_000):
+    def optimal_values(self, min_value, tolerance=1e-12, max_sweeps=200_000):
         """Value iteration on the known pairs with their self-loops; a point with an unknown action has max_value."""
-        rewards, chances = self.matrices()
-        hopeful = ~self.known.all(axis=0)
+        rewards, probabilities = self.matrices()
+        optimistic = ~self.known.all(axis=0)
         values = np.full(self.n_points, float(self.max_value))
-        for _ in range(most_sweeps):
-            backed_up = np.clip((rewards + self.gamma * chances @ values).max(axis=0), min_value, self.max_value)
-            backed_up[hopeful] = self.max_value
+        for _ in range(max_sweeps):
+            backed_up = np.clip((rewards + self.gamma * probabilities @ values).max(axis=0), min_value, self.max_value)
+            backed_up[optimistic] = self.max_value
             change = np.abs(backed_up - values).max()
             values = backed_up
             if change <= tolerance:
@@ -144,7 +147,7 @@ class NaiveFittedRMax:
         """Q at an exact state from values at the grid points; staying put is worth the state's own Q."""
         q = []
         for action in range(self.n_actions):
-            kept = kept_instances(state, self.instances[action], *self.kernel)
+            kept = self.kept_at(state, action)
             total = sum(w for _, w in kept)
             if total < self.threshold:
                 q.append(self.max_value)

@@ -15,7 +15,7 @@ from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 
 LEAST_EVIDENCE = 0.1
-"""The package's guard: a mapping whose instances weigh less than this in sum says nothing."""
+"""The package's guard: a mapping whose instances weigh less than this in sum counts for nothing."""
 
 
 class Transition(NamedTuple):
@@ -163,22 +163,22 @@ def relevance(source, j, mapping, action, transitions, bandwidths, mu):
     return 1.0 if off == 0.0 else 0.0 if d == 0.0 else math.exp(-((off / d) ** 2))
 
 
-def transferred(state, own, drawn_from, task, breadth, merit=None):
+def transferred(state, own, drawn_from, task, breadth, relevance=None):
     """What is transferred to a pair: (weight, effect, reward, terminal flag) of each instance, best first; or nothing.
 
     :param drawn_from: (source, mapping, target action) of each translation that may be drawn from
-    :param merit: function of (place in ``drawn_from``, number of the instance); None: nearest first
+    :param relevance: function of (place in ``drawn_from``, number of the instance); None: nearest first
     """
     gathered = []
     for place, (source, mapping, action) in enumerate(drawn_from):
         for one in translated(source, mapping, action, state):
             weight = math.exp(-(distance(state, one.start) ** 2) / breadth**2)
             if weight >= task.min_weight:
-                rank = weight if merit is None else merit(place, one.number)
+                rank = weight if relevance is None else relevance(place, one.number)
                 gathered.append((rank, weight, one.end - one.start, one.reward, one.terminated))
     chosen, total = [], own
     for _, weight, *what in sorted(gathered, key=lambda entry: -entry[0]):
-        if total >= task.exploration_threshold or (merit is None and weight < task.min_fraction * total):
+        if total >= task.exploration_threshold or (relevance is None and weight < task.min_fraction * total):
             break
         chosen.append((weight, *what))
         total += weight

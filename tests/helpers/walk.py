@@ -78,9 +78,9 @@ def same_parameters(one, other):
 
 def stored(model):
     """(state, next state, reward, terminated) of all instances, raw units, by action."""
-    instances, rows = model.policy.model.instances, []
+    instances, rows = model.agent.model.instances, []
     for action in range(2):
-        n = instances.count[action]
+        n = instances.size[action]
         state, end = instances.state[action, :n], instances.state[action, :n] + instances.effect[action, :n]
         raw = model.policy.scaling.to_raw(state), model.policy.scaling.to_raw(end)
         rows.append(np.column_stack([*raw, instances.reward[action, :n], instances.terminated[action, :n]]))

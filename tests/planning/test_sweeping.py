@@ -1,49 +1,44 @@
-"""The planner against exact value iteration on the same finite model, self-loops and all."""
+"""The planner against exact value iteration on the same finite MDP, self-loops included."""
 
 import numpy as np
 import pytest
+from helpers.kernel_models import N_ACTIONS, make_model
 from helpers.naive_fitted_rmax import NaiveFittedRMax
 
-from sb3_combrel.models.kernel_average import KernelModel
-from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.planning.sweeping import Planner
 
 NO_LIMIT = 10**9
 KERNEL = dict(breadth=0.35, min_weight=0.01, min_fraction=0.13)
-N_ACTIONS = 2
 MIN_VALUE = -60.0
 
 
 class Problem:
-    """A planner and the definition, fed the same transitions."""
+    """A planner with its model, and the definition, given the same transitions."""
 
     def __init__(self, resolution=(2, 2), margin=1, gamma=1.0, max_value=0.0, tolerance=1e-11, max_instances=None):
-        self.model = KernelModel(
-            StateGrid(len(resolution), resolution, margin),
-            N_ACTIONS,
-            model_breadth=KERNEL["breadth"],
-            min_weight=KERNEL["min_weight"],
-            min_fraction=KERNEL["min_fraction"],
-            exploration_threshold=1.0,
-            gamma=gamma,
-            max_instances=max_instances,
-        )
+        self.model = make_model((resolution, margin), KERNEL, gamma, max_instances)
         self.naive = NaiveFittedRMax(resolution, margin, N_ACTIONS, gamma=gamma, max_value=max_value, **KERNEL)
-        self.planner = Planner(self.model, max_value=max_value, min_value=MIN_VALUE, tolerance=tolerance)
+        self.planner = Planner(self.model.mdp, max_value=max_value, min_value=MIN_VALUE, tolerance=tolerance)
+
+    def update(self, transition, max_backups=NO_LIMIT):
+        """One step of learning; the pairs that changed, and the backups done."""
+        pairs = self.model.add(*transition)
+        self.model.update_rows(pairs)
+        return pairs, self.planner.update(pairs, max_backups)
 
     def learn(self, transitions, max_backups=NO_LIMIT):
         for transition in transitions:
-            self.planner.update(self.model.add(*transition), max_backups)
+            self.update(transition, max_backups)
             self.naive.add(*transition)
 
-    def think(self, max_backups=NO_LIMIT):
+    def plan(self, max_backups=NO_LIMIT):
         return self.planner.update(np.empty(0, dtype=np.int64), max_backups)
 
     def exact(self):
         return self.naive.optimal_values(MIN_VALUE)
 
     @property
-    def hopeful(self):
+    def optimistic(self):
         return ~self.naive.known.all(axis=0)
 
 
@@ -67,102 +62,161 @@ def test_sweeping_to_convergence_gives_the_values_of_exact_value_iteration(resol
     problem = Problem(resolution, margin, gamma, max_value)
     noise = (lambda rng: -1.0) if gamma == 1.0 else (lambda rng: float(rng.normal()))
     problem.learn(walk(seed, 120, len(resolution), reward=noise))
-    assert problem.planner.n_waiting == 0
+    assert problem.planner.n_queued == 0
     np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
     assert np.unique(np.round(problem.planner.values, 6)).size > 5, "a problem without interest"
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_passes_over_the_grid_come_to_the_same_values_and_leave_nothing_waiting(seed):
+def test_passes_over_the_grid_reach_the_same_values_and_leave_nothing_queued(seed):
     problem = Problem((3, 2), 1, gamma=0.9, max_value=5.0)
     problem.learn(walk(seed, 120), max_backups=0)
     problem.planner.sweep_all(10_000)
-    assert problem.planner.n_waiting == 0
+    assert problem.planner.n_queued == 0
     np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
 
 
-def test_a_few_passes_leave_the_rest_of_the_work_waiting():
+def test_a_few_passes_leave_the_rest_of_the_work_queued():
     problem = Problem((3, 2), 1, gamma=0.99, max_value=5.0)
     problem.learn(walk(1, 120), max_backups=0)
     problem.planner.sweep_all(2)
-    assert problem.planner.n_waiting > 0
-    problem.think()
+    assert problem.planner.n_queued > 0
+    problem.plan()
     np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
 
 
-def test_values_follow_while_pairs_become_known_one_by_one():
+def test_values_stay_exact_while_pairs_become_known_one_by_one():
     problem = Problem((3,), 1, gamma=0.95)
-    ever_hopeful = problem.hopeful.copy()
+    at_first = problem.optimistic.copy()
     for transition in walk(5, 60, 1):
         problem.learn([transition])
         np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
-        assert (problem.planner.values[problem.hopeful] == 0.0).all(), "optimistic points have max_value exactly"
-    assert ever_hopeful.all() and not problem.hopeful.all()
+        assert (problem.planner.values[problem.optimistic] == 0.0).all(), "optimistic points have max_value exactly"
+    assert at_first.all() and not problem.optimistic.all()
 
 
-def test_a_pair_that_is_forgotten_is_worth_max_value_again():
+def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again():
     """With room for two instances an action, old pairs lose all instances and become optimistic again."""
     problem = Problem((3,), 0, gamma=0.9, max_value=2.0, max_instances=2)
-    forgotten = 0
-    known = problem.model.arrays.known.copy()
+    lost = 0
+    known = problem.model.known.copy()
     for transition in walk(2, 80, 1):
-        problem.planner.update(problem.model.add(*transition), NO_LIMIT)
-        forgotten += int((known & ~problem.model.arrays.known).sum())
-        known = problem.model.arrays.known.copy()
+        problem.update(transition)
+        lost += int((known & ~problem.model.known).sum())
+        known = problem.model.known.copy()
         np.testing.assert_allclose(problem.planner.values, values_of_rows(problem), atol=1e-8)
-    assert forgotten > 0
+    assert lost > 0
 
 
-def values_of_rows(problem):
-    """Value iteration on the model's own rows."""
-    model, n = problem.model, problem.model.grid.n_points
-    values = np.full(n, problem.planner.bounds[1])
+def values_of_rows(problem, optimistic=True):
+    """Value iteration on the rows of the finite MDP.
+
+    :param optimistic: False: without optimistic pairs; a point that has no other takes the least value of its neighbours
+    """
+    arrays, n = problem.model.mdp.arrays, problem.model.grid.n_points
+    low, high = problem.planner.bounds
+    values = problem.planner.values.copy() if not optimistic else np.full(n, high)
     for _ in range(2000):
         backed_up = values.copy()
         for point in range(n):
-            q = [problem.planner.bounds[0]]
+            q = [low]
             for pair in (point, n + point):
-                if not model.arrays.known[pair]:
+                if arrays.modelled[pair]:
+                    to, weight = arrays.rows.entries(pair)
+                    q.append(arrays.reward[pair] + weight @ values[to])
+                elif optimistic:
                     q.append(np.inf)
-                    continue
-                to, weight = model.arrays.rows.entries(pair)
-                q.append(model.arrays.reward[pair] + weight @ values[to])
-            backed_up[point] = min(max(q), problem.planner.bounds[1])
+            backed_up[point] = min(max(q), high)
+            if not optimistic and len(q) == 1:
+                backed_up[point] = min(values[neighbour] for neighbour in neighbours_of(point, problem.model.grid))
         if np.abs(backed_up - values).max() < 1e-12:
             return backed_up
         values = backed_up
     raise AssertionError("value iteration did not converge")
 
 
-def test_bounded_work_leaves_the_rest_waiting_and_later_calls_finish_it():
+def neighbours_of(point, grid):
+    """Points one step along one axis away."""
+    points = np.arange(grid.n_points).reshape(grid.arrays.shape)
+    at = np.unravel_index(point, points.shape)
+    for axis, n in enumerate(points.shape):
+        for step in (-1, 1):
+            if 0 <= at[axis] + step < n:
+                yield points[tuple(c + step * (k == axis) for k, c in enumerate(at))]
+
+
+@pytest.mark.parametrize(("resolution", "seed", "n"), [((4,), 0, 4), ((4,), 5, 4), ((3, 3), 1, 14)])
+def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, seed, n):
+    problem = Problem(resolution, 0, gamma=0.9, max_value=2.0, tolerance=1e-12)
+    for transition in walk(seed, n, len(resolution)):
+        problem.update(transition)
+    modelled = problem.model.mdp.arrays.n_optimistic < N_ACTIONS
+    assert 0 < modelled.sum() < len(modelled), "points with a model and points without"
+    before = problem.planner.values.copy()
+    values = problem.planner.exploitation_values()
+    np.testing.assert_allclose(values, values_of_rows(problem, optimistic=False), atol=1e-5)
+    assert (values <= before + 1e-9).all() and (values < before).any()
+    np.testing.assert_array_equal(problem.planner.values, before)
+    for transition in walk(seed + 1, 5, len(resolution)):
+        problem.update(transition)
+    np.testing.assert_allclose(problem.planner.exploitation_values(), values_of_rows(problem, optimistic=False), atol=1e-5)
+
+
+def test_bounded_work_leaves_the_rest_queued_and_later_calls_finish_it():
     bounded, unbounded = Problem((3, 2), 0, gamma=0.95), Problem((3, 2), 0, gamma=0.95)
     transitions = list(walk(1, 90))
     for transition in transitions:
-        pairs = bounded.model.add(*transition)
-        backups = bounded.planner.update(pairs, 3)
+        pairs, backups = bounded.update(transition, 3)
         assert backups <= len(pairs) + 3
     unbounded.learn(transitions)
-    assert bounded.planner.n_waiting > 0
+    assert bounded.planner.n_queued > 0
     assert np.abs(bounded.planner.values - unbounded.planner.values).max() > 1e-3, "there is work left"
     calls = 0
-    while bounded.planner.n_waiting:
-        assert 0 < bounded.think(50) <= 50
+    while bounded.planner.n_queued:
+        assert 0 < bounded.plan(50) <= 50
         calls += 1
         assert calls < 10_000
     assert calls > 1
     np.testing.assert_allclose(bounded.planner.values, unbounded.planner.values, atol=1e-8)
     np.testing.assert_allclose(bounded.planner.values, unbounded.exact(), atol=1e-7)
-    assert bounded.think(50) == 0, "nothing to do, nothing done"
+    assert bounded.plan(50) == 0, "nothing is left to do"
+
+
+def test_the_points_around_the_agent_are_backed_up_at_once():
+    """With no backups left for the queue, the points around a state still take up what was propagated to them."""
+    problem = Problem((3, 2), 0, gamma=0.95)
+    problem.learn(walk(1, 90), max_backups=0)
+    changed = problem.planner.values.copy()
+    backups = problem.planner.update(np.empty(0, dtype=np.int64), 0, around=np.array([0.55, 0.4]))
+    corners = list(problem.naive.grid.corners(np.array([0.55, 0.4])))
+    assert 0 < backups <= len(corners)
+    changed = np.flatnonzero(changed != problem.planner.values)
+    assert len(changed) > 0 and set(changed) <= set(corners)
+
+
+def test_restored_values_converge_to_the_same_as_before():
+    problem = Problem((3, 2), 1, gamma=0.95, max_value=5.0)
+    problem.learn(walk(3, 100))
+    expected = problem.planner.values.copy()
+    problem.planner.restore(expected + np.random.default_rng(0).normal(size=len(expected)))
+    assert problem.planner.values.max() <= 5.0, "values are cut to their bounds"
+    assert problem.planner.n_queued == (problem.model.mdp.arrays.n_optimistic == 0).sum() > 0
+    problem.plan()
+    backed_up = problem.model.mdp.arrays.n_optimistic == 0
+    problem.planner.values[~backed_up] = expected[~backed_up]
+    problem.planner.restart()
+    problem.plan()
+    np.testing.assert_allclose(problem.planner.values, expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("tolerance", [0.3, 0.03])
-def test_a_change_up_to_the_tolerance_is_not_passed_on_and_costs_no_more_than_that(tolerance):
+def test_a_change_up_to_the_tolerance_is_not_propagated_and_costs_no_more_than_that(tolerance):
     gamma = 0.9
     problem = Problem((3, 2), 0, gamma, tolerance=tolerance)
     problem.learn(walk(4, 90))
     exact = problem.exact()
     error = np.abs(problem.planner.values - exact).max()
-    # A successor may have moved by the tolerance since it was last announced, and was as far from that when last used.
+    # A successor may have moved by the tolerance since it was last propagated, and was as far from that when last used.
     assert error <= 2 * tolerance * gamma / (1 - gamma)
     assert error > 1e-6, "with such a tolerance the values cannot be exact"
     precise = Problem((3, 2), 0, gamma, tolerance=1e-11)
@@ -173,11 +227,11 @@ def test_a_change_up_to_the_tolerance_is_not_passed_on_and_costs_no_more_than_th
 def test_values_never_leave_their_bounds():
     problem = Problem((2, 2), 0, gamma=1.0)
     for state, action, _, _, _ in walk(0, 80):
-        problem.planner.update(problem.model.add(state, action, -1.0, state, False), NO_LIMIT)  # leads nowhere
-    settled = problem.model.arrays.n_optimistic == 0
-    assert settled.any()
-    np.testing.assert_array_equal(problem.planner.values[settled], MIN_VALUE)
+        problem.update((state, action, -1.0, state, False))  # leads nowhere
+    modelled = problem.model.mdp.arrays.n_optimistic == 0
+    assert modelled.any()
+    np.testing.assert_array_equal(problem.planner.values[modelled], MIN_VALUE)
     problem = Problem((2, 2), 0, gamma=1.0)
     for state, action, _, _, _ in walk(0, 80):
-        problem.planner.update(problem.model.add(state, action, 1.0, state, False), NO_LIMIT)
+        problem.update((state, action, 1.0, state, False))
     np.testing.assert_array_equal(problem.planner.values, 0.0)

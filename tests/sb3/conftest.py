@@ -6,7 +6,7 @@ from helpers.walk import METHODS, small
 
 @pytest.fixture(params=METHODS)
 def method(request):
-    """The name of a way to learn."""
+    """The name of a method."""
     return request.param
 
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_combrel import FittedRMax
 
 
-def test_callbacks_are_shown_every_step_and_told_of_start_and_end(make):
+def test_callbacks_are_called_at_every_step_and_at_start_and_end(make):
     recorder = Recorder()
     model = make().learn(25, callback=recorder)
     assert (recorder.started, recorder.ended, recorder.n_calls) == (1, 1, 25)
@@ -40,17 +40,17 @@ def test_an_interrupt_ends_the_training_and_leaves_a_model_that_saves_and_goes_o
     with pytest.raises(KeyboardInterrupt):
         model.learn(100, callback=recorder)
     assert recorder.ended == 1
-    assert model.policy.model.n_instances == 12
+    assert model.agent.model.n_instances == 12
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert same_parameters(model, loaded)
     for resumed in (model, loaded):
         resumed.learn(20, reset_num_timesteps=False)
         assert resumed.num_timesteps == 32
-        assert resumed.policy.model.n_instances == 32
+        assert resumed.agent.model.n_instances == 32
 
 
-def test_progress_bar_and_functions_as_callbacks(make):
+def test_learn_takes_a_progress_bar_and_a_function_as_callback(make):
     calls = []
     make().learn(10, callback=lambda local, _: calls.append(local["self"]) or True, progress_bar=True)
     assert len(calls) == 10
@@ -61,8 +61,8 @@ def test_evaluation_and_checkpoints_in_mid_episode_hold_all_that_was_learned_so_
     evaluation = EvalCallback(Monitor(Walk()), eval_freq=20, n_eval_episodes=2, best_model_save_path=str(tmp_path), verbose=0)
     model.learn(45, callback=[CheckpointCallback(7, str(tmp_path), "at"), evaluation])
     for steps in (7, 14, 42):
-        assert FittedRMax.load(tmp_path / f"at_{steps}_steps").policy.model.n_instances == steps
-    assert FittedRMax.load(tmp_path / "best_model").policy.model.n_instances in (20, 40)
+        assert FittedRMax.load(tmp_path / f"at_{steps}_steps").agent.model.n_instances == steps
+    assert FittedRMax.load(tmp_path / "best_model").agent.model.n_instances in (20, 40)
 
 
 def test_a_reward_that_is_reached_stops_the_learning(make):
@@ -74,7 +74,7 @@ def test_a_reward_that_is_reached_stops_the_learning(make):
     assert model.num_timesteps % 50 == 0
 
 
-def test_events_every_n_steps(make):
+def test_every_n_timesteps_calls_its_callback_every_n_steps(make):
     inner = Recorder()
     inner._on_step = lambda: True
     make().learn(50, callback=EveryNTimesteps(n_steps=10, callback=inner))

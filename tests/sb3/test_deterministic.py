@@ -10,13 +10,13 @@ def test_the_same_seed_gives_the_same_run_to_the_last_bit(make):
     assert not same_parameters(one, third)
 
 
-def test_setting_the_seed_later_is_as_good(make):
+def test_a_seed_set_later_gives_the_same_run(make):
     one, other = make(seed=3), make(seed=4)
     other.set_random_seed(3)
     assert same_parameters(one.learn(100), other.learn(100))
 
 
-def test_without_a_seed_numpys_decides(make):
+def test_without_a_seed_numpys_own_generator_determines_the_run(make):
     runs = []
     for seed in (1, 1, 2, 3, 4, 5):
         np.random.seed(seed)

@@ -26,6 +26,7 @@ def checkpoints(folder):
     return sorted(folder.glob("at_*_steps.zip"), key=lambda path: int(re.findall(r"\d+", path.name)[-1]))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["none", "COMBREL"])
 def test_after_kill_9_learning_goes_on_from_the_last_checkpoint(name, tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
@@ -45,9 +46,9 @@ def test_after_kill_9_learning_goes_on_from_the_last_checkpoint(name, tmp_path):
     files = checkpoints(tmp_path)
     assert looks > 0 and len(files) >= 5
     for path in files:
-        assert FittedRMax.load(path).policy.model.n_instances == int(re.findall(r"\d+", path.name)[-1])
+        assert FittedRMax.load(path).agent.model.n_instances == int(re.findall(r"\d+", path.name)[-1])
     n = 40 * len(files)
     model = FittedRMax.load(files[-1], env=Walk())
     model.learn(100, reset_num_timesteps=False)
-    assert model.num_timesteps == model.policy.model.n_instances == n + 100
+    assert model.num_timesteps == model.agent.model.n_instances == n + 100
     assert (model.policy.transfer is None) == (name == "none")

@@ -18,7 +18,7 @@ def test_logs_have_the_groups_that_sb3_has(make, tmp_path):
     assert len((tmp_path / "progress.csv").read_text().splitlines()) == len(header) + 1
 
 
-def test_what_is_logged_is_what_happened(make, tmp_path):
+def test_logged_figures_are_those_of_the_run(make, tmp_path):
     model = make()
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(150, log_interval=1)
@@ -32,7 +32,7 @@ def test_what_is_logged_is_what_happened(make, tmp_path):
         assert abs(sum(shares) - 1.0) < 1e-5
 
 
-def test_only_with_transfer_there_are_figures_of_it(make, method, tmp_path):
+def test_logs_have_figures_of_transfer_only_with_a_transfer_method(make, method, tmp_path):
     model = make()
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(60, log_interval=1)
@@ -54,6 +54,6 @@ def test_tensorboard_logs_are_named_after_the_algorithm(make, tmp_path):
     assert (tmp_path / "again_1").is_dir()
 
 
-def test_logging_to_the_screen(make, capsys):
+def test_verbose_learning_logs_to_the_screen(make, capsys):
     make(verbose=1).learn(60, log_interval=1)
     assert "ep_rew_mean" in capsys.readouterr().out

@@ -8,7 +8,7 @@ from helpers.walk import OBSERVATIONS, same_parameters
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
 
-def test_parameters_go_back_and_forth(make):
+def test_get_and_set_parameters_round_trip(make):
     """Random values of any kind must load without an error."""
     model, other = make().learn(60), make(seed=1).learn(30)
     parameters = model.get_parameters()
@@ -27,7 +27,7 @@ def test_parameters_go_back_and_forth(make):
         model.set_parameters({"policy": parameters["policy"], "stranger": {}}, exact_match=True)
 
 
-def test_handing_out_parameters_hands_out_copies(make):
+def test_get_parameters_returns_copies(make):
     model = make().learn(30)
     for array in model.get_parameters()["policy"].values():
         array.fill_(-77.0)
@@ -35,7 +35,7 @@ def test_handing_out_parameters_hands_out_copies(make):
         assert not (array == -77.0).any()
 
 
-def test_parameters_carry_what_was_learned(make):
+def test_parameters_contain_what_was_learned(make):
     model, fresh = make().learn(300), make(seed=7)
     before, _ = fresh.predict(OBSERVATIONS, deterministic=True)
     fresh.set_parameters(model.get_parameters())

@@ -65,22 +65,23 @@ def test_the_walk_of_these_tests_is_a_proper_environment():
 
 def test_learning_counts_steps_and_episodes(make):
     model = make().learn(70)
-    assert model.num_timesteps == model.policy.model.n_instances == 70
+    assert model.num_timesteps == model.agent.model.n_instances == 70
     assert model._episode_num >= 2
     model.learn(30, reset_num_timesteps=False)
-    assert model.num_timesteps == model.policy.model.n_instances == 100
+    assert model.num_timesteps == model.agent.model.n_instances == 100
     model.learn(30)
-    assert model.num_timesteps == 30, "the count starts anew"
-    assert model.policy.model.n_instances == 130, "what was learned stays"
+    assert model.num_timesteps == 30, "steps are counted from 0 again"
+    assert model.agent.model.n_instances == 130, "what was learned is kept"
     assert model.learn(1e1).num_timesteps == 10, "as it is often written"
 
 
-def test_what_was_learned_is_the_way_to_the_goal(make):
+def test_the_learned_policy_walks_to_the_goal(make):
     model = make().learn(400)
     np.testing.assert_array_equal(model.predict(OBSERVATIONS[3:18], deterministic=True)[0], 1)
 
 
-def test_dqn_users_find_their_way():
+@pytest.mark.integration
+def test_a_script_for_dqn_works_with_another_name_of_the_algorithm():
     """The calls of a script for DQN work unchanged, but for the name."""
     for algorithm in (DQN, FittedRMax):
         kwargs = dict(buffer_size=100) if algorithm is DQN else {}
@@ -91,6 +92,7 @@ def test_dqn_users_find_their_way():
         model.get_env().step(action)
 
 
+@pytest.mark.integration
 def test_importing_is_light_and_compiles_nothing():
     code = (
         "import sys, sb3_combrel\n"

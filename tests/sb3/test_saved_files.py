@@ -251,9 +251,9 @@ def test_a_file_of_fifty_thousand_instances_is_no_larger_than_their_states_and_e
     parameters = model.get_parameters()["policy"]
     model.set_parameters({"policy": {**parameters, "instances": th.as_tensor(long_walks(d, n_actions, 50_000))}})
     model.save(tmp_path / "model")
-    assert FittedRMax.load(tmp_path / "model").policy.model.n_instances == 50_000
+    assert FittedRMax.load(tmp_path / "model").agent.model.n_instances == 50_000
     # State and effect have all their digits; reward, action and the rest cost nothing to speak of.
-    model_size = 8 * (2 * d * 50_000 + 2 * model.policy.model.grid.n_points * (1 + n_actions))
+    model_size = 8 * (2 * d * 50_000 + 2 * model.agent.grid.n_points * (1 + n_actions))
     assert (tmp_path / "model.zip").stat().st_size < model_size
 
 
@@ -266,18 +266,18 @@ def test_a_file_of_fifty_thousand_instances_is_no_larger_than_their_states_and_e
         ("combrel/MountainCar4D-v0", dict(model_breadth=0.4, resolution=3, min_fraction=0.1)),
     ],
 )
-def test_fifty_thousand_steps_of_mountain_car_make_a_small_file_that_holds_all(env, settings, tmp_path):
+def test_fifty_thousand_steps_of_mountain_car_make_a_small_file_with_all_of_them(env, settings, tmp_path):
     model = FittedRMax(env, seed=0, **settings).learn(50_000)
     model.save(tmp_path / "model")
-    assert (tmp_path / "model.zip").stat().st_size < 70 * model.policy.model.n_instances
+    assert (tmp_path / "model.zip").stat().st_size < 70 * model.agent.model.n_instances
     assert same_parameters(FittedRMax.load(tmp_path / "model"), model)
 
 
-def test_the_policys_own_file_holds_no_transfer_object(tmp_path):
+def test_the_policys_own_file_contains_no_class_of_the_package(tmp_path):
     model = small(Walk(), transfer=METHODS["COMBREL"]()).learn(20)
     model.policy.save(tmp_path / "policy.pth")
     with zipfile.ZipFile(tmp_path / "policy.pth") as archive:
         pickled = b"".join(archive.read(name) for name in archive.namelist() if name.endswith("data.pkl"))
     assert b"sb3_combrel.transfer.combrel.COMBREL" in pickled, "its name, as text"
     assert b"csb3_combrel" not in pickled, "no class to be imported"
-    assert len(FittedRMaxPolicy.load(tmp_path / "policy.pth").transfer._sources[0]) == 60
+    assert len(FittedRMaxPolicy.load(tmp_path / "policy.pth").transfer.sources[0]) == 60

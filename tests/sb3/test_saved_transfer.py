@@ -1,4 +1,4 @@
-"""A model with transfer, saved and loaded, goes on with the same mappings, compliance, source and chance."""
+"""A model with transfer, saved and loaded, goes on with the same mappings, compliance, source and random numbers."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from helpers.walk import METHODS, STRIDE, Walk, same_parameters, small, stored, 
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
-from sb3_combrel.common.transferred import Supply
+from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import Transfer
 
 MAPPING = InterTaskMapping([0, 1], [0, 1])
@@ -38,12 +38,12 @@ def test_learning_goes_on_to_the_last_bit(variant, tmp_path):
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     model.set_env(Walk())
-    # Loading has seeded the environment anew.
+    # Loading has seeded the environment again.
     model.get_env().seed(model.seed)
     for goes_on in (model, loaded):
         goes_on.learn(150, reset_num_timesteps=False)
     assert same_parameters(model, loaded)
-    assert model.policy.model.n_instances > 150
+    assert model.agent.model.n_instances > 150
     if model.policy.transfer is not None:
         assert model.policy.transfer.mapping_counts() == loaded.policy.transfer.mapping_counts()
 
@@ -59,62 +59,64 @@ def test_two_halves_make_the_run_that_was_not_interrupted(name, tmp_path):
     halves.learn(10**6, callback=StopTrainingOnMaxEpisodes(5), reset_num_timesteps=False)
     assert halves.num_timesteps == whole.num_timesteps
     np.testing.assert_array_equal(stored(halves), stored(whole))
-    np.testing.assert_allclose(halves.policy.planner.values, whole.policy.planner.values, atol=1e-8)
+    np.testing.assert_allclose(halves.agent.planner.values, whole.agent.planner.values, atol=1e-8)
     if name != "none":
         np.testing.assert_array_equal(halves.policy.transfer.choices(), whole.policy.transfer.choices())
 
 
 @pytest.mark.parametrize("name", ["TIMBREL", "COMBREL", "two sources", "first episode", "drawn"])
 @pytest.mark.parametrize("steps", [0, 13, 47])
-def test_choices_compliance_and_supply_are_the_same_at_once(name, steps, tmp_path):
+def test_choices_compliance_and_transferred_instances_are_the_same_at_once(name, steps, tmp_path):
     model = small(transfer=VARIANTS[name]())
     if steps:
         model.learn(steps)
     model.save(tmp_path / "model")
     ours, theirs = model.policy.transfer, FittedRMax.load(tmp_path / "model").policy.transfer
-    pairs = np.arange(2 * model.policy.model.grid.n_points)
+    pairs = np.arange(2 * model.agent.grid.n_points)
     np.testing.assert_array_equal(ours.choices(), theirs.choices())
     if isinstance(ours, COMBREL):
         np.testing.assert_array_equal(ours.chosen_compliance(pairs), theirs.chosen_compliance(pairs))
         assert (ours.choices() >= 0).any() == (steps == 47 or (steps > 0 and ours.measured == "online"))
     own = np.zeros(len(pairs))
     for method in (ours, theirs):
-        method.renewed(own > 0)
-    supplies = [method.supply(pairs, own, own > 0) for method in (ours, theirs)]
-    supplies += [method.supply_at(np.array([0.3, 0.5]), np.zeros(2)) for method in (ours, theirs)]
-    for n_rows, (one, other) in ((len(pairs), supplies[:2]), (2, supplies[2:])):
-        np.testing.assert_array_equal(one.count[:n_rows], other.count[:n_rows])
-        for row, n in enumerate(one.count[:n_rows]):
+        method.changed(own.reshape(2, -1) > 0)
+    actions, points = np.divmod(pairs, model.agent.grid.n_points)
+    at_sample = [method.transferred_to_sample(points, actions, own) for method in (ours, theirs)]
+    state = np.array([[0.3, 0.5], [0.3, 0.5]])
+    at_state = [method.transferred(state, np.arange(2), np.zeros(2)) for method in (ours, theirs)]
+    for n_rows, (one, other) in ((len(pairs), at_sample), (2, at_state)):
+        np.testing.assert_array_equal(one.length[:n_rows], other.length[:n_rows])
+        for row, n in enumerate(one.length[:n_rows]):
             for name_of in ("weight", "effect", "reward", "terminated"):
                 np.testing.assert_array_equal(getattr(one, name_of)[row, :n], getattr(other, name_of)[row, :n])
     assert ours.statistics() == theirs.statistics()
-    for one, other in zip(ours._sources, theirs._sources, strict=True):
+    for one, other in zip(ours.sources, theirs.sources, strict=True):
         np.testing.assert_array_equal(one.states, other.states)
         np.testing.assert_array_equal(one.rewards, other.rewards)
         assert (one.state_names, one.action_names, one.origin) == (other.state_names, other.action_names, other.origin)
 
 
-def test_the_source_travels_in_the_file(tmp_path):
+def test_the_file_of_a_model_contains_the_source(tmp_path):
     path = walk_source().save(tmp_path / "source.npz")
     model = small(transfer={"sb3_combrel.COMBREL": {"source": str(path), "n_neighbors": 2}}).learn(40)
     model.save(tmp_path / "model")
     path.unlink()
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert (type(loaded.policy.transfer), loaded.policy.transfer.n_neighbors) == (COMBREL, 2)
-    assert len(loaded.policy.transfer._sources[0]) == 60
+    assert len(loaded.policy.transfer.sources[0]) == 60
     loaded.learn(20)
     loaded.save(tmp_path / "again")
-    assert FittedRMax.load(tmp_path / "again").policy.model.n_instances == 60
+    assert FittedRMax.load(tmp_path / "again").agent.model.n_instances == 60
 
 
-def test_random_mappings_are_saved_too_and_drawn_anew(tmp_path):
-    """What differs after loading: pairs are settled anew, so TIMBREL("random") draws other mappings for them."""
+def test_random_mappings_are_saved_and_others_are_drawn_after_loading(tmp_path):
+    """What differs after loading: all pairs are modelled once more, so TIMBREL("random") draws other mappings for them."""
     model = small(transfer=TIMBREL(walk_source(), "random")).learn(60)
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert loaded.policy.transfer.mapping == "random"
     np.testing.assert_array_equal(stored(loaded), stored(model))
-    assert loaded.learn(30).policy.model.n_instances == 90
+    assert loaded.learn(30).agent.model.n_instances == 90
 
 
 class Pushy(Transfer):
@@ -123,9 +125,9 @@ class Pushy(Transfer):
     def __init__(self, push, schedule=None):
         self.push, self.schedule = push, schedule
 
-    def bind(self, target, rng):
-        self.target, self.n_observed = target, 0
-        self.news = np.arange(target.n_actions * len(target.sample_states))
+    def bind(self, task, rng):
+        super().bind(task, rng)
+        self.n_observed = 0
 
     def observe(self, state, action, reward, next_state, terminated):
         self.n_observed += 1
@@ -133,29 +135,22 @@ class Pushy(Transfer):
     def lowest_reward(self):
         return -1.0
 
-    def renewed(self, known):
-        news, self.news = self.news, self.news[:0]
-        return news[~known[news]]
+    def changed(self, known):
+        return self.n_observed == 0
 
-    def _push_all(self, needed):
-        n = len(needed)
-        effect = np.zeros((n, 1, self.target.n_variables))
+    def transferred(self, states, actions, own_weight):
+        n = len(states)
+        effect = np.zeros((n, 1, self.task.n_variables))
         effect[:, :, 0] = self.push
-        return Supply(
-            needed.astype(np.int64), np.ones((n, 1)), effect, np.full((n, 1), -1.0), np.zeros((n, 1), dtype=np.bool_)
+        return TransferredInstances(
+            np.ones(n, dtype=np.int64), np.ones((n, 1)), effect, np.full((n, 1), -1.0), np.zeros((n, 1), dtype=np.bool_)
         )
 
-    def supply(self, pairs, own_weight, known):
-        return self._push_all(~known)
-
-    def supply_at(self, state, own_weight):
-        return self._push_all(own_weight < 1.0)
-
-    def saved_arrays(self):
+    def get_state(self):
         return {"n_observed": np.array([float(self.n_observed)])}
 
-    def restore(self, saved):
-        self.n_observed = int(saved["n_observed"][0])
+    def set_state(self, state):
+        self.n_observed = int(state["n_observed"][0])
 
 
 def test_a_method_of_the_users_own_is_saved_by_its_arguments(tmp_path, recwarn):
@@ -173,22 +168,22 @@ def test_a_method_of_the_users_own_is_saved_by_its_arguments(tmp_path, recwarn):
     "broken, message",
     [
         (
-            lambda s: s.replace(count=s.count[:1], weight=s.weight[:1], effect=s.effect[:1], reward=s.reward[:1]),
-            "terminated of",
+            lambda t: t._replace(length=t.length[:1], weight=t.weight[:1], effect=t.effect[:1], reward=t.reward[:1]),
+            "returned terminated of shape",
         ),
-        (lambda s: Supply.empty(1, 2, 1), "Pushy supplied 1 rows, but was asked for"),
-        (lambda s: s.replace(effect=s.effect[:, :, :1].copy()), r"state variables that must be \(\d+, 1, 2\)"),
-        (lambda s: s.replace(count=2 * s.count), "counts from 2 to 2, with room for 1 instances"),
+        (lambda t: TransferredInstances.empty(1, 2, 1), "Pushy returned 1 rows, but was asked for"),
+        (lambda t: t._replace(effect=t.effect[:, :, :1].copy()), r"state variables it must be \(\d+, 1, 2\)"),
+        (lambda t: t._replace(length=2 * t.length), "returned length=2 .* from 0 to 1, the room in weight"),
     ],
 )
-def test_a_method_that_supplies_too_little_is_told_so(broken, message, monkeypatch):
-    whole = Pushy._push_all
-    monkeypatch.setattr(Pushy, "_push_all", lambda self, needed: broken(whole(self, needed)))
+def test_a_method_that_returns_too_little_is_an_error(broken, message, monkeypatch):
+    whole = Pushy.transferred
+    monkeypatch.setattr(Pushy, "transferred", lambda self, *asked: broken(whole(self, *asked)))
     with pytest.raises(ValueError, match=message):
         small(transfer=Pushy(STRIDE / 2)).learn(30)
 
 
-def test_what_is_not_plain_data_is_not_saved_but_asked_for(tmp_path):
+def test_a_transfer_method_that_is_not_plain_data_must_be_passed_to_load(tmp_path):
     own = Pushy(STRIDE / 2, schedule=lambda n: n)
     model = small(transfer=own).learn(30)
     with pytest.warns(UserWarning, match=r"Pushy is not saved .*load\(\.\.\., transfer=Pushy\(\.\.\.\)\)"):
@@ -200,7 +195,7 @@ def test_what_is_not_plain_data_is_not_saved_but_asked_for(tmp_path):
     assert same_parameters(loaded, model)
 
 
-def test_a_subclass_that_says_too_little_is_not_taken_for_its_parent(tmp_path):
+def test_a_subclass_without_its_arguments_is_not_loaded_as_its_parent(tmp_path):
     class Mine(COMBREL):
         def __init__(self, source, secret):
             super().__init__(source)

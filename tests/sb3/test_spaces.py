@@ -37,7 +37,7 @@ SPACES = {
 @pytest.mark.parametrize("actions", [spaces.Discrete(1), spaces.Discrete(3), spaces.Discrete(4, start=-2)], ids=str)
 def test_learning_predicting_and_saving_with_every_space(space, actions, tmp_path):
     model = FittedRMax(Anywhere(space, actions), resolution=2, model_breadth=0.3, seed=0).learn(40)
-    assert model.policy.model.n_instances == 40
+    assert model.agent.model.n_instances == 40
     states = np.stack([space.sample() for _ in range(10)])
     chosen, _ = model.predict(states, deterministic=True)
     assert all(actions.contains(np.int64(action)) for action in chosen)
@@ -48,7 +48,7 @@ def test_learning_predicting_and_saving_with_every_space(space, actions, tmp_pat
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64])
-def test_whole_numbers_are_no_states(dtype):
+def test_observations_that_are_whole_numbers_are_refused(dtype):
     with pytest.raises(ValueError, match=f"floating-point numbers, got dtype {dtype.__name__}"):
         FittedRMax(Anywhere(spaces.Box(0, 9, (2,), dtype=dtype), spaces.Discrete(2)))
 
@@ -58,11 +58,11 @@ def test_actions_may_start_anywhere(make):
     for observation in OBSERVATIONS:
         action, _ = model.predict(observation, deterministic=True)
         assert model.action_space.contains(int(action))
-    assert model.policy.model.instances.count.sum() == 60
+    assert model.agent.model.instances.size.sum() == 60
 
 
 @pytest.mark.parametrize(
-    ("bounds", "says"),
+    ("bounds", "expected"),
     [
         (([-1.0], [1.0]), "2"),
         (([-1.0, 0.0, 0.0], [1.0, 2.0, 1.0]), "2"),
@@ -71,8 +71,8 @@ def test_actions_may_start_anywhere(make):
         (([-1.0, 0.0], [1.0, 2.0], [3.0, 4.0]), "low, high"),
     ],
 )
-def test_bounds_of_the_wrong_length_are_refused_with_the_right_one(bounds, says):
+def test_bounds_of_the_wrong_length_are_refused_with_the_right_one(bounds, expected):
     with pytest.raises(ValueError, match="bounds") as error:
         small(bounds=bounds)
-    assert says in str(error.value)
+    assert expected in str(error.value)
     assert "\n" not in str(error.value)

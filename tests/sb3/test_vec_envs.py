@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 from sb3_combrel import FittedRMax
 
 
-@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.integration)])
 def test_several_environments_feed_one_model(make, vec_env):
     env = make_vec_env(Walk, n_envs=3, seed=0, vec_env_cls=vec_env)
     recorder = Recorder()
@@ -19,10 +19,11 @@ def test_several_environments_feed_one_model(make, vec_env):
     finally:
         env.close()
     assert model.num_timesteps == 63
-    assert model.policy.model.n_instances == 63
+    assert model.agent.model.n_instances == 63
     assert recorder.shown[0]["new_obs"].shape == (3, 2)
 
 
+@pytest.mark.integration
 def test_environments_in_other_processes_make_the_same_run():
     runs = []
     for vec_env in (DummyVecEnv, SubprocVecEnv):
@@ -52,7 +53,7 @@ def test_monitor_files_see_every_episode(make, tmp_path):
     assert len(model.ep_info_buffer) == model._episode_num
 
 
-def test_what_monitor_says_is_what_the_model_stored(make, tmp_path):
+def test_monitors_episodes_are_those_of_the_model(make, tmp_path):
     model = make(Monitor(Walk(), str(tmp_path / "monitor"))).learn(100)
     lengths = [int(line.split(",")[1]) for line in (tmp_path / "monitor.monitor.csv").read_text().splitlines()[2:]]
     assert sum(lengths) <= 100 < sum(lengths) + 30
@@ -88,7 +89,7 @@ def test_of_normalized_rewards_the_original_ones_are_stored(make, tmp_path):
     assert (stored(model.learn(50))[:, 4] == -1.0).all()
 
 
-def test_the_normalizing_environment_can_be_asked_for(make, tmp_path):
+def test_get_vec_normalize_env_returns_the_normalizing_environment(make, tmp_path):
     env = VecNormalize(DummyVecEnv([Walk]), norm_obs=False)
     model = make(env).learn(10)
     assert model.get_vec_normalize_env() is env
@@ -109,6 +110,6 @@ def test_set_env_goes_on_with_what_was_learned(make):
     model.set_env(other)
     assert model.get_env() is other
     model.learn(10)
-    assert model.policy.model.n_instances == 30
+    assert model.agent.model.n_instances == 30
     with pytest.raises(AssertionError):
         model.set_env(DummyVecEnv([Walk, Walk]))

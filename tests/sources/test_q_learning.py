@@ -64,6 +64,7 @@ class TestQLearning:
         np.testing.assert_allclose(learner.weights[:3], [[-4, -3], [-4, -2], [-4, -1]], atol=1e-3)
         assert learner.predict(np.array([0.0]), deterministic=True)[0] == 4
 
+    @pytest.mark.integration
     def test_it_solves_mountain_car_and_its_experience_is_a_source(self):
         source = SourceInstances.from_q_learning(MOUNTAIN_CAR, n_instances=1000, seed=0)
         assert len(source) == 1000
@@ -79,6 +80,7 @@ class TestQLearning:
         assert len(cells) >= 45
         assert np.bincount(source.actions).min() > 100
 
+    @pytest.mark.integration
     def test_the_greedy_policy_is_near_the_optimum_of_103_steps(self):
         learner = QLearning(MOUNTAIN_CAR, seed=1).learn(30_000)
         assert np.mean(learner.episode_lengths[-20:]) < 140
@@ -104,7 +106,7 @@ class TestQLearning:
         [
             ({"epsilon": 2.0}, "epsilon must be between 0 and 1, got 2.0"),
             ({"learning_rate": -0.1}, "learning_rate must be between 0 and 1"),
-            ({"n_tiles": 0}, "n_tiles must be at least 1"),
+            ({"n_tiles": 0}, "n_tiles must be a whole number from 1 to 10,000,000, got 0"),
             ({"env": "Pendulum-v1"}, "action space must be Discrete"),
             ({"env": "CartPole-v1"}, "bounds"),
         ],
@@ -114,7 +116,7 @@ class TestQLearning:
             QLearning(**{"env": "MountainCar-v0", **arguments})
 
     def test_more_instances_than_steps_are_refused(self):
-        with pytest.raises(ValueError, match="between 1 and total_timesteps=10, got 11"):
+        with pytest.raises(ValueError, match=r"n_instances must be a whole number from 1 to 10 \(total_timesteps\), got 11"):
             SourceInstances.from_q_learning("MountainCar-v0", 11, total_timesteps=10)
-        with pytest.raises(ValueError, match="total_timesteps must be at least 1"):
+        with pytest.raises(ValueError, match="total_timesteps must be a whole number from 1 to 100,000,000, got 0"):
             QLearning("MountainCar-v0").learn(0)

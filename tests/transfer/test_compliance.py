@@ -1,4 +1,4 @@
-"""Compliance and relevance against loops written from the paper's equations, and that they say what they are for."""
+"""Compliance and relevance against loops written from the paper's equations, and in cases with a known answer."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from sb3_combrel.transfer.compliance import (
     task_compliance,
     transition_compliance,
 )
-from sb3_combrel.transfer.mapping_transfer import stacked_instances, stacked_table
+from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
 from sb3_combrel.transfer.relevance import relevance
 
 seeds = st.integers(0, 2**32 - 1)
@@ -27,7 +27,7 @@ some_bandwidths = st.builds(Bandwidths, start=st.floats(0.003, 0.5), outcome=st.
 def tables_of(transitions, sources, sets, bandwidths):
     """The package's compliances of all transitions, shape (n_transitions, n_state_mappings, n_source_actions)."""
     instances, table = stacked_instances(sources), stacked_table(sets)
-    tables = np.full((len(transitions), len(table.index), len(instances.count)), np.nan)
+    tables = np.full((len(transitions), len(table.variable), len(instances.size)), np.nan)
     compliance_table(
         np.array([t.state for t in transitions]),
         np.array([t.next_state - t.state for t in transitions]),
@@ -225,7 +225,7 @@ def relevances(source, source_action, mapping, action, transitions, bandwidths, 
     """The package's relevances of all instances of one source action."""
     instances = stacked_instances([source])
     of_action = [t for t in transitions if t.action == action]
-    merit = np.full(int(instances.count.max()), np.nan)
+    values = np.full(int(instances.size.max()), np.nan)
     d = len(mapping.state)
     relevance(
         np.array([t.state for t in of_action]).reshape(-1, d),
@@ -238,9 +238,9 @@ def relevances(source, source_action, mapping, action, transitions, bandwidths, 
         bandwidths,
         mu,
         np.empty(len(of_action)),
-        merit,
+        values,
     )
-    return merit[: instances.count[source_action]]
+    return values[: instances.size[source_action]]
 
 
 @settings(max_examples=60, deadline=None)

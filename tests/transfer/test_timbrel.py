@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
+from helpers.asking import bound, changed_pairs, transferred_at, transferred_to_pairs
 from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
@@ -26,27 +27,21 @@ def task():
     return naive.target_task(POINTS, 2)
 
 
-def bound(method, task, seed=0):
-    method.bind(task, np.random.default_rng(seed))
-    return method
-
-
-def supply_of(method, task, own=0.0):
+def transferred_to_all(method, task, own=0.0):
     pairs = np.arange(task.n_actions * len(task.sample_states))
-    own = np.full(len(pairs), own)
-    return method.supply(pairs, own, own >= task.exploration_threshold)
+    return copy.deepcopy(transferred_to_pairs(method, pairs, np.full(len(pairs), own)))
 
 
-def assert_supplies(method, task, drawn_from, breadth):
-    """Every pair is supplied, naively, from ``drawn_from(action)``; at an exact state, too."""
-    supply, n_points, n_transferred = supply_of(method, task), len(task.sample_states), 0
+def assert_transfers(method, task, drawn_from, breadth):
+    """Every pair gets what the naive version takes from ``drawn_from(action)``; at an exact state, too."""
+    on_grid, n_points, n_transferred = transferred_to_all(method, task), len(task.sample_states), 0
     for point, state in enumerate(task.sample_states):
-        at = method.supply_at(state, np.zeros(task.n_actions))
+        at = transferred_at(method, state, np.zeros(task.n_actions))
         for action in range(task.n_actions):
             expected = naive.transferred(state, 0.0, drawn_from(action), task, breadth)
             n_transferred += len(expected)
-            for found, row in ((supply, action * n_points + point), (at, action)):
-                n = found.count[row]
+            for found, row in ((on_grid, action * n_points + point), (at, action)):
+                n = found.length[row]
                 assert n == len(expected)
                 np.testing.assert_allclose(found.weight[row, :n], [e[0] for e in expected], rtol=1e-9)
                 np.testing.assert_allclose(found.effect[row, :n], np.array([e[1] for e in expected]).reshape(n, 3), atol=1e-12)
@@ -55,17 +50,17 @@ def assert_supplies(method, task, drawn_from, breadth):
 
 def test_one_mapping_serves_all_actions(source, task):
     method = bound(TIMBREL(source, ONE, breadth=0.2), task)
-    assert_supplies(method, task, lambda action: [(source, ONE, action)], 0.2)
+    assert_transfers(method, task, lambda action: [(source, ONE, action)], 0.2)
 
 
 def test_each_action_may_have_a_mapping_of_its_own(source, task):
     method = bound(TIMBREL(source, [ONE, OTHER], breadth=0.2), task)
-    assert_supplies(method, task, lambda action: [(source, [ONE, OTHER][action], action)], 0.2)
+    assert_transfers(method, task, lambda action: [(source, [ONE, OTHER][action], action)], 0.2)
 
 
 def test_the_pool_holds_the_translations_by_all_mappings(source, task):
     method = bound(TIMBREL(source, "pool", mappings=[ONE, OTHER], breadth=0.1), task)
-    assert_supplies(method, task, lambda action: [(source, ONE, action), (source, OTHER, action)], 0.1)
+    assert_transfers(method, task, lambda action: [(source, ONE, action), (source, OTHER, action)], 0.1)
 
 
 def test_random_draws_a_mapping_of_the_set_with_each_transition(source, task):
@@ -77,40 +72,41 @@ def test_random_draws_a_mapping_of_the_set_with_each_transition(source, task):
     drawn = []
     for _ in range(60):
         method.observe(state, 0, -1.0, state, False)
-        chance = method._rng.bit_generator.state
-        before = method.supply_at(state, np.array([0.0, 1.0])).effect[0].copy()
-        supply = method.supply_at(state, np.array([0.0, 1.0]))
-        # Whoever asks twice hears the same and leaves no trace.
-        np.testing.assert_array_equal(supply.effect[0, : supply.count[0]], before[: supply.count[0]])
-        assert method._rng.bit_generator.state == chance
-        effects = supply.effect[0, : supply.count[0]]
+        generator = method.rng.bit_generator.state
+        before = transferred_at(method, state, np.array([0.0, 1.0])).effect[0].copy()
+        found = transferred_at(method, state, np.array([0.0, 1.0]))
+        effects = found.effect[0, : found.length[0]]
+        # To ask leaves no trace: asked twice, it returns the same.
+        np.testing.assert_array_equal(effects, before[: len(effects)])
+        assert method.rng.bit_generator.state == generator
         [which] = [k for k, p in enumerate(possible) if p.shape == effects.shape and np.allclose(p, effects)]
         drawn.append(which)
     assert 15 < sum(drawn) < 45
 
 
-def test_at_first_every_pair_that_is_not_known_is_renewed_and_then_none(source, task):
+def test_at_first_everything_has_changed_and_then_nothing(source, task):
     method = bound(TIMBREL(source, ONE), task)
     known = np.arange(2 * len(POINTS)) % 3 == 0
-    assert method.renewed(known).tolist() == np.flatnonzero(~known).tolist()
+    assert changed_pairs(method, known).tolist() == np.flatnonzero(~known).tolist()
     method.observe(POINTS[5], 0, -1.0, POINTS[6], False)
-    assert method.renewed(known).tolist() == []
+    assert changed_pairs(method, known).tolist() == []
 
 
 def test_pairs_that_are_known_are_given_nothing(source, task):
     method = bound(TIMBREL(source, ONE, breadth=0.3), task)
-    assert supply_of(method, task, own=0.5).count.any()
-    assert not supply_of(method, task, own=1.0).count.any()
-    assert method.supply_at(POINTS[20], np.array([0.0, 1.0])).count.tolist()[1] == 0
-    assert method.supply_at(POINTS[20], np.array([1.0, 0.0])).count.tolist()[0] == 0
-    assert not method.supply_at(POINTS[20], np.array([1.0, 3.0])).count.any()
+    assert transferred_to_all(method, task, own=0.5).length.any()
+    assert not transferred_to_all(method, task, own=1.0).length.any()
+    assert transferred_at(method, POINTS[20], np.array([0.0, 1.0])).length.tolist()[1] == 0
+    assert transferred_at(method, POINTS[20], np.array([1.0, 0.0])).length.tolist()[0] == 0
+    assert not transferred_at(method, POINTS[20], np.array([1.0, 3.0])).length.any()
 
 
-def test_a_sources_first_mapping_and_action_names_describe_what_was_used(source, task):
+def test_uses_are_counted_by_name_where_the_agent_acts_and_not_where_it_predicts(source, task):
     method = bound(TIMBREL(source, ONE, breadth=0.3), task)
     for _ in range(3):
-        method.supply_at(POINTS[21], np.zeros(2))
-    method.supply_at(POINTS[21], np.array([0.0, 1.0]))
+        method.note_use(transferred_at(method, POINTS[21], np.zeros(2)))
+        transferred_at(method, POINTS[20], np.zeros(2))
+    method.note_use(transferred_at(method, POINTS[21], np.array([0.0, 1.0])))
     assert method.mapping_counts() == [("a0<-a1 with s0<-s0, s2<-s1", 4), ("a1<-a0 with s0<-s0, s2<-s1", 3)]
 
 
@@ -130,36 +126,35 @@ def test_a_known_pairs_row_is_built_of_its_own_instances_only(source):
     three_actions = naive.random_source(np.random.default_rng(0), 500, 2, 3)
     model, plain = mountain_car(TIMBREL(three_actions, IDENTITY)), mountain_car(None)
     rng = np.random.default_rng(1)
-    model.policy.prepare()
+    model.agent.prepare()
     before = {pair: row_of(model, pair) for pair in range(3 * 17 * 17)}
     state = rng.uniform(0.3, 0.7, 2)
     for _ in range(400):
         action, after = int(rng.integers(3)), np.clip(state + 0.03 * rng.normal(size=2), 0.0, 1.0)
         for each in (model, plain):
-            each.policy.learn_from(state, action, -1.0, after, False)
+            each.agent.update(state, action, -1.0, after, False)
         state = after
-    arrays, of_plain = model.policy.model.arrays, plain.policy.model.arrays
-    known = np.flatnonzero(arrays.known)
-    assert known.tolist() == np.flatnonzero(of_plain.known).tolist()
+    known = np.flatnonzero(model.agent.model.known)
+    assert known.tolist() == np.flatnonzero(plain.agent.model.known).tolist()
     assert len(known) > 30
     n_changed = 0
     for pair in known:
         assert row_of(model, pair) == row_of(plain, pair)
         n_changed += pair in before and row_of(model, pair) != before[pair]
     assert n_changed > 0.9 * len(known), "what was transferred there before was something else"
-    transferred = arrays.settled.astype(bool) & ~arrays.known
+    transferred = model.agent.mdp.arrays.modelled & ~model.agent.model.known
     assert transferred.sum() > 100
-    assert not of_plain.settled[transferred].any()
+    assert not plain.agent.mdp.arrays.modelled[transferred].any()
 
 
 def row_of(model, pair):
-    arrays = model.policy.model.arrays
+    arrays = model.agent.mdp.arrays
     start, length = arrays.rows.start[pair], arrays.rows.length[pair]
-    if not arrays.settled[pair]:
+    if not arrays.modelled[pair]:
         return None
     return (
         float(arrays.reward[pair]),
-        arrays.rows.index[start : start + length].tolist(),
+        arrays.rows.item[start : start + length].tolist(),
         arrays.rows.weight[start : start + length].tolist(),
     )
 
@@ -186,8 +181,8 @@ def test_the_object_that_was_given_is_left_alone_and_serves_two_models(method):
 
 def trace(model):
     """Every instance of the model, in the order of the actions."""
-    instances = model.policy.model.instances
-    return np.vstack([instances.state[a, :n] for a, n in enumerate(instances.count)])
+    instances = model.agent.model.instances
+    return np.vstack([instances.state[a, :n] for a, n in enumerate(instances.size)])
 
 
 @pytest.mark.parametrize(
@@ -204,7 +199,7 @@ def test_the_same_seed_gives_the_same_run(make):
     source = naive.random_source(np.random.default_rng(0), 200, 2, 3)
     one, same = (mountain_car(make(source), seed=4).learn(250) for _ in range(2))
     np.testing.assert_array_equal(trace(one), trace(same))
-    np.testing.assert_array_equal(one.policy.planner.values, same.policy.planner.values)
+    np.testing.assert_array_equal(one.agent.planner.values, same.agent.planner.values)
     assert one.policy.transfer.mapping_counts() == same.policy.transfer.mapping_counts()
 
 
@@ -213,14 +208,14 @@ def test_the_same_seed_gives_the_same_run(make):
 def test_every_variant_learns(mapping, relevance):
     source = naive.random_source(np.random.default_rng(0), 200, 2, 3)
     model = mountain_car(TIMBREL(source, mapping, relevance=relevance)).learn(150)
-    assert model.policy.statistics()["model/transferred"] > 0.0
-    assert model.policy.model.n_instances == 150
+    assert model.agent.statistics()["model/transferred"] > 0.0
+    assert model.agent.model.n_instances == 150
 
 
-def test_random_and_pool_draw_from_the_injective_mappings_unless_told():
+def test_random_and_pool_draw_from_the_injective_mappings_by_default():
     source = naive.random_source(np.random.default_rng(0), 50, 2, 3)
     model = mountain_car(TIMBREL(source))
     expected = {(0, 1), (1, 0)}
-    assert {tuple(row) for row in model.policy.transfer._sets[0].state_mappings.tolist()} == expected
+    assert {tuple(row) for row in model.policy.transfer.candidates.sets[0].state_mappings.tolist()} == expected
     all_of_them = mountain_car(TIMBREL(source, "pool", mappings=MappingSet.all(2, 2, 3, 3, signs=True)))
-    assert all_of_them.policy.transfer._sets[0].n_state_mappings > len(expected)
+    assert all_of_them.policy.transfer.candidates.sets[0].n_state_mappings > len(expected)

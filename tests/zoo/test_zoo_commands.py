@@ -16,6 +16,8 @@ pytest.importorskip("rl_zoo3")
 from sb3_combrel import FittedRMax, SourceInstances
 from sb3_combrel.zoo import commands
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "zoo_configs"
 CAR = "combrel/MountainCar2D-v0"
@@ -75,7 +77,7 @@ def logs(tmp_path_factory):
 
 
 class TestTrainAndEnjoy:
-    def test_it_evaluates_at_the_frequency_asked_and_keeps_models(self, logs):
+    def test_training_evaluates_at_the_given_frequency_and_keeps_models(self, logs):
         (folder,) = (logs / "fitted_rmax").iterdir()
         assert np.load(folder / "evaluations.npz")["timesteps"].tolist() == [300, 600]
         names = {path.name for path in folder.glob("*.zip")}
@@ -166,7 +168,7 @@ class TestTuning:
         tuning = ("-optimize", "--n-trials", n_trials, "--n-evaluations", 2, "--n-startup-trials", 1, "--no-optim-plots")
         return train_args(folder, *tuning, "--storage", storage, "--study-name", "car", *more, n=300, env=SHORT_CAR, **changes)
 
-    def test_it_runs_with_pruning_and_journal_storage(self, tmp_path):
+    def test_tuning_runs_with_pruning_and_journal_storage(self, tmp_path):
         pytest.importorskip("pandas")
         optuna = pytest.importorskip("optuna")
         file = tmp_path / "journal.log"
@@ -195,7 +197,7 @@ class TestTuning:
             "transfer_n_neighbors",
             "transfer_min_compliance",
             "transfer_relevance",
-            "transfer_voting_radius",
+            "transfer_neighbor_radius",
             "transfer_choice",
         }
         # They take the place of those in the configuration; what was not drawn stays.
@@ -211,13 +213,13 @@ class TestTuning:
         from sb3_combrel.zoo.algorithm import ZooFittedRMax
 
         model = ZooFittedRMax("FittedRMaxPolicy", Box(3), model_breadth=0.2, resolution=drawn)
-        assert model.policy.model.grid.resolution == (expected,) * 3
+        assert model.agent.grid.resolution == (expected,) * 3
 
     def test_a_finer_grid_of_many_variables_stays_within_memory(self):
         from sb3_combrel.zoo.algorithm import ZooFittedRMax
 
         suited, finer = (ZooFittedRMax("FittedRMaxPolicy", Box(5), resolution=drawn) for drawn in (None, "finer"))
-        assert finer.policy.model.grid.resolution == suited.policy.model.grid.resolution
+        assert finer.agent.grid.resolution == suited.agent.grid.resolution
 
     @pytest.mark.slow
     def test_processes_share_a_study_in_a_database(self, tmp_path):
@@ -234,7 +236,7 @@ class TestTuning:
 
 
 class TestTablesAndPictures:
-    def test_plots_and_table(self, logs, tmp_path, capsys):
+    def test_plot_train_and_all_plots_make_pictures_and_a_table(self, logs, tmp_path, capsys):
         pytest.importorskip("seaborn")
         pytest.importorskip("pandas")
         assert call("plot_train", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs) == 0
@@ -269,7 +271,7 @@ class TestTablesAndPictures:
 
 class TestBadInput:
     @pytest.mark.parametrize(
-        ("entry", "words"),
+        ("entry", "message"),
         [
             ({"transfer": {"sb3_combrel.NOBODY": {"source": RECIPE}}}, "sb3_combrel.NOBODY"),
             ({"transfer": {"sb3_combrel.COMBREL": {"source": "nowhere.npz"}}}, "no source file nowhere.npz"),
@@ -286,23 +288,23 @@ class TestBadInput:
             ({"transfer": {"sb3_combrel.COMBREL": {"source": RECIPE}}, "transfer_kwargs": {"k": 5}}, "'k'"),
         ],
     )
-    def test_what_is_wrong_in_a_configuration_is_said_in_a_sentence(self, tmp_path, capsys, entry, words):
+    def test_an_error_in_a_configuration_is_reported_in_one_sentence(self, tmp_path, capsys, entry, message):
         entry = {"policy": "FittedRMaxPolicy", **entry}
         if entry["policy"] is None:
             del entry["policy"]
         assert call("train", *train_args(tmp_path, conf=write_config(tmp_path / "bad.yml", **entry))) == 1
-        said = capsys.readouterr().err
-        assert said.startswith("sb3_combrel.zoo: ")
-        assert words in said
-        assert "Traceback" not in said
+        written = capsys.readouterr().err
+        assert written.startswith("sb3_combrel.zoo: ")
+        assert message in written
+        assert "Traceback" not in written
 
     @pytest.mark.parametrize(
-        ("change", "words"),
+        ("change", "message"),
         [({"env": "combrel/MountainCar3D-v0"}, "MountainCar3D"), ({"conf": "nowhere.yml"}, "nowhere.yml")],
     )
-    def test_an_unknown_environment_or_file_is_named(self, tmp_path, capsys, change, words):
+    def test_an_unknown_environment_or_file_is_named(self, tmp_path, capsys, change, message):
         assert call("train", *train_args(tmp_path, **change)) == 1
-        assert words in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
     def test_an_unknown_algorithm_is_named(self, tmp_path, capsys):
         with pytest.raises(SystemExit):

@@ -1,9 +1,9 @@
-"""The lists of a kernel model from its instances alone, pair by pair: what entering them one by one comes to, but sooner."""
+"""The lists of a kernel model from its instances alone, pair by pair: the result of entering them one by one, in less time."""
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
-from sb3_combrel.common.instances import InstanceArrays, along_curve
+from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.common.instances import Instances, along_curve
 from sb3_combrel.common.kernels import insert_by_weight, near_instances
 from sb3_combrel.common.list_store import reserve
 from sb3_combrel.models.kernel_lists import note_corners
@@ -13,40 +13,39 @@ SLACK = 1 - 1e-9
 
 
 @compiled
-def refill_lists(arrays, instances, slots, grid, kernel, threshold, at, index, weight, pair):
+def refill_lists(arrays, instances, slots, grid, kernel, threshold, scratch, pair):
     """Fill the lists of all pairs, from ``pair`` on, which are empty at first (and nothing known); all but ``entry``.
 
     :param instances: the model's, but in an order in which neighbours lie close together
-    :param slots: int64, shape (n_actions, most instances of an action): the place of each in the model
+    :param slots: int64, shape (n_actions, max instances of an action): the slot of each in the model
     :param kernel: (breadth, min_weight, min_fraction)
-    :param at: float64 scratch, shape (n_variables,)
-    :param index: int32 scratch, shape (list room,); ``weight``: float64, same shape
-    :return: number of pairs; or the pair at which another call goes on when the lists' pool has grown
+    :param scratch: unit coordinates, float64, shape (n_variables,); items, int32, and weights, float64, shape (list room,)
+    :return: number of pairs; or the pair at which another call goes on when the lists have grown
     """
     breadth, min_weight, min_fraction = kernel
+    at, item, weight = scratch
+    wider = (breadth, min_weight * SLACK, min_fraction * SLACK)
     lists = arrays.lists
-    n_points = len(arrays.n_optimistic)
+    n_points = grid.shape[0] * grid.strides[0]
     found = np.int64(0)
     while pair < len(arrays.total):
         action = pair // n_points
-        coordinates_of(pair - action * n_points, grid, at)
+        unit_coordinates_of(pair - action * n_points, grid, at)
         # Neighbouring points have most of their instances in common: the last ones found are looked at first.
-        found, _ = near_instances(
-            instances, action, at, breadth, min_weight * SLACK, min_fraction * SLACK, index, weight, found
-        )
+        found, _ = near_instances(instances, action, at, wider, item, weight, found)
         if found > 0 and not reserve(lists, pair, found + 1):
             return pair
         length = np.int64(0)
         total = 0.0
         for f in range(found):
-            w = kernel_weight(instances.state[action, index[f]], at, breadth)
+            w = kernel_weight(instances.state[action, item[f]], at, breadth)
             if w >= min_weight:
-                length, total = insert_by_weight(
-                    lists.index, lists.weight, lists.start[pair], length, total, slots[action, index[f]], w, min_fraction
-                )
+                slot = slots[action, item[f]]
+                start = lists.start[pair]
+                length, total = insert_by_weight(lists.item, lists.weight, start, length, total, slot, w, min_fraction)
         if length > 0:
             for k in range(lists.start[pair], lists.start[pair] + length):
-                arrays.members[action, lists.index[k]] += 1
+                arrays.n_lists[action, lists.item[k]] += 1
             arrays.known[pair] = total >= threshold
         lists.length[pair] = length
         arrays.total[pair] = total
@@ -54,30 +53,30 @@ def refill_lists(arrays, instances, slots, grid, kernel, threshold, at, index, w
     return pair
 
 
-def in_neighbourhoods(instances: InstanceArrays, listed: np.ndarray) -> tuple[InstanceArrays, np.ndarray]:
+def in_neighbourhoods(instances: Instances, listed: np.ndarray) -> tuple[Instances, np.ndarray]:
     """Those instances that stand in any list, in an order in which a search passes over most blocks.
 
     :param listed: whether each instance does, bool, those of one action after those of another
     :return: they, and the place that each had, int64, shape (n_actions, most instances of an action)
     """
-    slots = np.zeros((len(instances.count), max(1, int(instances.count.max()))), dtype=np.int64)
+    slots = np.zeros((len(instances.size), max(1, int(instances.size.max()))), dtype=np.int64)
     rows = []
-    for action, of_action in enumerate(np.split(listed, np.cumsum(instances.count)[:-1])):
+    for action, of_action in enumerate(np.split(listed, np.cumsum(instances.size)[:-1])):
         there = np.flatnonzero(of_action)
         n = len(there)
         slots[action, :n] = order = there[np.argsort(along_curve(instances.state[action, there]), kind="stable")]
         columns = (instances.state, instances.effect, instances.reward, instances.terminated)
         rows.append((np.full(n, action), *(column[action, order] for column in columns)))
-    return InstanceArrays.of_rows(len(instances.count), *map(np.concatenate, zip(*rows, strict=True))), slots
+    return Instances.of_rows(len(instances.size), *map(np.concatenate, zip(*rows, strict=True))), slots
 
 
 @compiled
-def coordinates_of(point, grid, at):
+def unit_coordinates_of(point, grid, at):
     """Write the unit coordinates of a grid point to ``at``."""
     for k in range(len(at)):
         along = point // grid.strides[k]
         point -= along * grid.strides[k]
-        at[k] = (along - grid.margin[k]) / grid.cells[k]
+        at[k] = (along - grid.margin) / grid.cells[k]
 
 
 @compiled
@@ -92,7 +91,10 @@ def kernel_weight(state, at, breadth):
 
 @compiled
 def note_effects(instances, arrays, grid):
-    """Work out what the arrays hold of the effect of each instance."""
-    for action in range(len(instances.count)):
-        for slot in range(instances.count[action]):
+    """Compute what the arrays hold of the effect of each instance."""
+    for action in range(len(instances.size)):
+        for slot in range(instances.size[action]):
             note_corners(arrays, instances.effect[action, slot], grid, action, slot)
+
+
+refill_all_lists, note_all_effects = EntryPoint(refill_lists), EntryPoint(note_effects)

@@ -1,4 +1,4 @@
-"""The two factors of a set of mappings: state mappings as rows of an array, action mappings by their number."""
+"""Sequences of action mappings, looked up by number: which source action each target action is mapped to."""
 
 from __future__ import annotations
 
@@ -6,63 +6,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, permutations, product
-from math import comb, perm
+from itertools import combinations, product
+from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Ints
+from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.mappings.inter_task_mapping import Ints, index_table
 
-MAX_STATE_MAPPINGS = 100_000
-"""State mappings are rows of an array, and the table of compliances has a column for each: more of them help nobody."""
+# The numbers of mappings, which are computed with, have at most 3,000 digits.
+MAX_ACTIONS = 1000
 
-LAYINGS_OF_TWO_ON_FOUR: Ints = np.array(list(permutations((0, 1, UNMAPPED, UNMAPPED))), dtype=np.int64)
-"""The paper's 4! state mappings from two to four variables: the layings of (0, 1, None, None); 12 of the 24 differ."""
-
-
-def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, allow_none: bool) -> Ints:
-    """
-    Every state mapping that uses as many different source variables as there is room for.
-
-    :param n_source: number of source variables
-    :param n_target: number of target variables
-    :param once: whether a source variable is used at most once
-    :param allow_none: whether target variables may be left unmapped
-    :return: one mapping a row in lexicographic order (None first), shape (n, n_target), -1 for None
-    :raises ValueError: if a number is below 1, or if there are more than ``MAX_STATE_MAPPINGS``
-    """
-    _check_positive(n_source_variables=n_source, n_target_variables=n_target)
-    different = min(n_source, n_target)
-    _check_state_mappings(_count_state_mappings(n_source, n_target, once, allow_none))
-    choices = np.arange(UNMAPPED if allow_none else 0, n_source, dtype=np.int64)
-    rows = np.empty((1, 0), dtype=np.int64)
-    for position in range(n_target):
-        rows = np.column_stack([np.repeat(rows, len(choices), axis=0), np.tile(choices, len(rows))])
-        # Prune at once: rows that can no longer become valid would grow to (n_source + 1) ** n_target.
-        used = (rows[:, :, None] == np.arange(n_source)).sum(axis=1)
-        keep = (used > 0).sum(axis=1) + (n_target - 1 - position) >= different
-        rows = rows[keep & (used <= 1).all(axis=1)] if once else rows[keep]
-    return rows
-
-
-def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
-    """
-    Every state mapping with every choice of signs for its mapped variables.
-
-    :param state_mappings: shape (n, n_target), -1 for None
-    :return: the mappings and their signs (+1 or -1), both of shape (m, n_target); each mapping first with +1 throughout
-    :raises ValueError: if there are more than ``MAX_STATE_MAPPINGS``
-    """
-    mapped = state_mappings != UNMAPPED
-    copies = 2 ** mapped.sum(axis=1)
-    _check_state_mappings(int(copies.sum()))
-    rows = np.repeat(state_mappings, copies, axis=0)
-    # The k-th copy of a mapping mirrors its mapped variables by the binary digits of k.
-    number = np.arange(len(rows)) - np.repeat(np.cumsum(copies) - copies, copies)
-    digit = np.cumsum(rows != UNMAPPED, axis=1) - 1
-    mirrored = (rows != UNMAPPED) & ((number[:, None] >> np.maximum(digit, 0)) & 1 == 1)
-    return rows, np.where(mirrored, -1, 1).astype(np.int64)
+# Finding a member takes a number of steps in proportion to the third power of the number of actions.
+MAX_BALANCED_ACTIONS = 100
 
 
 class ActionMappings(ABC):
@@ -121,7 +79,8 @@ class AllActionMappings(ActionMappings):
     n_target_actions: int
 
     def __post_init__(self) -> None:
-        _check_positive(n_source_actions=self.n_source_actions, n_target_actions=self.n_target_actions)
+        check_count("n_source_actions", self.n_source_actions, max=MAX_ACTIONS)
+        check_count("n_target_actions", self.n_target_actions, max=MAX_ACTIONS)
 
     @property
     def n_mappings(self) -> int:
@@ -143,6 +102,9 @@ class AllActionMappings(ActionMappings):
             raise self._none_maps(action, source_action)
         return source_action * self.n_source_actions ** (self.n_target_actions - 1 - action)
 
+    def source_actions_for(self, action: int) -> Ints:
+        return np.arange(self.n_source_actions, dtype=np.int64)
+
 
 @dataclass(frozen=True)
 class BalancedActionMappings(ActionMappings):
@@ -160,7 +122,9 @@ class BalancedActionMappings(ActionMappings):
     n_target_actions: int
 
     def __post_init__(self) -> None:
-        _check_positive(n_source_actions=self.n_source_actions, n_target_actions=self.n_target_actions)
+        why = "of balanced action mappings"
+        check_count("n_source_actions", self.n_source_actions, max=MAX_BALANCED_ACTIONS, why_max=why)
+        check_count("n_target_actions", self.n_target_actions, max=MAX_BALANCED_ACTIONS, why_max=why)
 
     @property
     def n_mappings(self) -> int:
@@ -179,24 +143,27 @@ class BalancedActionMappings(ActionMappings):
         return tuple(chosen)
 
     def count(self, action: int, source_action: int) -> int:
-        # Every target action is as good as any other, and so is every source action.
+        # By symmetry: the mappings are closed under permutations of the target actions and of the source actions.
         return self.n_mappings // self.n_source_actions if 0 <= source_action < self.n_source_actions else 0
 
     def first(self, action: int, source_action: int) -> int:
         if not self.count(action, source_action):
             raise self._none_maps(action, source_action)
-        # The least such mapping: at each place the least choice that leaves a use of `source_action` for place `action`.
+        # The first such mapping has at each position the first choice that leaves a `source_action` for position `action`.
         chosen: list[int] = []
         number = 0
-        for place in range(action + 1):
+        for position in range(action + 1):
             for candidate in range(self.n_source_actions):
                 # What is left to be chosen may come in any order, so `source_action` may as well come next.
-                reserved = [candidate, source_action] if place < action else [candidate]
-                if self._completions([*chosen, *reserved]) and (place < action or candidate == source_action):
+                reserved = [candidate, source_action] if position < action else [candidate]
+                if self._completions([*chosen, *reserved]) and (position < action or candidate == source_action):
                     chosen.append(candidate)
                     break
                 number += self._completions([*chosen, candidate])
         return number
+
+    def source_actions_for(self, action: int) -> Ints:
+        return np.arange(self.n_source_actions, dtype=np.int64)
 
     def _completions(self, chosen: Sequence[int]) -> int:
         """Number of balanced mappings that begin with ``chosen``."""
@@ -206,19 +173,19 @@ class BalancedActionMappings(ActionMappings):
 
 @lru_cache(maxsize=4096)
 def _balanced_completions(usage: tuple[int, ...], n_target: int) -> int:
-    """In how many ways a beginning that used the source actions so many times can be completed to a balanced mapping."""
-    least, n_extra = divmod(n_target, len(usage))
-    # ways[e]: distributions of the free places over the source actions so far, e of which are used least + 1 times.
+    """Number of balanced mappings with a given beginning, which used the source actions so many times."""
+    n_each, n_extra = divmod(n_target, len(usage))
+    # ways[e]: distributions of the free positions over the source actions so far, e of which are used n_each + 1 times.
     ways = {0: (1, n_target - sum(usage))}
     for used in usage:
         following: dict[int, tuple[int, int]] = {}
         for extra, (count, free) in ways.items():
             for more in (0, 1):
-                places = least + more - used
-                if places < 0 or places > free or extra + more > n_extra:
+                needed = n_each + more - used
+                if needed < 0 or needed > free or extra + more > n_extra:
                     continue
                 before = following.get(extra + more, (0, 0))[0]
-                following[extra + more] = (before + count * comb(free, places), free - places)
+                following[extra + more] = (before + count * comb(free, needed), free - needed)
         ways = following
     return ways.get(n_extra, (0, 0))[0]
 
@@ -233,12 +200,9 @@ class ListedActionMappings(ActionMappings):
     """
 
     def __init__(self, mappings: ArrayLike, n_source_actions: int | None = None) -> None:
-        array = np.array(mappings)
-        if array.ndim != 2 or 0 in array.shape or not np.issubdtype(array.dtype, np.integer):
-            raise ValueError(
-                f"action mappings must be integers of shape (n, n_target_actions), got {array.dtype} of shape {array.shape}"
-            )
-        self.mappings: Ints = array.astype(np.int64)
+        array = index_table("action mappings", mappings, "(n, n_target_actions)")
+        check_count("n_source_actions", n_source_actions, none_allowed=True)
+        self.mappings: Ints = array
         self.mappings.flags.writeable = False
         self.n_target_actions = int(array.shape[1])
         self.n_source_actions = int(array.max()) + 1 if n_source_actions is None else n_source_actions
@@ -265,6 +229,9 @@ class ListedActionMappings(ActionMappings):
             raise self._none_maps(action, source_action)
         return int(found[0])
 
+    def source_actions_for(self, action: int) -> Ints:
+        return np.unique(self.mappings[:, action])
+
 
 def paper_icub_actions() -> Ints:
     """The 48 action mappings of the iCub experiment, shape (48, 8); see :meth:`MappingSet.paper_icub`."""
@@ -277,25 +244,17 @@ def paper_icub_actions() -> Ints:
     return np.array(mappings, dtype=np.int64)
 
 
-def _count_state_mappings(n_source: int, n_target: int, once: bool, allow_none: bool) -> int:
-    if once:
-        return perm(max(n_source, n_target), min(n_source, n_target))
-    if n_source >= n_target:
-        return perm(n_source, n_target)
-    # Inclusion and exclusion over the source variables that are left out.
-    choices = n_source + allow_none
-    return sum((-1) ** k * comb(n_source, k) * (choices - k) ** n_target for k in range(n_source + 1))
+def _sizes(actions: AllActionMappings | BalancedActionMappings) -> tuple[str, dict[str, int]]:
+    sizes = {"n_source_actions": actions.n_source_actions, "n_target_actions": actions.n_target_actions}
+    return type(actions).__name__, sizes
 
 
-def _check_state_mappings(count: int) -> None:
-    if count > MAX_STATE_MAPPINGS:
-        raise ValueError(
-            f"these spaces have {count:,} state mappings of that kind, more than the {MAX_STATE_MAPPINGS:,} that are "
-            "practical; give mappings=[InterTaskMapping(...), ...], or a MappingSet of the state mappings of interest"
-        )
-
-
-def _check_positive(**numbers: int) -> None:
-    for name, number in numbers.items():
-        if number < 1:
-            raise ValueError(f"{name} must be at least 1, got {number}")
+register_writer(AllActionMappings, _sizes)
+register_reader("AllActionMappings", AllActionMappings)
+register_writer(BalancedActionMappings, _sizes)
+register_reader("BalancedActionMappings", BalancedActionMappings)
+register_writer(
+    ListedActionMappings,
+    lambda actions: ("ListedActionMappings", {"mappings": actions.mappings, "n_source_actions": actions.n_source_actions}),
+)
+register_reader("ListedActionMappings", ListedActionMappings)

@@ -1,0 +1,343 @@
+"""The agent of Fitted R-Max: model, planner and transfer method together, on arrays, without Stable-Baselines3."""
+
+from __future__ import annotations
+
+import threading
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.common.task import Task
+from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory, small_cell
+from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
+from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
+from sb3_combrel.models.kernel_average import KernelAverage
+from sb3_combrel.planning.corrections import MAX_VISITS, CorrectionArrays
+from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.planning.mdp import FiniteMDP
+from sb3_combrel.planning.q_values import NOBODY, Prediction, QValues, ValueFunction
+from sb3_combrel.planning.sweeping import NOWHERE, Planner
+from sb3_combrel.transfer.base import TargetTask, Transfer
+
+# Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
+# enough that one grid point that leads nowhere does not lower its neighbours' interpolated values for long.
+LONGEST_PLAN = 10_000
+
+# Backups in multiples of those of a step, passes over the grid, and backups for each pair that transfer has changed.
+AT_EPISODE_END = 400
+BEFORE_FIRST_STEP = 300
+BACKUPS_PER_CHANGED_PAIR = 2
+
+# A time limit reached this often changes nothing; each further time multiplies the threshold by the factor.
+DECAY_AFTER_EPISODES = 10
+THRESHOLD_DECAY = 0.98
+
+
+class FittedRMaxAgent:
+    """
+    Fitted R-Max on arrays. States are in unit coordinates (``task.scaling.to_unit(states)``), actions are numbered from 0.
+
+    One step of learning is ``action = agent.act(state)``, then ``agent.update(state, action, reward, next_state,
+    terminated)``; call ``agent.end_episode(truncated)`` at the end of each episode. All methods may be called from any
+    thread. What is asked of the agent without ``explore`` does not change what it learns.
+
+    :param settings: see :class:`FittedRMaxSettings`
+    :param task: state variables and actions
+    :param transfer: a transfer method, bound here to the task; None for none
+    :param rng: generator of all random numbers of learning
+    :param model_class: a subclass of :class:`~sb3_combrel.models.base.Model`
+    :raises ValueError: if the settings do not fit the task, or the transfer method does not
+    """
+
+    def __init__(
+        self,
+        settings: FittedRMaxSettings,
+        task: Task,
+        transfer: Transfer | None = None,
+        rng: np.random.Generator | None = None,
+        model_class: type[Model] = KernelAverage,
+    ):
+        self.settings = settings
+        self.task = task
+        self.transfer = transfer
+        self.model_class = model_class
+        self.rng = np.random.default_rng() if rng is None else rng
+        self._prediction_rng = np.random.default_rng(self.rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
+        d = task.n_variables
+        self.max_backups = settings.backups_for(d)
+        self.model_settings = settings.model_settings(d)
+        breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
+        self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight)
+        self.workload = workload(self.grid, task.n_actions, self.model_settings, transfer is not None)
+        warn_if_long(self.workload, self.grid)
+        self.n_truncated = 0
+        self.n_backups = 0
+        # Measure the time of planning, which takes some itself.
+        self.timed = False
+        self.planning_seconds = 0.0
+        # One thread at a time: predicting in one while another learns must be safe.
+        self._lock = threading.RLock()
+        self._q = QValues(task.n_actions, d)
+        if transfer is not None:
+            self.target = self._target_task(transfer)
+        self._build()
+        if transfer is not None:
+            self._widen(transfer.lowest_reward())
+
+    def _target_task(self, transfer: Transfer) -> TargetTask:
+        target = TargetTask(
+            scaling=self.task.scaling,
+            n_actions=self.task.n_actions,
+            sample_states=self.grid.points(),
+            exploration_threshold=self.model_settings.exploration_threshold,
+            min_weight=self.model_settings.min_weight,
+            min_fraction=self.model_settings.min_fraction,
+            state_names=tuple(self.task.state_names),
+            action_names=tuple(self.task.action_names),
+        )
+        transfer.bind(target, self.rng)
+        return target
+
+    def _build(self) -> None:
+        """Make model and planner, without any instances."""
+        max_value = float(self.settings.max_value)
+        self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.settings.gamma)
+        self.model = self.model_class(self.mdp, self.model_settings, self.transfer)
+        self.planner = Planner(
+            self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=self.settings.planning_tolerance
+        )
+        self.corrections = CorrectionArrays.empty(self.task.n_variables)
+        self._outdated: list[np.ndarray] = []
+
+    def reseed(self, rng: np.random.Generator) -> None:
+        """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
+        # The generator itself stays the same, as the transfer method has it too.
+        self.rng.bit_generator.state = rng.bit_generator.state
+        self._prediction_rng = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=threading.RLock())
+
+    # ------------------------------------------------------------------ acting
+
+    def act(self, state: np.ndarray, explore: bool = True, episode: int = 0, memory: EpisodeMemory | None = None) -> int:
+        """
+        Choose an action.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
+            first. Otherwise the best action of those that are known; where none is, of those that are modelled with
+            transferred instances: an evaluation must not depend on trying things out.
+        :param episode: in learning, a number that tells the episodes of all environments apart
+        :param memory: in evaluation, what is stored of the episode so far; where it is caught in a loop, other actions
+            are tried
+        :return: the action, from 0 on
+        """
+        with self._lock:
+            return self._explore(state, episode) if explore else self._exploit(state, memory)
+
+    def _explore(self, state: np.ndarray, episode: int) -> int:
+        self.corrections = self.corrections.with_room()
+        prediction, given = self.model.predict_at(state)
+        if given is not None:
+            assert self.transfer is not None
+            self.transfer.note_use(given)
+        visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
+        best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)
+        if best >= 0:
+            return best
+        ties = np.flatnonzero(self._q.q == self._q.q.max())
+        return int(ties[self.rng.integers(len(ties))])
+
+    def _exploit(self, state: np.ndarray, memory: EpisodeMemory | None) -> int:
+        mode = EXPLOIT if memory is None else memory.mode
+        prediction = self._evaluate(state, self.planner.exploitation_values() if mode == EXPLOIT else None)
+        q = self._q.q
+        eligible = prediction.weight >= self.model.exploration_threshold
+        if not eligible.any():
+            eligible = prediction.modelled
+        if mode == EXPLORE or (mode == OPTIMISTIC and not eligible.any()):
+            eligible = np.ones(len(q), dtype=np.bool_)
+        action = int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
+        if memory is not None:
+            memory.note(small_cell(state, self.grid), float(q[action]), float(prediction.reward[action]), self.settings.gamma)
+        return action
+
+    def sample_action(self, state: np.ndarray) -> int:
+        """Choose an action as in learning, optimistic ones first, but for a prediction: it does not change what is learned."""
+        with self._lock:
+            self._evaluate(state)
+            return int(self._prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
+
+    def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
+        """
+        Compute the action values at an exact state; optimistic actions have ``max_value``.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :param values: at the grid points; by default the planner's, optimistic ones
+        :return: shape (n_actions,)
+        """
+        with self._lock:
+            self._evaluate(np.ascontiguousarray(state, dtype=np.float64), values)
+            return self._q.q.copy()
+
+    def _evaluate(self, state: np.ndarray, values: np.ndarray | None = None) -> Prediction:
+        prediction, _ = self.model.predict_at(state)
+        function = self._value_function(self.planner.values if values is None else values)
+        self._q.compute(prediction, state, function, NOBODY)
+        return prediction
+
+    def _value_function(self, values: np.ndarray) -> ValueFunction:
+        return ValueFunction(values, self.corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds)
+
+    # ---------------------------------------------------------------- learning
+
+    def update(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        """
+        Learn from one transition, and plan.
+
+        :param state: unit coordinates; ``next_state``: the same
+        :param action: from 0 on
+        :param terminated: whether ``next_state`` is a terminal state; a time limit is none
+        """
+        with self._lock:
+            self._widen(reward)
+            self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
+            if self.transfer is not None:
+                self.transfer.observe(state, action, reward, next_state, terminated)
+            self._plan(self.max_backups, NOWHERE if terminated else next_state)
+
+    def end_episode(self, truncated: bool) -> None:
+        """
+        Plan on while no action is due.
+
+        :param truncated: whether the episode ended by its time limit
+        """
+        with self._lock:
+            if truncated:
+                self.n_truncated += 1
+                self._outdated.append(self.model.lower_threshold(self._lowered_threshold()))
+            if self.transfer is not None:
+                self.transfer.end_episode(truncated)
+                self._outdated.append(self.model.outdated())
+            self._plan(AT_EPISODE_END * self.max_backups)
+
+    def _lowered_threshold(self) -> float:
+        """The threshold after so many episodes that ran into their time limit.
+
+        Where the kernel is so narrow that all that is within an episode's reach cannot become known, exploration would
+        otherwise go on for ever. In the end any instance that counts at all suffices.
+        """
+        full, min_weight = self.model_settings.exploration_threshold, self.model_settings.min_weight
+        return max(full * THRESHOLD_DECAY ** max(0, self.n_truncated - DECAY_AFTER_EPISODES), min(full, min_weight))
+
+    def prepare(self) -> None:
+        """Model what is transferred before the first step, and plan until the values have converged."""
+        with self._lock:
+            # Episodes are numbered from 0 again.
+            self.corrections.visits.fill(0)
+            self._plan(0)
+            if self.transfer is None and self.model.n_instances == 0:
+                return
+            self.planner.restart()
+            self.n_backups += self.planner.sweep_all(BEFORE_FIRST_STEP)
+
+    def _plan(self, max_backups: int, around: np.ndarray = NOWHERE) -> None:
+        """Plan, and measure the time that it takes if that is wanted."""
+        if not self.timed:
+            return self._update_and_plan(max_backups, around)
+        began = perf_counter()
+        self._update_and_plan(max_backups, around)
+        self.planning_seconds += perf_counter() - began
+
+    def _update_and_plan(self, max_backups: int, around: np.ndarray) -> None:
+        """Update the rows of the pairs that changed, and plan; longer where transfer changed many pairs at once."""
+        changed = NO_PAIRS if self.transfer is None else self._changed_by(self.transfer)
+        passes = 0
+        if len(changed):
+            self._outdated.append(changed)
+            backups = BACKUPS_PER_CHANGED_PAIR * len(changed)
+            passes = backups // self.grid.n_points
+            max_backups += backups if passes == 0 else 0
+        # Left on the list until all is done: an interrupt in between loses no change.
+        pairs = self._outdated[0] if len(self._outdated) == 1 else np.unique(np.concatenate([NO_PAIRS, *self._outdated]))
+        while len(pairs) > MAX_PAIRS_AT_ONCE:
+            some, pairs = pairs[:MAX_PAIRS_AT_ONCE], pairs[MAX_PAIRS_AT_ONCE:]
+            self.model.update_rows(some)
+            self.n_backups += self.planner.update(some, 0)
+        if len(pairs):
+            self.model.update_rows(pairs)
+        self.n_backups += self.planner.update(pairs, max_backups, around)
+        self._outdated.clear()
+        if passes:
+            self.n_backups += self.planner.sweep_all(passes)
+
+    def _changed_by(self, transfer: Transfer) -> np.ndarray:
+        """The pairs, not known, for which the transfer method may have other instances than when it was last asked."""
+        changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
+        if isinstance(changed, bool | np.bool_):
+            return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
+        return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
+
+    def _widen(self, reward: float) -> None:
+        """Keep the lower bound of the values below what the worst reward seen could add up to."""
+        low, high = self.planner.bounds
+        lowest = min(0.0, high) + LONGEST_PLAN * min(0.0, reward)
+        if lowest < low:
+            self.planner.bounds = (lowest, high)
+
+    # ------------------------------------------------------------------- state
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """
+        What has been learned, float64 arrays by name, from which all else is rebuilt.
+
+        Names and shapes do not change, but for the number of rows of arrays with several axes.
+        """
+        with self._lock:
+            of_transfer = {} if self.transfer is None else self.transfer.get_state()
+            return {
+                **{f"transfer_{name}": array for name, array in of_transfer.items()},
+                **self.model.get_state(),
+                "values": self.planner.values.copy(),
+                "lowest_value": np.array([self.planner.bounds[0]]),
+                "n_truncated": np.array([float(self.n_truncated)]),
+                "corrections": self.corrections.rows(),
+            }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Take over what :meth:`get_state` returned; what has been learned since is forgotten."""
+        with self._lock:
+            self._build()
+            self.n_truncated = int(state["n_truncated"][0])
+            if self.transfer is not None:
+                self.transfer.bind(self.target, self.rng)
+                prefix = "transfer_"
+                given = {name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)}
+                self.transfer.set_state(given)
+            self.model.lower_threshold(self._lowered_threshold())
+            self.model.set_state(state)
+            self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
+            self.planner.restore(state["values"])
+            self.corrections = CorrectionArrays.of_rows(state["corrections"])
+
+    def statistics(self) -> dict[str, float]:
+        """Figures for the logger, by name."""
+        with self._lock:
+            modelled = float(self.mdp.arrays.modelled.mean())
+            known = float(self.model.known.mean())
+            figures = {
+                "model/instances": self.model.n_instances,
+                "model/known": known,
+                "model/transferred": modelled - known,
+                "model/optimistic": 1.0 - modelled,
+                "model/threshold": self.model.exploration_threshold,
+                "planner/queued": self.planner.n_queued,
+                "planner/corrections": int(self.corrections.n_states[0]),
+            }
+            return figures if self.transfer is None else {**figures, **self.transfer.statistics()}

@@ -1,0 +1,81 @@
+"""How much work a grid makes, estimated before it begins: a fine grid can take minutes without any sign of life."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import NamedTuple
+
+from sb3_combrel.models.base import ModelSettings
+from sb3_combrel.planning.grid import StateGrid
+
+# Measured with grids of a million points of two and four state variables, in seconds: for each state-action pair until the
+# first step, and for each grid point that an instance reaches in a step. With transfer they differ by a factor of three.
+SETUP_OF_PAIR, SETUP_OF_PAIR_WITH_TRANSFER = 1e-6, 1e-5
+STEP_OF_POINT, STEP_OF_POINT_WITH_TRANSFER = 7e-7, 4e-6
+
+LONG_SETUP_SECONDS = 5.0
+LONG_STEP_SECONDS = 0.05
+
+
+class Workload(NamedTuple):
+    """
+    The size of a grid, and what it costs.
+
+    :param n_points: grid points
+    :param n_pairs: state-action pairs
+    :param setup_seconds: estimated time until the first step, and for loading a model
+    :param step_seconds: estimated time of a step
+    """
+
+    n_points: int
+    n_pairs: int
+    setup_seconds: float
+    step_seconds: float
+
+    @property
+    def is_long(self) -> bool:
+        """Whether a user would wonder what is going on."""
+        return self.setup_seconds > LONG_SETUP_SECONDS or self.step_seconds > LONG_STEP_SECONDS
+
+    def __str__(self) -> str:
+        return (
+            f"{self.n_points:,} grid points and {self.n_pairs:,} state-action pairs: roughly {_time(self.setup_seconds)} "
+            f"until the first step, and {_time(self.step_seconds)} a step"
+        )
+
+
+def workload(grid: StateGrid, n_actions: int, settings: ModelSettings, transfers: bool) -> Workload:
+    """
+    Estimate the work.
+
+    :param grid: the finite sample of states
+    :param n_actions: number of actions
+    :param settings: of the model: its kernel's reach decides how many grid points an instance changes
+    :param transfers: whether there is a transfer method
+    """
+    d = grid.n_variables
+    reach = settings.model_breadth * math.sqrt(-math.log(settings.min_weight))
+    ball = math.pi ** (d / 2) / math.gamma(d / 2 + 1) * min(reach, 1.0) ** d
+    reached = min(ball, 1.0) * grid.n_points
+    n_pairs = grid.n_points * n_actions
+    of_pair, of_point = (SETUP_OF_PAIR, STEP_OF_POINT)
+    if transfers:
+        of_pair, of_point = (SETUP_OF_PAIR_WITH_TRANSFER, STEP_OF_POINT_WITH_TRANSFER)
+    return Workload(grid.n_points, n_pairs, of_pair * n_pairs, of_point * reached)
+
+
+def warn_if_long(work: Workload, grid: StateGrid) -> None:
+    """Warn of a grid that takes long, before it does."""
+    if work.is_long:
+        warnings.warn(
+            f"resolution={list(grid.resolution)} means {work}; a lower resolution takes less time, each number less by one "
+            "about half",
+            stacklevel=5,
+        )
+
+
+def _time(seconds: float) -> str:
+    if seconds >= 90.0:
+        return f"{seconds / 60.0:.0f} minutes"
+    return f"{seconds:.0f} seconds" if seconds >= 2.0 else f"{seconds:.1g} seconds"

@@ -1,0 +1,86 @@
+"""State mappings as rows of an array: which source variable each target variable is mapped to."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from math import comb, perm
+
+import numpy as np
+
+from sb3_combrel.common.checks import check_count, count_text
+from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Ints
+
+MAX_STATE_MAPPINGS = 100_000
+"""State mappings are rows of an array, and the table of compliances has a column for each."""
+
+# Far beyond what model learning on a grid is possible with; without limits, counting the mappings already takes for ever.
+MAX_SOURCE_VARIABLES = 1000
+MAX_TARGET_VARIABLES = 100
+
+TWO_VARIABLES_ON_FOUR: Ints = np.array(list(permutations((0, 1, UNMAPPED, UNMAPPED))), dtype=np.int64)
+"""The paper's 4! state mappings from two to four variables: the permutations of (0, 1, None, None); 12 of the 24 differ."""
+
+
+def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, allow_none: bool) -> Ints:
+    """
+    Every state mapping that uses as many different source variables as there is room for.
+
+    :param n_source: number of source variables
+    :param n_target: number of target variables
+    :param once: whether a source variable is used at most once
+    :param allow_none: whether target variables may be left unmapped
+    :return: one mapping a row in lexicographic order (None first), shape (n, n_target), -1 for None
+    :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` mappings
+    """
+    check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
+    check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
+    different = min(n_source, n_target)
+    _check_state_mappings(_count_state_mappings(n_source, n_target, once, allow_none))
+    choices = np.arange(UNMAPPED if allow_none else 0, n_source, dtype=np.int64)
+    rows = np.empty((1, 0), dtype=np.int64)
+    for position in range(n_target):
+        rows = np.column_stack([np.repeat(rows, len(choices), axis=0), np.tile(choices, len(rows))])
+        # Prune at once: rows that can no longer become valid would grow to (n_source + 1) ** n_target.
+        used = (rows[:, :, None] == np.arange(n_source)).sum(axis=1)
+        keep = (used > 0).sum(axis=1) + (n_target - 1 - position) >= different
+        rows = rows[keep & (used <= 1).all(axis=1)] if once else rows[keep]
+    return rows
+
+
+def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
+    """
+    Every state mapping with every choice of signs for its mapped variables.
+
+    :param state_mappings: shape (n, n_target), -1 for None
+    :return: the mappings and their signs (+1 or -1), both of shape (m, n_target); each mapping first with +1 throughout
+    :raises ValueError: if there are more than ``MAX_STATE_MAPPINGS``
+    """
+    mapped = state_mappings != UNMAPPED
+    n_mapped = mapped.sum(axis=1)
+    # With the integers of Python, which do not overflow.
+    _check_state_mappings(sum(2**n for n in n_mapped.tolist()))
+    copies = 2**n_mapped
+    rows = np.repeat(state_mappings, copies, axis=0)
+    # The k-th copy of a mapping mirrors its mapped variables by the binary digits of k.
+    number = np.arange(len(rows)) - np.repeat(np.cumsum(copies) - copies, copies)
+    digit = np.cumsum(rows != UNMAPPED, axis=1) - 1
+    mirrored = (rows != UNMAPPED) & ((number[:, None] >> np.maximum(digit, 0)) & 1 == 1)
+    return rows, np.where(mirrored, -1, 1).astype(np.int64)
+
+
+def _count_state_mappings(n_source: int, n_target: int, once: bool, allow_none: bool) -> int:
+    if once:
+        return perm(max(n_source, n_target), min(n_source, n_target))
+    if n_source >= n_target:
+        return perm(n_source, n_target)
+    # Inclusion and exclusion over the source variables that are left out.
+    choices = n_source + allow_none
+    return sum((-1) ** k * comb(n_source, k) * (choices - k) ** n_target for k in range(n_source + 1))
+
+
+def _check_state_mappings(count: int) -> None:
+    if count > MAX_STATE_MAPPINGS:
+        raise ValueError(
+            f"these spaces have {count_text(count)} state mappings of that kind, more than the {MAX_STATE_MAPPINGS:,} that "
+            "are practical; give mappings=[InterTaskMapping(...), ...], or a MappingSet of the state mappings of interest"
+        )

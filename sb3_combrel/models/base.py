@@ -1,0 +1,231 @@
+"""What planner and agent ask of a model of the dynamics."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from sb3_combrel.common.instances import Instances, put_instance_at
+from sb3_combrel.common.transferred import TransferredInstances, check_transferred
+from sb3_combrel.planning.mdp import FiniteMDP
+from sb3_combrel.planning.q_values import Prediction
+
+NO_PAIRS = np.empty(0, dtype=np.int64)
+MAX_PAIRS_AT_ONCE = 4096
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """
+    The arguments of :class:`~sb3_combrel.FittedRMax` that a model needs; see there.
+
+    :param model_breadth: kernel breadth, unit coordinates
+    :param min_weight: instances of less weight do not count
+    :param min_fraction: fraction of the weight of nearer instances that an instance must have
+    :param exploration_threshold: weight of instances that makes a state-action pair known
+    :param max_instances: of one action; None for no limit
+    """
+
+    model_breadth: float
+    min_weight: float
+    min_fraction: float
+    exploration_threshold: float
+    max_instances: int | None = None
+
+
+class Predictions(NamedTuple):
+    """What the target's own instances predict of n state-action pairs. Unit coordinates.
+
+    :param weight: float64, shape (n,): weight of the instances behind each prediction, which decides whether it is known
+    :param reward: float64, shape (n,): expected reward
+    :param probability: float64, shape (n, n_successors); what is missing to 1 ends the episode
+    :param effect: float64, shape (n, n_successors, n_variables): displacement to each successor
+    """
+
+    weight: np.ndarray
+    reward: np.ndarray
+    probability: np.ndarray
+    effect: np.ndarray
+
+
+class InstanceTransfer(Protocol):
+    """What a model knows of a transfer method (see ``sb3_combrel.transfer.base.Transfer``)."""
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        """Transferred instances for states, unit coordinates, and actions."""
+
+    def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        """The same for states of the finite sample, by number."""
+
+
+class Model(ABC):
+    """
+    A model of the dynamics, kept up to date transition by transition. Everything is in unit coordinates.
+
+    A subclass must say what its instances predict, :meth:`predict`, and nothing else: the other methods have defaults, which
+    are slow, as they compute all pairs of an action anew with each of its transitions. A state-action pair is *known* once
+    the weight of the target's own instances reaches the threshold, and stays known. A pair that is not known can be modelled
+    with transferred instances; if it is not, it is optimistic.
+
+    :param mdp: the finite MDP over the sample of states, which the model writes
+    :param settings: see :class:`ModelSettings`
+    :param transfer: where to get instances for pairs that are not known
+    """
+
+    def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
+        self.mdp = mdp
+        self.grid = mdp.grid
+        self.n_actions = mdp.n_actions
+        self.settings = settings
+        self.transfer = transfer
+        self.exploration_threshold = float(settings.exploration_threshold)
+        self.instances = Instances.empty(self.n_actions, self.grid.n_variables)
+        n_pairs = self.n_actions * self.grid.n_points
+        # Weight of each pair's own instances, and whether it has reached the threshold.
+        self.own_weight = np.zeros(n_pairs)
+        self.known = np.zeros(n_pairs, dtype=np.bool_)
+        self._oldest = np.zeros(self.n_actions, dtype=np.int64)
+
+    @abstractmethod
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
+        """
+        Predict from the target's own instances.
+
+        :param states: shape (n, n_variables)
+        :param actions: int64, shape (n,)
+        """
+
+    @property
+    def n_instances(self) -> int:
+        """Number of instances, of all actions."""
+        return int(self.instances.size.sum())
+
+    def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
+        """
+        Add one transition.
+
+        :param state: shape (n_variables,)
+        :param next_state: the same
+        :param terminated: the episode ended in a terminal state; a time limit is none
+        :return: pairs whose rows are to be updated, int64; by default all of the action
+        """
+        slot = int(self.instances.size[action])
+        if self.settings.max_instances is not None and slot >= self.settings.max_instances:
+            slot = int(self._oldest[action])
+            self._oldest[action] = (slot + 1) % self.settings.max_instances
+        else:
+            self.instances = self.instances.with_room(action)
+        put_instance_at.call(self.instances, (action, slot, state, next_state, reward, terminated))
+        return np.arange(action * self.grid.n_points, (action + 1) * self.grid.n_points)
+
+    def update_rows(self, pairs: np.ndarray) -> None:
+        """
+        Bring the rows of the finite MDP up to date with the instances and with what is transferred.
+
+        :param pairs: int64, at most ``MAX_PAIRS_AT_ONCE``
+        """
+        actions, points = np.divmod(pairs, self.grid.n_points)
+        predictions = self.predict(self.grid.points()[points], actions)
+        self.own_weight[pairs] = predictions.weight
+        self.known[pairs] |= predictions.weight >= self.exploration_threshold
+        modelled = self.known[pairs].copy()
+        if self.transfer is not None and not modelled.all():
+            given = self.transfer.transferred_to_sample(points, actions, predictions.weight)
+            self._check(given, predictions.weight)
+            predictions, modelled = join(predictions, given, modelled)
+        self.mdp.write_rows(pairs, modelled, predictions.probability, predictions.effect, predictions.reward)
+
+    def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
+        """
+        Predict every action at an exact state, with transferred instances where the own ones do not suffice.
+
+        :param state: shape (n_variables,)
+        :return: good until the next call; and the transferred instances that were asked for, if any
+        """
+        actions = np.arange(self.n_actions)
+        states = np.repeat(np.asarray(state, dtype=np.float64)[None], self.n_actions, axis=0)
+        predictions = self.predict(states, actions)
+        modelled, given = predictions.weight >= self.exploration_threshold, None
+        weight = predictions.weight
+        if self.transfer is not None and not modelled.all():
+            given = self.transfer.transferred(states, actions, weight)
+            self._check(given, weight)
+            predictions, modelled = join(predictions, given, modelled)
+        length = np.full(self.n_actions, predictions.probability.shape[1], dtype=np.int64)
+        arrays = map(np.ascontiguousarray, (predictions.probability, predictions.effect))
+        return Prediction(modelled, weight, predictions.reward, length, *arrays), given
+
+    def lower_threshold(self, threshold: float) -> np.ndarray:
+        """
+        Be content with less weight.
+
+        :return: the pairs that become known by that, whose rows are to be updated
+        """
+        self.exploration_threshold = threshold
+        newly_known = np.flatnonzero(~self.known & (self.own_weight >= threshold))
+        self.known[newly_known] = True
+        return newly_known
+
+    def outdated(self) -> np.ndarray:
+        """The pairs that are not known and whose own weight has changed since their rows were updated; by default none."""
+        return NO_PAIRS
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """What has been learned, float64 arrays, to be saved; their names and widths do not change."""
+        by_action = np.split(self.instances.rows(), np.cumsum(self.instances.size)[:-1])
+        # The oldest first, so that they are replaced first after loading as well.
+        rows = np.vstack([np.roll(some, -oldest, axis=0) for some, oldest in zip(by_action, self._oldest, strict=True)])
+        return {
+            "instances": np.column_stack([rows, np.ones(len(rows))]),
+            "known": self.known.astype(np.float64),
+            "total": self.own_weight.copy(),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Take over what :meth:`get_state` returned, and update all rows of the finite MDP; for a new model."""
+        self.instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1])
+        self._oldest[:] = 0
+        self.known[:] = state["known"] > 0.5
+        self.own_weight[:] = state["total"]
+        self.update_all_rows()
+
+    def update_all_rows(self) -> None:
+        """Bring all rows of the finite MDP up to date."""
+        pairs = np.arange(len(self.known))
+        for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
+            self.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
+
+    def _check(self, given: TransferredInstances, own_weight: np.ndarray) -> None:
+        threshold = self.settings.exploration_threshold
+        check_transferred(given, self.transfer, own_weight, self.grid.n_variables, threshold)
+
+
+def join(own: Predictions, given: TransferredInstances, known: np.ndarray) -> tuple[Predictions, np.ndarray]:
+    """
+    Let transferred instances join the own ones of pairs that are not known, all in proportion to their weight.
+
+    :param own: what the own instances predict
+    :param given: transferred instances, one row a pair
+    :param known: bool, shape (n,): pairs that need none
+    :return: the predictions, and which of the pairs have a model, bool, shape (n,)
+    """
+    n = len(known)
+    length = np.where(known, 0, given.length[:n])
+    used = np.arange(given.weight.shape[1]) < length[:, None]
+    weight = np.where(used, given.weight[:n], 0.0)
+    own_weight = np.where((length > 0) & (own.weight > 0.0), own.weight, length == 0)
+    total = own_weight + weight.sum(axis=1)
+    share, own_share = weight / total[:, None], own_weight / total
+    reward = own_share * own.reward + (share * np.where(used, given.reward[:n], 0.0)).sum(axis=1)
+    goes_on = np.where(used & ~given.terminated[:n], share, 0.0)
+    effect = np.where(used[:, :, None], given.effect[:n], 0.0)
+    joined = Predictions(
+        weight=own.weight,
+        reward=reward,
+        probability=np.hstack([own_share[:, None] * own.probability, goes_on]),
+        effect=np.concatenate([own.effect, effect], axis=1),
+    )
+    return joined, known | (length > 0)

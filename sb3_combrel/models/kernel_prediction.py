@@ -1,0 +1,108 @@
+"""Compiled loops of the kernel average at an exact state: which instances are near it, and what they predict."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.compiled import compiled, part
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.kernels import near_instances
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.planning.q_values import Prediction
+
+
+class NearLists(NamedTuple):
+    """The kept instances at an exact state, one row an action.
+
+    :param item: int32, shape (n_actions, list room): instances, nearest first; ``weight``: float64, same shape
+    :param length: int64, shape (n_actions,)
+    """
+
+    item: np.ndarray
+    weight: np.ndarray
+    length: np.ndarray
+
+
+@part
+def predict_own(instances, state, kernel, threshold, near, prediction):
+    """Predict every action at ``state`` from the instances that the kernel keeps there.
+
+    :param kernel: (breadth, min_weight, min_fraction)
+    :param near: receives these instances; those of the last query make the search shorter
+    :param prediction: receives the prediction; an action of less weight than ``threshold`` has none
+    :return: the least weight that an action has
+    """
+    least = np.inf
+    for action in range(len(near.length)):
+        item = near.item[action]
+        weight = near.weight[action]
+        n, total = near_instances(instances, action, state, kernel, item, weight, near.length[action])
+        near.length[action] = n
+        prediction.weight[action] = total
+        prediction.modelled[action] = total >= threshold
+        least = min(least, total)
+        prediction.reward[action] = 0.0
+        prediction.length[action] = 0
+        if total > 0.0:
+            predict_from_lists(instances, action, near, total, prediction)
+    return least
+
+
+@compiled
+def predict_own_plain(instances, state, kernel, threshold, near, prediction):
+    """:func:`predict_own` for callers from Python, with plain tuples."""
+    return predict_own(Instances(*instances), state, kernel, threshold, NearLists(*near), Prediction(*prediction))
+
+
+@part
+def predict_from_lists(instances, action, near, total, prediction):
+    """Enter what the instances in ``near`` predict of an action, all instances weighing ``total``."""
+    reward = 0.0
+    n = 0
+    for k in range(near.length[action]):
+        i = near.item[action, k]
+        p = near.weight[action, k] / total
+        reward += p * instances.reward[action, i]
+        if not instances.terminated[action, i]:
+            prediction.probability[action, n] = p
+            for v in range(instances.effect.shape[2]):
+                prediction.effect[action, n, v] = instances.effect[action, i, v]
+            n += 1
+    prediction.reward[action] = reward
+    prediction.length[action] = n
+
+
+@part
+def join_transferred(instances, near, transferred, threshold, prediction):
+    """Let transferred instances join the prediction of the actions whose own instances weigh less than ``threshold``.
+
+    :param transferred: one row an action
+    """
+    for action in range(len(near.length)):
+        n_transferred = transferred.length[action]
+        if prediction.weight[action] >= threshold or n_transferred == 0:
+            continue
+        total = prediction.weight[action]
+        for j in range(n_transferred):
+            total += transferred.weight[action, j]
+        predict_from_lists(instances, action, near, total, prediction)
+        n = prediction.length[action]
+        reward = prediction.reward[action]
+        for j in range(n_transferred):
+            p = transferred.weight[action, j] / total
+            reward += p * transferred.reward[action, j]
+            if not transferred.terminated[action, j]:
+                prediction.probability[action, n] = p
+                for v in range(transferred.effect.shape[2]):
+                    prediction.effect[action, n, v] = transferred.effect[action, j, v]
+                n += 1
+        prediction.reward[action] = reward
+        prediction.length[action] = n
+        prediction.modelled[action] = True
+
+
+@compiled
+def join_transferred_plain(instances, near, transferred, threshold, prediction):
+    """:func:`join_transferred` for callers from Python, with plain tuples."""
+    transferred = TransferredInstances(*transferred)
+    join_transferred(Instances(*instances), NearLists(*near), transferred, threshold, Prediction(*prediction))

@@ -1,0 +1,87 @@
+"""Checks of the fields of source instances; each returns an array of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def finite_array(name: str, values: object, shape: tuple[int, ...]) -> Floats:
+    """
+    States or rewards.
+
+    :param name: name of the argument
+    :param values: its value, one row an instance
+    :param shape: the shape that is right
+    :return: float64
+    :raises ValueError: if it has another shape or is not finite
+    """
+    try:
+        given = np.asarray(values)
+        # NumPy would also convert text, dates and complex numbers.
+        if given.dtype.kind not in "biufO":
+            raise TypeError(f"{given.dtype} are no numbers")
+        array = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}") from error
+    if array.shape != shape:
+        raise ValueError(f"{name} must have the shape {shape}, got {array.shape}")
+    wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
+    if wrong.size:
+        raise ValueError(f"{name} must be finite, got {array[wrong[0]]} for instance {wrong[0]}")
+    return array
+
+
+def action_array(actions: object, n: int, n_actions: int) -> NDArray[np.int64]:
+    """
+    Actions.
+
+    :param actions: one for each instance
+    :param n: number of instances
+    :param n_actions: number of actions of the task
+    :return: int64, shape (n,)
+    :raises ValueError: unless they are integers from 0 to ``n_actions - 1``
+    """
+    array = np.array(actions)
+    if array.shape != (n,) or not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"actions must be integers of shape ({n},), got {array.dtype} of shape {array.shape}")
+    if array.min() < 0 or array.max() >= n_actions:
+        raise ValueError(f"actions must lie between 0 and n_actions - 1 = {n_actions - 1}, got {array.min()} to {array.max()}")
+    return array.astype(np.int64)
+
+
+def flag_array(terminated: object, n: int) -> NDArray[np.bool_]:
+    """
+    Flags of terminal states.
+
+    :param terminated: one for each instance
+    :param n: number of instances
+    :return: bool, shape (n,)
+    :raises ValueError: if they are something else
+    """
+    array = np.array(terminated)
+    if array.shape != (n,) or array.dtype != np.bool_:
+        raise ValueError(f"terminated must be booleans of shape ({n},), got {array.dtype} of shape {array.shape}")
+    return array
+
+
+def checked_names(name: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
+    """
+    Names of variables or actions.
+
+    :param name: name of the argument
+    :param names: its value; empty for names by number
+    :param n: how many there must be
+    :param letter: first letter of names by number
+    :return: ``n`` names
+    :raises ValueError: if there is another number of them
+    """
+    if len(names) == 0:
+        return tuple(f"{letter}{i}" for i in range(n))
+    if len(names) != n:
+        raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
+    return tuple(str(each) for each in names)

@@ -1,0 +1,206 @@
+"""Source tasks and mapping sets held as one: the candidates from which instances for a target action are translated."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.instances import Instances, along_curve
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve
+from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.base import TargetTask
+
+SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances | str | os.PathLike[str]]
+MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
+
+
+class Candidate(NamedTuple):
+    """
+    What a candidate stands for.
+
+    :param target_action: number of the target action
+    :param source_action: name of the source action that it is mapped to
+    :param state_mapping: the pairs of target and source variables, as text
+    """
+
+    target_action: int
+    source_action: str
+    state_mapping: str
+
+
+class Origin(NamedTuple):
+    """
+    Where a candidate comes from.
+
+    :param source: number of the source task
+    :param target_action: number of the target action
+    :param state_index: number of the state mapping in that source's set
+    :param source_action: number of the action in that source task
+    """
+
+    source: int
+    target_action: int
+    state_index: int
+    source_action: int
+
+
+class CandidateArrays(NamedTuple):
+    """
+    The candidates of all target actions: ``first[a]`` to ``first[a + 1]`` are those of action a.
+
+    :param first: int64, shape (n_target_actions + 1,)
+    :param row: int64, shape (n_candidates,): state mapping, a row of the mapping table
+    :param action: int64, shape (n_candidates,): source action
+    """
+
+    first: np.ndarray
+    row: np.ndarray
+    action: np.ndarray
+
+
+class MappingTable(NamedTuple):
+    """
+    State mappings for compiled code, one a row.
+
+    :param variable: int64, shape (n_state_mappings, n_target_variables): source variable of each target variable, -1 for none
+    :param sign: float64, same shape: -1 where the variable is mirrored
+    """
+
+    variable: np.ndarray
+    sign: np.ndarray
+
+
+class Candidates:
+    """
+    The candidates of each target action: pairs of a state mapping and a source action.
+
+    Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The rest of a
+    mapping, the source actions of other target actions, plays no part in what is translated for an action.
+
+    :param source: instances, a path to them, or a list of several
+    :param mappings: mappings from the target to the source (see ``resolve``)
+    :param task: the target task
+    :raises ValueError: if source or mappings do not fit the target
+    """
+
+    def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask):
+        self.task = task
+        self.sources = load_sources(source)
+        self.sets = [
+            resolve(mappings, **_sizes(one, task)).with_names(
+                one.state_names, task.state_names, one.action_names, task.action_names
+            )
+            for one in self.sources
+        ]
+        self.instances = stacked_instances(self.sources)
+        self.table = stacked_table(self.sets)
+        self.origins: list[Origin] = []
+        self.arrays = self._numbered()
+
+    def _numbered(self) -> CandidateArrays:
+        """Number the candidates of every target action, over all sources."""
+        rows: list[np.ndarray] = []
+        actions: list[np.ndarray] = []
+        first = [0]
+        for a in range(self.task.n_actions):
+            row_offset = action_offset = 0
+            for number, (source, mappings) in enumerate(zip(self.sources, self.sets, strict=True)):
+                state_index, source_action = mappings.candidates(a)
+                rows.append(state_index + row_offset)
+                actions.append(source_action + action_offset)
+                self.origins += [Origin(number, a, int(s), int(u)) for s, u in zip(state_index, source_action, strict=True)]
+                row_offset += mappings.n_state_mappings
+                action_offset += source.n_actions
+            first.append(len(self.origins))
+        return CandidateArrays(
+            first=np.array(first, dtype=np.int64),
+            row=np.concatenate(rows).astype(np.int64),
+            action=np.concatenate(actions).astype(np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def find(self, action: int, mapping: InterTaskMapping) -> int:
+        """Return the candidate that a mapping to the first source amounts to for one target action."""
+        return next(
+            c
+            for c in range(self.arrays.first[action], self.arrays.first[action + 1])
+            if np.array_equal(self.table.variable[self.arrays.row[c]], mapping.state_index)
+            and np.array_equal(self.table.sign[self.arrays.row[c]], mapping.state_sign)
+            and self.arrays.action[c] == mapping.action[action]
+        )
+
+    def parts(self, candidate: int) -> Candidate:
+        """Return a candidate's parts, by name."""
+        number, action, state_index, source_action = self.origins[candidate]
+        mappings = self.sets[number]
+        whole = repr(mappings[mappings.find(state_index, action, source_action)])
+        variables = whole[whole.index("(") + 1 : whole.index(";")]
+        return Candidate(action, self.sources[number].action_names[source_action], variables)
+
+    def describe(self, candidate: int) -> str:
+        """Return target action, source action and pairs of variables of a candidate as text."""
+        parts = self.parts(candidate)
+        words = f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
+        return words if len(self.sources) == 1 else f"source {self.origins[candidate].source}: {words}"
+
+    def source_action_names(self) -> list[str]:
+        """Return the names of the source actions of all sources, each name once."""
+        return list(dict.fromkeys(name for source in self.sources for name in source.action_names))
+
+
+def load_sources(source: SourceLike) -> list[SourceInstances]:
+    """
+    Return the source instances that a user means.
+
+    :raises FileNotFoundError: if there is no file at a path
+    :raises ValueError: if it is not instances, a path, or a list of these
+    """
+    if isinstance(source, SourceInstances):
+        return [source]
+    if isinstance(source, str | os.PathLike):
+        return [SourceInstances.load(source)]
+    if isinstance(source, Sequence) and len(source) > 0:
+        return [instances for one in source for instances in load_sources(one)]
+    raise ValueError(f"source must be SourceInstances, a path to them, or a list of these, got {source!r}")
+
+
+def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
+    """
+    Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
+
+    They are sorted along a curve that fills the space, so that a search passes over most blocks.
+    """
+    n_actions = sum(source.n_actions for source in sources)
+    n_variables = max(source.n_variables for source in sources)
+    columns, offset = [], 0
+    for source in sources:
+        states = source.scaling.to_unit(source.states)
+        effects = source.scaling.to_unit(source.next_states) - states
+        order = np.argsort(along_curve(states), kind="stable")
+        padding = ((0, 0), (0, n_variables - source.n_variables))
+        rows = (source.actions + offset, np.pad(states, padding), np.pad(effects, padding), source.rewards, source.terminated)
+        columns.append([column[order] for column in rows])
+        offset += source.n_actions
+    return Instances.of_rows(n_actions, *map(np.concatenate, zip(*columns, strict=True)))
+
+
+def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:
+    """Return the state mappings of all sets, one below the other."""
+    return MappingTable(
+        variable=np.vstack([mappings.state_mappings for mappings in sets]).astype(np.int64),
+        sign=np.vstack([mappings.state_signs for mappings in sets]).astype(np.float64),
+    )
+
+
+def _sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:
+    return {
+        "n_source_variables": source.n_variables,
+        "n_target_variables": task.n_variables,
+        "n_source_actions": source.n_actions,
+        "n_target_actions": task.n_actions,
+    }

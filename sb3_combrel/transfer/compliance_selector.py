@@ -1,0 +1,285 @@
+"""COMBREL's selector: Algorithm 1, for states of the sample and for exact states."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.compliance import (
+    Bandwidths,
+    ComplianceScratch,
+    RewardCounts,
+    no_change_compliance,
+    transition_compliance,
+)
+from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose, find_nearest
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.selectors import Ranges, Selector
+
+# Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: every
+# transition changes some choices, and to plan again with each would cost more than all the rest.
+RENEWAL_GROWTH = 1.2
+NO_DRAWS = np.empty(0)
+
+
+class ComplianceSelector(Selector):
+    """
+    Selects the candidate with the highest mean compliance with the nearest recorded transitions (Algorithm 1).
+
+    The methods stand in the order of the algorithm. It computes the compliance of every transition of the first episode
+    (lines 9-13); here that of a transition is computed when a choice first needs it.
+
+    :param bandwidths: of compliance
+    :param n_neighbors: k of line 2
+    :param neighbor_radius: how far a neighbour may be, unit coordinates; None: any distance
+    :param drawn: candidates are drawn in proportion to their mean compliance, instead of line 20
+    :param online: transitions of all episodes are recorded and used at once, not those of the first after its end
+    :param max_transitions: how many are recorded
+    :param min_compliance: a candidate's mean compliance must exceed this many times that of the no-change baseline
+    """
+
+    makes_choices = True
+    needs_transitions = True
+
+    def __init__(
+        self,
+        candidates: Candidates,
+        task: TargetTask,
+        transitions: RecordedTransitions,
+        rng: np.random.Generator,
+        *,
+        bandwidths: Bandwidths,
+        n_neighbors: int,
+        neighbor_radius: float | None,
+        drawn: bool,
+        online: bool,
+        max_transitions: int,
+        min_compliance: float,
+    ):
+        super().__init__(candidates, task, transitions, rng)
+        self.bandwidths = bandwidths
+        self.n_neighbors = n_neighbors
+        self.drawn = drawn
+        self.online = online
+        self.max_transitions = max_transitions
+        self.min_compliance = min_compliance
+        # An empty place counts as a neighbour at the limit: what is farther away does not enter.
+        self.limit = np.inf if neighbor_radius is None else float(neighbor_radius) ** 2
+        self.first_episode = True
+        self.n_switches = 0
+        self._allocate()
+
+    def _allocate(self) -> None:
+        """Make the arrays: compliance of transitions, nearest transitions and choices."""
+        candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
+        n_rows, n_source_actions = len(candidates.table.variable), len(candidates.instances.size)
+        self._scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances)
+        self._table = np.empty((n_rows, n_source_actions))
+        # Where in that table the candidates of each action stand.
+        columns = candidates.arrays.row * n_source_actions + candidates.arrays.action
+        self._columns = np.split(columns, self.first[1:-1])
+        self._rewards = RewardCounts.of_instances(candidates.instances)
+        self._cache = ComplianceCache.empty(int(np.diff(self.first).max()))
+        self._listed = np.empty((n_actions, 64), dtype=np.int64)
+        self._n_listed = np.zeros(n_actions, dtype=np.int64)
+        self._near = np.full((n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
+        self._distance = np.full((n_actions, n_points, self.n_neighbors), self.limit)
+        self._choice = np.full(n_actions * n_points, -1, dtype=np.int64)
+        self._due = np.zeros((n_actions, n_points), dtype=np.bool_)
+        self._renewal_due = 0.0
+        # Nothing is asked before the first transition. To draw here would change what a loaded model draws.
+        self._draws_at = np.zeros(n_actions) if self.drawn else NO_DRAWS
+        self._make_room_at(n_actions)
+        self._transition_compliance, self._add_to_sample, self._choose, self._find_nearest = map(
+            EntryPoint, (transition_compliance, add_to_sample, choose, find_nearest)
+        )
+
+    def _make_room_at(self, n: int) -> None:
+        """Make work space for ``n`` exact states."""
+        self._near_at = np.empty((n, self.n_neighbors), dtype=np.int64)
+        self._distance_at = np.empty((n, self.n_neighbors))
+        self._choice_at = np.empty(n, dtype=np.int64)
+
+    # ------------------------------------------------- lines 6-8: record transitions of the first episode, or of all
+
+    def before_transition(self) -> None:
+        # With each transition, not with each question: a prediction asked for twice is the same, and leaves no trace.
+        self._draws_at = self._draws(self.task.n_actions)
+
+    def takes_transitions(self) -> bool:
+        return self.transitions.n < self.max_transitions and (self.first_episode or self.online)
+
+    def add_transition(self, i: int) -> None:
+        if self.online or not self.first_episode:
+            self._use(i)
+
+    def n_used(self) -> int:
+        return self.transitions.n if self.online or not self.first_episode else 0
+
+    def end_episode(self) -> bool:
+        # At an episode's end there is time to renew all choices that are due.
+        self._renewal_due = 0.0
+        ends_recording = self.first_episode and not self.online
+        if ends_recording:
+            for i in range(self.transitions.n):
+                self._use(i)
+        self.first_episode = False
+        return ends_recording
+
+    # ------------------------------------------------------------- lines 9-13: compliance of recorded transitions
+
+    def _measure(self, near: np.ndarray) -> None:
+        """Compute the compliance with every candidate of those of these transitions that have not been measured yet."""
+        near = near[near >= 0]
+        for i in set(near[~self._cache.measured[near]].tolist()):
+            effect, reward = self.transitions.effects[i], float(self.transitions.rewards[i])
+            self._transition_compliance(
+                self.transitions.states[i],
+                effect,
+                reward,
+                self.candidates.instances,
+                self.candidates.table,
+                self.bandwidths,
+                self._scratch,
+                self._table,
+            )
+            compliance = self._table.ravel()[self._columns[int(self.transitions.actions[i])]]
+            self._cache.compliance[i, : len(compliance)] = compliance
+            no_change = no_change_compliance(effect, reward, self._rewards, self.bandwidths)
+            self._cache.least[i] = self.min_compliance * no_change
+            self._cache.measured[i] = True
+
+    # --------------------------------------------- lines 15-16: for each state and action with too few data of its own
+
+    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        n = len(actions)
+        if n > len(self._choice_at):
+            self._make_room_at(2 * n)
+        near = self._find_neighbors(states, actions, own_weight)
+        self._measure(near)
+        draws = self._draws_at[actions] if self.drawn else NO_DRAWS
+        # Rows are overwritten where the choice changes, in order: never one that is still to come.
+        self._choose(np.arange(n), actions, near, self._cache, self.first, draws, self._choice_at)
+        return _range(self._choice_at[:n])
+
+    def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        return _range(self._choice[actions * len(self.task.sample_states) + points])
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        if self.transitions.n < self._renewal_due:
+            return False
+        self._renewal_due = RENEWAL_GROWTH * self.transitions.n
+        due = np.flatnonzero(self._due & ~known)
+        changed = np.zeros(known.shape, dtype=np.bool_)
+        changed.ravel()[self._renew(due)] = True
+        return changed
+
+    # ------------------------------------------------------ line 17: the k nearest recorded transitions
+
+    def _use(self, i: int) -> None:
+        """List transition ``i`` under its action, and among the nearest of sample states."""
+        self._cache = self._cache.with_room(i)
+        action = int(self.transitions.actions[i])
+        n = self._n_listed[action]
+        if n == self._listed.shape[1]:
+            self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)
+        self._listed[action, n] = i
+        self._n_listed[action] += 1
+        near, distance, due = self._near[action], self._distance[action], self._due[action]
+        self._add_to_sample(i, self.transitions.states[i], self.task.sample_states, near, distance, due)
+
+    def _find_neighbors(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> np.ndarray:
+        """Return the nearest transitions of exact states, shape (n, n_neighbors)."""
+        near = self._near_at[: len(actions)]
+        self._find_nearest(
+            states,
+            actions,
+            own_weight,
+            self.task.exploration_threshold,
+            self.transitions.states,
+            self._listed,
+            self._n_listed,
+            self.limit,
+            near,
+            self._distance_at,
+        )
+        return near
+
+    # -------------------------------------- lines 19-20: mean compliance of the neighbours, and the best candidate
+
+    def _renew(self, pairs: np.ndarray) -> np.ndarray:
+        """Renew the choices of pairs of the sample; return those that changed."""
+        near = self._near.reshape(-1, self.n_neighbors)
+        self._measure(near[pairs])
+        rows, actions = pairs.copy(), pairs // len(self.task.sample_states)
+        n_changed = self._choose(rows, actions, near, self._cache, self.first, self._draws(len(pairs)), self._choice)
+        self._due.ravel()[pairs] = False
+        self.n_switches += n_changed
+        return rows[:n_changed]
+
+    def _draws(self, n: int) -> np.ndarray:
+        """Draw random numbers for so many choices, if they are drawn."""
+        return self.rng.random(n) if self.drawn else NO_DRAWS
+
+    # ------------------------------------------------------------------------------ figures, saving
+
+    def choices(self) -> np.ndarray:
+        return self._choice.copy()
+
+    def mean_compliance(self, pairs: np.ndarray) -> np.ndarray:
+        """
+        Return the mean compliance of the chosen candidate with the nearest transitions (line 19).
+
+        :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
+        :return: float64, shape (n,); NaN where nothing is chosen
+        """
+        near = self._near.reshape(-1, self.n_neighbors)[pairs]
+        self._measure(near)
+        counted = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
+        chosen = np.maximum(self._choice[pairs], 0)[:, None]
+        first = self.first[pairs // self._near.shape[1]][:, None]
+        compliance = self._cache.compliance[np.maximum(near, 0), np.maximum(chosen - first, 0)]
+        n_counted = counted.sum(axis=1)
+        total = np.where(counted, compliance, 0.0).sum(axis=1)
+        return np.where(n_counted > 0, total / np.maximum(n_counted, 1), np.nan)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        return {
+            "first_episode": np.array([float(self.first_episode)]),
+            "renewal_due": np.array([float(self._renewal_due)]),
+            "switches": np.array([float(self.n_switches)]),
+            "choice": self._choice.astype(np.float64),
+            "vote_due": self._due.ravel().astype(np.float64),
+            "draws_at": self._draws_at,
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        self.first_episode = bool(state["first_episode"][0] > 0.5)
+        for i in range(self.n_used()):
+            self._use(i)
+        first, last = self.first[:-1, None], self.first[1:, None] - 1
+        chosen = state["choice"].astype(np.int64).reshape(self.task.n_actions, -1)
+        self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
+        self._due.ravel()[:] = state["vote_due"] > 0.5
+        self._draws_at = np.clip(state["draws_at"], 0.0, 1.0)
+        self._renewal_due = float(state["renewal_due"][0])
+        self.n_switches = int(state["switches"][0])
+
+    def statistics(self) -> dict[str, float]:
+        chosen = self._choice[self._choice >= 0]
+        shares = np.bincount(chosen) / max(len(chosen), 1)
+        shares = shares[shares > 0.0]
+        return {
+            "transfer/switches": self.n_switches,
+            "transfer/choice_entropy": float(-(shares * np.log(shares)).sum()),
+            "transfer/distinct_mappings": len(shares),
+            "transfer/target_transitions": self.transitions.n,
+        }
+
+
+def _range(chosen: np.ndarray) -> Ranges:
+    """Return the range of one candidate, or of none where it is -1."""
+    first = np.maximum(chosen, 0)
+    return first, first + (chosen >= 0)

@@ -1,0 +1,337 @@
+"""Compliance, relevance and the choice of a mapping (Eqs. 1-7 and Algorithm 1 of the COMBREL paper) in plain NumPy.
+
+This is the specification: one function an equation, written to be read and compared with, not to be fast. The compiled
+code of this package computes the same.
+
+Notation and units. Index i runs over target transitions, j over source instances; t and m are their numbers, d is the
+number of target variables. States are unit coordinates (:class:`~sb3_combrel.common.scaling.StateScaling`), an *effect*
+is next state minus state in unit coordinates, rewards are raw. Actions are discrete: two transitions with different
+actions are infinitely far apart, so a target transition is compared only with the source instances whose action its own
+action is mapped to ("only to the target task instances that apply action a", Section 5.1).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+ROUNDING = 1e-12
+"""Sums of normalised weights that differ by at most this are taken for equal."""
+
+
+class Transitions(NamedTuple):
+    """Experience of one task: the tuples (s, a, r, s') of the paper, one a row.
+
+    :param state: unit coordinates of that task, shape (n, n_variables)
+    :param action: int64, shape (n,)
+    :param effect: s' - s, shape (n, n_variables)
+    :param reward: raw, shape (n,)
+    :param terminated: bool, shape (n,): whether s' is terminal (not by a time limit)
+    """
+
+    state: Floats
+    action: Ints
+    effect: Floats
+    reward: Floats
+    terminated: Bools
+
+    def with_action(self, action: int) -> "Transitions":
+        """Select the transitions with one action, in their order."""
+        rows = self.action == action
+        return Transitions(*(column[rows] for column in self))
+
+
+class Bandwidths(NamedTuple):
+    """Bandwidths delta of the kernel :func:`phi`.
+
+    :param start: delta_sa, of the distance between the states where two transitions start
+    :param outcome: delta_s', of the distance between an outcome and the predicted one
+    :param reward: delta_r, of the difference of two raw rewards
+    """
+
+    start: float
+    outcome: float
+    reward: float
+
+
+class VirtualSource(NamedTuple):
+    """Source instances of one target action, translated to the target task and seen from t target states.
+
+    :param start: where each instance starts, shape (t, m, d). It depends on the state from which it is seen: a target
+        variable mapped to None keeps the value that it has there, and so adds nothing to any distance
+    :param effect: s'_j - s_j, shape (m, d); 0 for variables mapped to None: they are predicted not to change
+    :param reward: shape (m,)
+    :param terminated: bool, shape (m,)
+    """
+
+    start: Floats
+    effect: Floats
+    reward: Floats
+    terminated: Bools
+
+
+class TransferRules(NamedTuple):
+    """When the model knows a state-action pair, and which instances count (the parameters of Table 1).
+
+    :param breadth: b, kernel breadth of transferred instances in unit coordinates
+    :param threshold: sum of weights from which on a pair is known
+    :param min_weight: an instance that weighs less does not count
+    :param min_fraction: nor does one, nearest first, with less than this fraction of the weight before it
+    """
+
+    breadth: float
+    threshold: float
+    min_weight: float
+    min_fraction: float
+
+
+def phi(x: Floats, delta: float) -> Floats:
+    """Evaluate the Gaussian kernel phi(x) = exp(-x^2 / delta) of Section 2.3.
+
+    :param x: distances, any shape
+    :param delta: bandwidth, in squared units of ``x``
+    :return: values in [0, 1], same shape
+    """
+    return np.exp(-(x**2) / delta)
+
+
+def virtual_source(source: Transitions, mapping: InterTaskMapping, action: int, states: Floats) -> VirtualSource:
+    """Translate the source instances that ``mapping`` gives to a target action (lines 4-5 of Algorithm 1).
+
+    :param source: source instances, in the source's unit coordinates
+    :param action: target action; only instances with the source action that it maps to are translated
+    :param states: target states from which the instances are seen, shape (t, d)
+    """
+    chosen = source.with_action(mapping.source_action(action))
+    return VirtualSource(
+        start=mapping.source_to_target(chosen.state, states[:, None, :]),
+        effect=mapping.displacement_to_target(chosen.effect),
+        reward=chosen.reward,
+        terminated=chosen.terminated,
+    )
+
+
+def start_distances(states: Floats, virtual: VirtualSource) -> Floats:
+    """Measure d(<s_i, a_i>, <s_j, a_j>) between transitions with the same action.
+
+    :param states: target states from which ``virtual`` is seen, shape (t, d)
+    :return: Euclidean distances over the mapped variables, shape (t, m)
+    """
+    return np.linalg.norm(states[:, None, :] - virtual.start, axis=2)
+
+
+def normalized_weights(distances: Floats, delta: float, axis: int = 1) -> Floats:
+    """Compute w_ij of Eq. 2: the kernel of the distance, normalised over the source instances j.
+
+    :param distances: of where transitions and instances start, shape (t, m)
+    :param delta: delta_sa
+    :param axis: over which the weights add up to 1: 1 for the source instances (compliance), 0 for the target
+        transitions (w_ji, relevance)
+    :return: shape (t, m); 0 where all kernels are 0 to machine precision
+    """
+    kernels = phi(distances, delta)
+    total = kernels.sum(axis=axis, keepdims=True)
+    return np.divide(kernels, total, out=np.zeros_like(kernels), where=total > 0.0)
+
+
+def transition_compliances(weights: Floats, effects: Floats, virtual: VirtualSource, delta: float) -> Floats:
+    """Compute lambda^P_ij = w_ij phi(d(s'_i, s_i + (s'_j - s_j))), Eq. 2.
+
+    The distance between the outcome and the predicted one is that between the two effects.
+
+    :param weights: w_ij, shape (t, m)
+    :param effects: s'_i - s_i of the target transitions, shape (t, d)
+    :param delta: delta_s'
+    :return: shape (t, m)
+    """
+    return weights * phi(np.linalg.norm(effects[:, None, :] - virtual.effect, axis=2), delta)
+
+
+def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource, delta: float) -> Floats:
+    """Compute lambda^R_ij = w_ij phi(|r_i - r_j|), the formula below Eq. 2.
+
+    :param weights: w_ij, shape (t, m)
+    :param rewards: r_i of the target transitions, shape (t,)
+    :param delta: delta_r
+    :return: shape (t, m)
+    """
+    return weights * phi(np.abs(rewards[:, None] - virtual.reward), delta)
+
+
+def compliance(of_transitions: Floats, of_rewards: Floats, axis: int = 1) -> Floats:
+    """Compute lambda_i = (sum_j lambda^P_ij) (sum_j lambda^R_ij), Eqs. 1, 3 and 5 without Z^P and Z^R.
+
+    Each sum is a mean weighted by w_ij, so a transition that the instances predict perfectly has 1. Z^P and Z^R are left
+    out because all mappings must share them: a common factor does not change which mapping is best. Computed for each
+    mapping on its own, they would make the sums over the whole target sample equal for all mappings, and erase the
+    difference that is to be measured.
+
+    :param of_transitions: lambda^P_ij, shape (t, m)
+    :param of_rewards: lambda^R_ij, same shape
+    :param axis: 1 to sum over source instances; 0 to sum over target transitions, for lambda_{T,sigma_j} of Eq. 7
+    :return: values in [0, 1], shape (t,), or (m,) for ``axis=0``
+    """
+    return of_transitions.sum(axis=axis) * of_rewards.sum(axis=axis)
+
+
+def sample_compliance(
+    transitions: Transitions, source: Transitions, mapping: InterTaskMapping, bandwidths: Bandwidths, min_evidence: float = 0.0
+) -> Floats:
+    """Compute the compliance of each target transition with one virtual source task (Eq. 5; lines 9-13 of Algorithm 1).
+
+    :param transitions: target sample, with any actions
+    :param source: source instances
+    :param min_evidence: a transition near which the kernels of all instances, sum_j phi(d_ij) with delta_sa, add up to
+        less has compliance 0. Without such a guard an instance far away looks as good as one near by, since weights are
+        normalised. 0 is the paper: only a sum that is 0 to machine precision, for which Eq. 2 is not defined, gives 0
+    :return: values in [0, 1], shape (t,)
+    """
+    found = np.zeros(len(transitions.reward))
+    for action in np.unique(transitions.action):
+        rows = transitions.action == action
+        states, _, effects, rewards, _ = transitions.with_action(action)
+        virtual = virtual_source(source, mapping, action, states)
+        distances = start_distances(states, virtual)
+        weights = normalized_weights(distances, bandwidths.start)
+        of_transitions = transition_compliances(weights, effects, virtual, bandwidths.outcome)
+        of_rewards = reward_compliances(weights, rewards, virtual, bandwidths.reward)
+        evidence = phi(distances, bandwidths.start).sum(axis=1)
+        found[rows] = np.where(evidence < min_evidence, 0.0, compliance(of_transitions, of_rewards))
+    return found
+
+
+def task_compliance(compliances: Floats, prior: float = 1.0) -> float:
+    """Compute Lambda_X = (1 / t) sum_i lambda_{X,i} P(S_X), the compliance of the whole target sample (Eq. 6).
+
+    :param compliances: :func:`sample_compliance` with one mapping, shape (t,), t > 0
+    :param prior: P(S_X); 1 where all mappings are equally likely, and it would be a common factor
+    """
+    return float(compliances.mean() * prior)
+
+
+def average_distance(distances: Floats, weights: Floats, mu: float) -> float:
+    """Compute d_j of Eq. 4: the mean distance from a source instance to the h_j nearest target transitions.
+
+    h_j is the largest number of transitions, nearest first (that is, largest weight first), whose weights w_ji add up to
+    less than mu: the transition with which they would reach mu does not count. Where the nearest one alone reaches mu,
+    h_j would be 0 and the mean undefined; then the nearest one counts.
+
+    :param distances: from the instance to the transitions, shape (t,), t > 0
+    :param weights: w_ji, adding up to 1 over the transitions, same shape
+    :param mu: fraction of the weight, in (0, 1]
+    :raises ValueError: if ``mu`` is outside (0, 1]
+    """
+    if not 0.0 < mu <= 1.0:
+        raise ValueError(f"mu must be above 0 and at most 1, got {mu!r}")
+    nearest_first = np.argsort(distances, kind="stable")
+    # Without the margin rounding would decide, for mu = 1, whether the farthest transition counts.
+    n_below = int(np.sum(np.cumsum(weights[nearest_first]) < mu - ROUNDING))
+    return float(distances[nearest_first[: max(n_below, 1)]].mean())
+
+
+def relevance(with_target: float, distance: float) -> float:
+    """Compute rho_j = exp(-((lambda_{T,sigma_j} - 1) / d_j)^2), Eq. 7.
+
+    :param with_target: lambda_{T,sigma_j}, 1 for an instance that agrees perfectly with the target's transitions
+    :param distance: d_j
+    :return: value in [0, 1]; for d_j = 0 the limit: 1 at perfect compliance, 0 otherwise
+    """
+    off, distance = float(with_target) - 1.0, float(distance)
+    if abs(off) <= ROUNDING or distance == 0.0:
+        return 1.0 if abs(off) <= ROUNDING else 0.0
+    return math.exp(-(off / distance) * (off / distance))
+
+
+def source_relevances(
+    source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths, mu: float
+) -> Floats:
+    """Compute the relevance of the source instances of one target action to the target sample (Eq. 7; line 21).
+
+    :param transitions: target sample; only its transitions with ``action`` count
+    :param mu: see :func:`average_distance`
+    :return: values in [0, 1], in the order of the instances of :func:`virtual_source`, shape (m,). An instance without a
+        near transition (all kernels 0 to machine precision) has 1: there is no evidence against its transfer
+    """
+    states, _, effects, rewards, _ = transitions.with_action(action)
+    virtual = virtual_source(source, mapping, action, states)
+    distances = start_distances(states, virtual)
+    weights = normalized_weights(distances, bandwidths.start, axis=0)
+    of_transitions = transition_compliances(weights, effects, virtual, bandwidths.outcome)
+    of_rewards = reward_compliances(weights, rewards, virtual, bandwidths.reward)
+    compliances = compliance(of_transitions, of_rewards, axis=0)
+    found = np.ones(len(virtual.reward))
+    for j in np.flatnonzero(weights.sum(axis=0) > 0.0):
+        found[j] = relevance(compliances[j], average_distance(distances[:, j], weights[:, j], mu))
+    return found
+
+
+def nearest_transitions(
+    state: Floats, action: int, transitions: Transitions, n_neighbors: int, action_distance: float = np.inf
+) -> Ints:
+    """Find the k target transitions nearest to a state and action (line 17 of Algorithm 1).
+
+    :param state: unit coordinates, shape (d,)
+    :param n_neighbors: k
+    :param action_distance: distance between two different actions, in unit coordinates. Infinity: only transitions with
+        the same action are neighbours, and of an action mapping only this action matters. Finite: neighbours run over
+        states and actions together, with each of them compliance depends on its own action, and so mappings that differ
+        in other actions differ here too. Table 2 needs this second reading: two mappings that agree in the action have
+        different shares there
+    :return: rows of ``transitions``, the nearest first, at most k
+    """
+    apart = np.where(transitions.action == action, 0.0, action_distance)
+    distances = np.hypot(np.linalg.norm(transitions.state - state, axis=1), apart)
+    order = np.argsort(distances, kind="stable")
+    return order[np.isfinite(distances[order])][:n_neighbors]
+
+
+def best_mapping(compliances: Floats, baseline: float = 0.0) -> int | None:
+    """Choose the mapping with the highest mean compliance (lines 19-20 of Algorithm 1).
+
+    :param compliances: of the k nearest transitions with every mapping, shape (k, n_mappings)
+    :param baseline: what the mean must exceed; 0 is the paper, but that a mapping without any evidence is not chosen
+    :return: the mapping's column, of equal ones the first; None if there is no transition, or no mean above ``baseline``
+    """
+    if not len(compliances):
+        return None
+    mean = compliances.mean(axis=0)
+    best = int(np.argmax(mean))
+    return best if mean[best] > baseline else None
+
+
+def transferred_instances(
+    state: Floats, own_weight: float, virtual: VirtualSource, rules: TransferRules, relevances: Sequence[float] | None = None
+) -> tuple[Ints, Floats]:
+    """Choose the translated instances that complete the model at a state and action (lines 16, 18, 21 and 22).
+
+    They are added in the order of their relevance or, without it, of their distance (as in TIMBREL), until their weights
+    exp(-d^2 / b^2) and the weight of the target's own instances reach the threshold. If they cannot reach it, nothing is
+    transferred, and the pair stays unknown.
+
+    :param state: unit coordinates, shape (d,)
+    :param own_weight: sum of the weights of the target's own instances there
+    :param virtual: instances seen from this state alone, ``start`` of shape (1, m, d). Those of several mappings may be
+        joined (the pool of TIMBREL)
+    :param relevances: shape (m,), or None for the order of distance. ``min_fraction`` applies to that order only: the
+        most relevant instance may be a light one, and heavier ones come after it
+    :return: numbers of the instances, in the order in which they are added, int64, and their weights, same shape
+    """
+    [weights] = phi(start_distances(state[None, :], virtual), rules.breadth**2)
+    order = np.argsort(-(weights if relevances is None else np.asarray(relevances)), kind="stable")
+    chosen: list[int] = []
+    total = own_weight
+    for j in order[weights[order] >= rules.min_weight]:
+        if total >= rules.threshold or (relevances is None and weights[j] < rules.min_fraction * total):
+            break
+        chosen.append(int(j))
+        total += weights[j]
+    numbers = np.array(chosen if total >= rules.threshold else [], dtype=np.int64)
+    return numbers, weights[numbers]

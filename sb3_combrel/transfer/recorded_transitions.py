@@ -1,0 +1,49 @@
+"""Transitions of the target task that a transfer method has recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class RecordedTransitions:
+    """
+    Transitions of the target task in growing arrays, in the order in which they were observed (unit coordinates).
+
+    :param n_variables: number of state variables of the target
+    """
+
+    def __init__(self, n_variables: int):
+        self.n = 0
+        self.states = np.empty((64, n_variables))
+        self.effects = np.empty((64, n_variables))
+        self.rewards = np.empty(64)
+        self.actions = np.empty(64, dtype=np.int64)
+
+    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> int:
+        """
+        Record one transition.
+
+        :param state: shape (n_variables,); ``effect``: next state minus state, same shape
+        :param action: target action
+        :param reward: raw
+        :return: its number
+        """
+        if self.n == len(self.rewards):
+            for name in ("states", "effects", "rewards", "actions"):
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.empty_like(old)]))
+        i = self.n
+        self.states[i], self.effects[i] = state, effect
+        self.rewards[i], self.actions[i] = reward, action
+        self.n += 1
+        return i
+
+    def of_action(self, action: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return states, effects and rewards of the transitions with one action."""
+        rows = np.flatnonzero(self.actions[: self.n] == action)
+        return self.states[rows], self.effects[rows], self.rewards[rows]
+
+    def rows(self) -> np.ndarray:
+        """Return all of them, one a row: state, effect, reward, action; shape (n, 2 * n_variables + 2)."""
+        n = self.n
+        return np.hstack([self.states[:n], self.effects[:n], self.rewards[:n, None], self.actions[:n, None]])

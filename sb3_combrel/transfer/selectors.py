@@ -1,0 +1,162 @@
+"""Selectors: which mapping's instances are translated for which state and action."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+
+Ranges = tuple[np.ndarray, np.ndarray]
+
+
+class Selector(ABC):
+    """
+    Selects, for states and actions, the range of candidates whose instances are translated.
+
+    :param candidates: the candidates of every target action
+    :param task: the target task
+    :param transitions: the recorded target transitions
+    :param rng: random number generator
+    """
+
+    #: Whether :meth:`choices` ever names a candidate.
+    makes_choices: ClassVar[bool] = False
+    #: Whether the selection depends on recorded transitions.
+    needs_transitions: ClassVar[bool] = False
+    #: Whether a range is of one candidate at most.
+    selects_one: ClassVar[bool] = True
+
+    def __init__(self, candidates: Candidates, task: TargetTask, transitions: RecordedTransitions, rng: np.random.Generator):
+        self.candidates = candidates
+        self.task = task
+        self.transitions = transitions
+        self.rng = rng
+        self.first = candidates.arrays.first
+
+    @abstractmethod
+    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        """
+        Select candidates for states and actions, without leaving a trace.
+
+        :param states: unit coordinates of the target, shape (n, n_variables)
+        :param actions: target actions, int64, shape (n,)
+        :param own_weight: weight of the target's own instances there, shape (n,)
+        :return: first candidate, and one past the last (equal: none), int64, shape (n,)
+        """
+
+    def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        """Select candidates for states of the finite sample, given by their numbers; called for learning only."""
+        return self.select(self.task.sample_states[points], actions, own_weight)
+
+    def before_transition(self) -> None:  # noqa: B027 - most have nothing to do
+        """Prepare for another transition of the target, whether it is recorded or not."""
+
+    def takes_transitions(self) -> bool:
+        """Return whether another transition is to be recorded."""
+        return True
+
+    def add_transition(self, i: int) -> None:  # noqa: B027 - most ignore it
+        """Take in that transition ``i`` was recorded."""
+
+    def n_used(self) -> int:
+        """Return how many of the recorded transitions are used; the first so many."""
+        return self.transitions.n
+
+    def end_episode(self) -> bool:
+        """
+        Take in the end of an episode.
+
+        :return: whether transitions recorded before are used from now on
+        """
+        return False
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        """Say for which states of the sample the selection differs from the last one (see ``Transfer.changed``)."""
+        return False
+
+    def choices(self) -> np.ndarray:
+        """
+        Return the candidate selected for each state-action pair of the sample.
+
+        :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
+        """
+        return np.full(self.task.n_actions * len(self.task.sample_states), -1, dtype=np.int64)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return what is to be saved besides the transitions."""
+        return {}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:  # noqa: B027 - most have none
+        """Restore what :meth:`get_state` returned; called after the transitions have been recorded again."""
+
+    def statistics(self) -> dict[str, float]:
+        """Return figures for the logger, by name."""
+        return {}
+
+
+class FixedSelector(Selector):
+    """
+    Selects one candidate for each action, the same in every state.
+
+    :param fixed: candidate of each target action, int64, shape (n_actions,)
+    """
+
+    makes_choices = True
+
+    def __init__(
+        self,
+        candidates: Candidates,
+        task: TargetTask,
+        transitions: RecordedTransitions,
+        rng: np.random.Generator,
+        fixed: np.ndarray,
+    ):
+        super().__init__(candidates, task, transitions, rng)
+        self.fixed = fixed
+
+    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        chosen = self.fixed[actions]
+        return chosen, chosen + 1
+
+    def choices(self) -> np.ndarray:
+        return np.repeat(self.fixed, len(self.task.sample_states))
+
+
+class RandomSelector(Selector):
+    """
+    Selects at random: whenever a state of the sample is asked for; elsewhere one an action until the next transition.
+
+    So a prediction that is asked for twice is the same, and draws no random numbers.
+    """
+
+    def __init__(self, candidates: Candidates, task: TargetTask, transitions: RecordedTransitions, rng: np.random.Generator):
+        super().__init__(candidates, task, transitions, rng)
+        self.before_transition()
+
+    def before_transition(self) -> None:
+        self._drawn = self._draw(np.arange(self.task.n_actions))
+
+    def _draw(self, actions: np.ndarray) -> np.ndarray:
+        return self.rng.integers(self.first[actions], self.first[actions + 1])
+
+    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        chosen = self._drawn[actions]
+        return chosen, chosen + 1
+
+    def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        chosen = self._draw(actions)
+        return chosen, chosen + 1
+
+
+class PooledSelector(Selector):
+    """Selects all candidates of an action: the instances come from one pool of all translations (Figure 3)."""
+
+    selects_one = False
+
+    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        return self.first[actions], self.first[actions + 1]

@@ -1,0 +1,177 @@
+"""The agent in plain Python on arrays: without Stable-Baselines3, without Gymnasium."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from helpers.agents import assert_same_state, make_agent
+from helpers.square import FEWEST_STEPS, METHODS, START, evaluate, learn, square_agent
+
+from sb3_combrel.fitted_rmax.loop_detection import EpisodeMemory
+
+
+@pytest.fixture(params=METHODS)
+def method(request):
+    return request.param
+
+
+# ---------------------------------------------------------------------- learning
+
+
+def test_the_agent_learns_the_shortest_plan():
+    agent = square_agent()
+    lengths = [len(actions) for actions in learn(agent, 25)]
+    assert lengths[0] > FEWEST_STEPS
+    assert lengths[-3:] == [FEWEST_STEPS] * 3
+    assert evaluate(agent) == FEWEST_STEPS
+    assert agent.q_values(START).max() == pytest.approx(-FEWEST_STEPS, abs=2.0)
+
+
+def test_transfer_from_the_task_itself_saves_the_agent_most_of_the_exploration():
+    without, transferring = (sum(map(len, learn(square_agent(method), 5))) for method in ("none", "TIMBREL"))
+    assert FEWEST_STEPS * 5 <= transferring < 0.7 * without
+
+
+@pytest.mark.integration
+def test_the_agent_and_all_that_it_needs_are_imported_without_stable_baselines3():
+    # The package's first page imports FittedRMax: an empty module with the same path takes its place.
+    code = (
+        "import importlib.util, sys, types\n"
+        "package = types.ModuleType('sb3_combrel')\n"
+        "package.__path__ = importlib.util.find_spec('sb3_combrel').submodule_search_locations\n"
+        "sys.modules |= {'sb3_combrel': package, 'stable_baselines3': None, 'torch': None}\n"
+        "import sb3_combrel.fitted_rmax.agent\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(method):
+    runs = [learn(square_agent(method, seed), 4) for seed in (0, 0, 1)]
+    assert runs[0] == runs[1] != runs[2]
+
+
+def test_an_agent_of_unknown_actions_tries_each_of_them():
+    agent = make_agent(2, 4, model_breadth=0.15, resolution=3)
+    assert {agent.act(START) for _ in range(100)} == {0, 1, 2, 3}, "ties are broken at random"
+    assert agent.act(START, explore=False) == agent.act(START, explore=False)
+    for action in (0, 1, 3):
+        agent.update(START, action, -1.0, START, False)
+    assert {agent.act(START) for _ in range(20)} == {2}, "the optimistic action comes first"
+    assert agent.sample_action(START) == 2
+    assert agent.act(START, explore=False) != 2, "and an evaluation does not try it"
+
+
+# ------------------------------------------------------------------------- state
+
+
+# Without those whose random draws or order of relevance are renewed after loading (see FittedRMax.save).
+@pytest.mark.parametrize("method", sorted(METHODS.keys() - {"TIMBREL random", "COMBREL by relevance"}))
+def test_an_agent_learns_on_from_a_restored_state_as_the_original_bit_for_bit(method):
+    agent = square_agent(method)
+    learn(agent, 4)
+    restored = square_agent(method, rng=123)
+    restored.set_state(copy.deepcopy(agent.get_state()))
+    assert_same_state(restored, agent)
+    restored.reseed(agent.rng)
+    states = np.random.default_rng(0).random((50, 2))
+    for state in states:
+        np.testing.assert_array_equal(restored.q_values(state), agent.q_values(state))
+        assert restored.act(state, explore=False) == agent.act(state, explore=False)
+    assert learn(restored, 4, episode=4) == learn(agent, 4, episode=4)
+    assert_same_state(restored, agent)
+
+
+def test_set_state_forgets_what_was_learned_since(method):
+    agent, untouched = square_agent(method), square_agent(method)
+    at_first = copy.deepcopy(agent.get_state())
+    learn(agent, 3)
+    agent.set_state(at_first)
+    assert_same_state(agent, untouched)
+    assert agent.statistics()["model/instances"] == 0
+
+
+def test_the_state_of_an_agent_is_not_the_agent_s_own_arrays(method):
+    agent = square_agent(method)
+    learn(agent, 2)
+    state = agent.get_state()
+    before = copy.deepcopy(state)
+    learn(agent, 1, episode=2)
+    for name, array in state.items():
+        np.testing.assert_array_equal(array, before[name], err_msg=name)
+        assert array.dtype == np.float64, name
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda agent: pickle.loads(pickle.dumps(agent))], ids=["copy", "pickle"])
+def test_a_copied_agent_learns_as_the_original_and_apart_from_it(method, copied):
+    agent = square_agent(method)
+    learn(agent, 2)
+    first, second = copied(agent), copied(agent)
+    before = copied(agent)
+    assert learn(first, 3, episode=2) == learn(second, 3, episode=2)
+    assert_same_state(first, second)
+    assert_same_state(agent, before)
+
+
+# ------------------------------------------------------- predictions leave no trace
+
+
+def test_predictions_in_between_change_nothing_that_is_learned_bit_for_bit(method):
+    agent, interrupted = square_agent(method), square_agent(method)
+    memory, others = EpisodeMemory(), np.random.default_rng(5)
+
+    def predict(state):
+        for at in (state, others.random(2)):
+            interrupted.act(at, explore=False)
+            interrupted.act(at, explore=False, memory=memory)
+            interrupted.sample_action(at)
+            interrupted.q_values(at)
+        interrupted.statistics()
+        interrupted.get_state()
+
+    assert learn(interrupted, 4, before_each=predict) == learn(agent, 4)
+    assert_same_state(interrupted, agent)
+    assert interrupted.rng.bit_generator.state == agent.rng.bit_generator.state
+    assert interrupted.n_backups == agent.n_backups
+    assert interrupted.statistics() == agent.statistics()
+
+
+def test_sampled_actions_are_optimistic_first_and_random_among_the_best():
+    agent = make_agent(2, 4, model_breadth=0.15, resolution=3)
+    assert {agent.sample_action(START) for _ in range(100)} == {0, 1, 2, 3}
+    agent.update(START, 2, -1.0, START, False)
+    assert {agent.sample_action(START) for _ in range(100)} == {0, 1, 3}
+
+
+# -------------------------------------------------------------------- statistics
+
+
+def test_statistics_are_those_of_model_and_planner(method):
+    agent = square_agent(method)
+    n_steps = sum(map(len, learn(agent, 3)))
+    figures = agent.statistics()
+    known, modelled = agent.model.known, agent.mdp.arrays.modelled
+    assert figures["model/instances"] == n_steps
+    assert figures["model/known"] == known.mean() > 0.0
+    assert figures["model/transferred"] == pytest.approx((modelled & ~known).mean())
+    assert figures["model/optimistic"] == pytest.approx((~modelled).mean())
+    assert figures["model/threshold"] == 1.0
+    assert figures["planner/corrections"] == len(agent.get_state()["corrections"])
+    assert figures["planner/queued"] == agent.planner.n_queued
+    assert all(np.isfinite(value) for value in figures.values())
+    of_transfer = {name for name in figures if name.startswith("transfer/")}
+    assert bool(of_transfer) == (method != "none")
+    if method != "none":
+        assert figures["transfer/instances_used"] > 0
+
+
+def test_the_time_of_planning_is_measured_on_request_only():
+    agent = square_agent()
+    learn(agent, 1)
+    assert agent.planning_seconds == 0.0
+    agent.timed = True
+    learn(agent, 1, episode=1)
+    assert agent.planning_seconds > 0.0

@@ -1,0 +1,164 @@
+"""Sets of mappings: members, look-ups against a search through all members, copies, and what they refuse."""
+
+import copy
+import pickle
+import tracemalloc
+
+import numpy as np
+import pytest
+from helpers.mappings import MOUNTAIN_CAR, mappings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel import InterTaskMapping, MappingSet
+from sb3_combrel.mappings import AllActionMappings
+
+
+def check_against_members(mapping_set, n_source_actions):
+    """Compare every look-up with a search through all members."""
+    members = list(mapping_set)
+    key = [(mapping.state, mapping.sign) for mapping in members]
+    rows = [
+        (tuple(None if i < 0 else i for i in state.tolist()), tuple(sign.tolist()))
+        for state, sign in zip(mapping_set.state_mappings, mapping_set.signs, strict=True)
+    ]
+    for a in range(mapping_set.n_target_actions):
+        expected = {(k, mapping.action[a]) for k, mapping in zip(key, members, strict=True)}
+        states, source_actions = mapping_set.candidates(a)
+        assert states.dtype == source_actions.dtype == np.int64
+        found = [(rows[s], b) for s, b in zip(states.tolist(), source_actions.tolist(), strict=True)]
+        assert len(found) == len(expected)
+        assert set(found) == expected
+        assert mapping_set.source_actions_for(a).tolist() == sorted({b for _, b in expected})
+        for s, row in enumerate(rows):
+            for b in range(n_source_actions):
+                matching = [i for i, mapping in enumerate(members) if key[i] == row and mapping.action[a] == b]
+                assert mapping_set.count(s, a, b) == len(matching)
+                if matching:
+                    assert mapping_set.find(s, a, b) == matching[0]
+                else:
+                    with pytest.raises(ValueError, match="no mapping of the set"):
+                        mapping_set.find(s, a, b)
+
+
+class TestMappingSet:
+    @pytest.mark.parametrize(
+        "mapping_set",
+        [
+            MappingSet.injective(2, 3, 2, 3),
+            MappingSet.all(1, 2, 2, 2, signs=True),
+            MappingSet.balanced(2, 2, 2, 3),
+            # Equal state mappings in several rows, as in the paper's layings.
+            MappingSet([[0, -1], [-1, 0], [0, -1]], [[0, 1], [1, 1]], signs=[[1, -1], [1, 1], [1, 1]]),
+        ],
+    )
+    def test_lookups_agree_with_a_search_through_the_members(self, mapping_set):
+        assert len(mapping_set) == len(list(mapping_set)) == mapping_set.n_state_mappings * mapping_set.n_action_mappings
+        check_against_members(mapping_set, 2)
+
+    @settings(max_examples=30, deadline=None)
+    @given(st.lists(mappings(n_source=2, n_target=2), min_size=1, max_size=8))
+    def test_a_list_holds_exactly_its_mappings_in_order(self, listed):
+        mapping_set = MappingSet.from_list(listed)
+        assert list(mapping_set) == listed
+        check_against_members(mapping_set, 3)
+
+    @settings(max_examples=30, deadline=None)
+    @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=1, max_size=8))
+    def test_pairs_choose_members_of_the_factors(self, pairs):
+        # Equal state mappings in two rows, as in the paper's sets.
+        factors = ([[0, -1], [-1, 0], [0, -1]], AllActionMappings(2, 2))
+        product, chosen = MappingSet(*factors), MappingSet(*factors, pairs=pairs)
+        assert list(chosen) == [product[4 * state + action] for state, action in pairs]
+        assert chosen.pairs.tolist() == [list(pair) for pair in pairs]
+        check_against_members(chosen, 2)
+
+    def test_sets_with_more_candidates_than_practical_are_refused(self):
+        with pytest.raises(ValueError, match="12,000,000 candidates, more than the 10,000,000 that are practical"):
+            MappingSet.injective(2, 4, 1000, 1000)
+        assert len(MappingSet([[0, 1]], AllActionMappings(1000, 1000), pairs=[[0, 5]])) == 1
+
+    def test_check_looks_at_every_mapping_of_a_large_set(self):
+        sizes = {"n_source_variables": 2, "n_target_variables": 4, "n_source_actions": 500, "n_target_actions": 500}
+        mapping_set = MappingSet.injective(**sizes)
+        mapping_set.check(**sizes)
+        for name, message in (
+            ("n_source_variables", "state must hold indices from 0 to 0"),
+            ("n_target_variables", "state must have 3 entries"),
+            ("n_source_actions", "action must hold indices from 0 to 498"),
+            ("n_target_actions", "action must have 499 entries"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                mapping_set.check(**{**sizes, name: sizes[name] - 1})
+
+    def test_members_by_number(self):
+        mapping_set = MappingSet.injective(**MOUNTAIN_CAR)
+        assert mapping_set[-1] == list(mapping_set)[2915]
+        assert mapping_set[np.int64(7)] == mapping_set[7]
+        for index in (2916, -2917):
+            with pytest.raises(IndexError, match="2916"):
+                mapping_set[index]
+
+    def test_millions_of_pairs_cost_no_memory(self):
+        tracemalloc.start()
+        mapping_set = MappingSet.injective(2, 4, 8, 8)
+        balanced = MappingSet.balanced(2, 4, 8, 16)
+        ends = mapping_set[0], mapping_set[-1], balanced[-1], next(iter(mapping_set))
+        candidates = mapping_set.candidates(3)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert len(mapping_set) == 12 * 8**8
+        assert len(balanced) == 12 * 81_729_648_000
+        assert ends[0].action == (0,) * 8
+        assert ends[1].action == (7,) * 8
+        assert ends[2].action == tuple(b for b in range(7, -1, -1) for _ in range(2))
+        assert len(candidates.state_index) == 12 * 8
+        assert peak < 1_000_000
+
+    def test_sets_that_len_cannot_count_still_have_a_size(self):
+        mapping_set = MappingSet.injective(1, 1, 10, 30)
+        assert mapping_set.n_mappings == 10**30
+        assert mapping_set[10**30 - 1].action == (9,) * 30
+        assert repr(mapping_set) == "<about 10^30 mappings: 1 state mappings x about 10^30 action mappings>"
+
+    def test_names_reach_the_members(self):
+        named = MappingSet.injective(1, 1, 1, 1).with_names(["v"], ["vx"], ["Go"], ["East"])
+        assert repr(named[0]) == "InterTaskMapping(vx<-v; East<-Go)"
+
+    def test_copies_and_pickles_are_alike(self):
+        for mapping_set in (MappingSet.balanced(**MOUNTAIN_CAR), MappingSet.from_list([InterTaskMapping((0,), (1, 0))])):
+            for copied in (copy.deepcopy(mapping_set), pickle.loads(pickle.dumps(mapping_set))):
+                assert list(copied) == list(mapping_set)
+
+    @pytest.mark.parametrize("method", ["candidates", "source_actions_for"])
+    @pytest.mark.parametrize("action", [-1, 5])
+    def test_unknown_target_actions_are_refused(self, method, action):
+        with pytest.raises(ValueError, match="action must be a target action from 0 to 4"):
+            getattr(MappingSet.injective(**MOUNTAIN_CAR), method)(action)
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (([0, 1], [[0]]), "state_mappings must be integers of shape"),
+            (([[0.5]], [[0]]), "state_mappings must be integers"),
+            (([[-1]], [[0]]), "at least one of them not -1"),
+            (([[-2, 0]], [[0]]), "-1 for None"),
+            (([[0]], [0]), "action mappings must be integers of shape"),
+            (([[0]], [[-1]]), "source actions from 0"),
+            (([[0]], [[0]], [[2]]), r"signs must be \+1 and -1"),
+            ((np.array([[2**64 - 1]], dtype=np.uint64), [[0]]), "state_mappings must hold indices up to 2147483647"),
+            (([[0], [0, 1]], [[0]]), "state_mappings must be integers of shape"),
+        ],
+    )
+    def test_wrong_factors_are_named(self, arguments, message):
+        with pytest.raises(ValueError, match=message):
+            MappingSet(*arguments)
+
+    @pytest.mark.parametrize("pairs", [[], [[0]], [[1, 0]], [[0, 2]], [[-1, 0]], [[0.5, 0]], [[0, 0, 0]]])
+    def test_wrong_pairs_are_named(self, pairs):
+        with pytest.raises(ValueError, match="pairs must be"):
+            MappingSet([[0]], [[0], [1]], pairs=pairs)
+
+    def test_a_list_of_something_else_is_refused(self):
+        with pytest.raises(ValueError, match="mappings must be InterTaskMapping objects, got 3"):
+            MappingSet.from_list([3])

@@ -1,0 +1,87 @@
+"""The state mappings of the named sets, against brute force over itertools."""
+
+import itertools
+from collections import Counter
+
+import pytest
+from helpers.mappings import MOUNTAIN_CAR, SMALL_SIZES, choices
+
+from sb3_combrel import InterTaskMapping, MappingSet
+
+
+def is_injective(state, n_source):
+    used = [i for i in state if i is not None]
+    return len(used) == len(set(used)) == min(n_source, len(state))
+
+
+def is_complete(state, n_source):
+    return len({i for i in state if i is not None}) == min(n_source, len(state))
+
+
+class TestStateMappings:
+    @pytest.mark.parametrize(("n_source", "n_target"), SMALL_SIZES)
+    @pytest.mark.parametrize(
+        ("name", "belongs"),
+        [
+            ("injective", is_injective),
+            ("all", is_complete),
+            ("surjective", lambda state, n_source: None not in state and is_complete(state, n_source)),
+        ],
+    )
+    def test_the_named_sets_have_the_members_that_their_definitions_ask_for(self, name, belongs, n_source, n_target):
+        found = MappingSet.from_name(name, n_source, n_target, 1, 1)
+        expected = [state for state in choices(n_source, n_target) if belongs(state, n_source)]
+        assert Counter(mapping.state for mapping in found) == Counter(expected)
+
+    def test_sizes_from_mountain_car_2d_to_4d(self):
+        sizes = {name: MappingSet.from_name(name, **MOUNTAIN_CAR) for name in ("injective", "surjective", "all", "balanced")}
+        factors = {name: (each.n_state_mappings, each.n_action_mappings) for name, each in sizes.items()}
+        assert factors == {"injective": (12, 243), "surjective": (14, 243), "all": (50, 243), "balanced": (12, 90)}
+
+    @pytest.mark.parametrize("name", ["injective", "surjective", "all", "balanced"])
+    def test_signed_sets_have_names_too(self, name):
+        numbers = (2, 4, 1, 2)
+        signed = MappingSet.from_name(name, *numbers, signs=True)
+        assert list(MappingSet.from_name(f"signed_{name}", *numbers)) == list(signed)
+        assert len(signed) > len(MappingSet.from_name(name, *numbers))
+
+    @pytest.mark.parametrize(("n_source", "n_target"), [(1, 3), (2, 3), (3, 2)])
+    def test_signs_add_every_mirrored_variant_once(self, n_source, n_target):
+        plain = MappingSet.all(n_source, n_target, 1, 1)
+        expected = {
+            InterTaskMapping(mapping.state, (0,), sign)
+            for mapping in plain
+            for sign in itertools.product((1, -1), repeat=n_target)
+        }
+        found = list(MappingSet.all(n_source, n_target, 1, 1, signs=True))
+        assert set(found) == expected
+        assert len(found) == len(expected)
+
+    def test_too_many_state_mappings_are_refused_before_they_are_built(self):
+        with pytest.raises(ValueError, match=r"362,880 state mappings .* practical"):
+            MappingSet.injective(9, 9, 2, 2)
+        with pytest.raises(ValueError, match="state mappings of that kind"):
+            MappingSet.all(20, 40, 2, 2, signs=True)
+        with pytest.raises(ValueError, match=r"about 10\^166 state mappings of that kind"):
+            MappingSet.surjective(50, 100, 3, 5)
+        # 2**70 choices of signs for one mapping.
+        with pytest.raises(ValueError, match=r"about 10\^21 state mappings of that kind"):
+            MappingSet.surjective(1, 70, 3, 5, signs=True)
+
+    @pytest.mark.parametrize("name", ["injective", "surjective", "all", "balanced"])
+    @pytest.mark.parametrize(
+        ("numbers", "message"),
+        [
+            ((10**6, 10**6), "n_source_variables must be a whole number from 1 to 1,000, got 1,000,000"),
+            ((1, 10**5), "n_target_variables must be a whole number from 1 to 100, got 100,000"),
+            ((2, 10**400), r"n_target_variables .*, got about 10\^400"),
+            ((float("inf"), 4), "n_source_variables .*, got inf"),
+            ((2, float("nan")), "n_target_variables .*, got nan"),
+            ((2.5, 4), "n_source_variables .*, got 2.5"),
+            ((True, 4), "n_source_variables .*, got True"),
+            (("2", 4), "n_source_variables .*, got '2'"),
+        ],
+    )
+    def test_impossible_numbers_of_variables_are_refused(self, name, numbers, message):
+        with pytest.raises(ValueError, match=message):
+            MappingSet.from_name(name, *numbers, 3, 5)

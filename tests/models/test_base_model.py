@@ -1,0 +1,204 @@
+"""The defaults of the base class of models, which need ``predict`` alone, against the kernel average and plain loops."""
+
+import numpy as np
+import pytest
+from helpers.kernel_models import (
+    GRIDS,
+    KERNELS,
+    N_ACTIONS,
+    assert_same_row,
+    learn,
+    make_model,
+    random_transitions,
+    row_of,
+)
+from helpers.naive_fitted_rmax import Instance, kept_instances
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.base import Model, Predictions, join
+from sb3_combrel.models.kernel_average import KernelAverage
+
+slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=25)
+MAX_KEPT = 60
+
+
+class NaiveKernelAverage(Model):
+    """The kernel average in plain loops, from ``predict`` alone."""
+
+    def predict(self, states, actions):
+        s, n = self.settings, len(states)
+        found = Predictions(np.zeros(n), np.zeros(n), np.zeros((n, MAX_KEPT)), np.zeros((n, MAX_KEPT, self.grid.n_variables)))
+        for row, (state, action) in enumerate(zip(states, actions, strict=True)):
+            instances = [
+                Instance(row[:d], action, row[-2], row[:d] + row[d : 2 * d], bool(row[-1]))
+                for d, row in ((self.grid.n_variables, row[1:]) for row in self.rows_of(action))
+            ]
+            kept = kept_instances(state, instances, s.model_breadth, s.min_weight, s.min_fraction)
+            total = sum(w for _, w in kept)
+            found.weight[row] = total
+            for k, (number, w) in enumerate(kept):
+                found.reward[row] += w / total * instances[number].reward
+                found.probability[row, k] = 0.0 if instances[number].terminated else w / total
+                found.effect[row, k] = instances[number].effect
+        return found
+
+    def rows_of(self, action):
+        rows = self.instances.rows()
+        return rows[rows[:, 0] == action]
+
+
+class SomeInstances:
+    """Transferred instances that depend on state and action alone; for some pairs there are none.
+
+    What it returns is larger than what was asked for, and full of values that must not be read.
+    """
+
+    max_instances = 4
+
+    def __init__(self, points, threshold):
+        self.points, self.threshold = points, threshold
+
+    def transferred(self, states, actions, own_weight):
+        n, d = states.shape
+        given = TransferredInstances(
+            length=np.full(n + 3, -7, dtype=np.int64),
+            weight=np.full((n + 3, self.max_instances), np.nan),
+            effect=np.full((n + 3, self.max_instances, d), np.nan),
+            reward=np.full((n + 3, self.max_instances), np.nan),
+            terminated=np.ones((n + 3, self.max_instances), dtype=np.bool_),
+        )
+        for row, (state, action) in enumerate(zip(states, actions, strict=True)):
+            rng = np.random.default_rng([*np.round(state * 1000).astype(int) % 10**6, int(action)])
+            length = given.length[row] = rng.integers(self.max_instances + 1)
+            given.weight[row, :length] = rng.random(length) + self.threshold
+            given.effect[row, :length] = rng.normal(0.0, 0.2, (length, d)) * (rng.random(length) < 0.8)[:, None]
+            given.reward[row, :length] = rng.normal(size=length)
+            given.terminated[row, :length] = rng.random(length) < 0.3
+        return given
+
+    def transferred_to_sample(self, points, actions, own_weight):
+        return self.transferred(self.points[points], actions, own_weight)
+
+
+problems = st.tuples(
+    st.sampled_from([grid for grid in GRIDS if grid not in (((3, 2), 0), ((1, 1, 1), 1))]),
+    st.sampled_from([kernel for kernel in KERNELS if kernel["min_fraction"] > 0.02]),
+    st.integers(0, 10**6),
+    st.integers(0, 25),
+    st.sampled_from([1.0, 0.9]),
+    st.booleans(),
+)
+
+
+def both(problem):
+    """The kernel average and its naive version, which have learned the same."""
+    grid, kernel, seed, n, gamma, transfers = problem
+    made = []
+    for model_class in (KernelAverage, NaiveKernelAverage):
+        model = make_model(grid, kernel, gamma, model_class=model_class)
+        if transfers:
+            model.transfer = SomeInstances(model.grid.points(), 1.0)
+        transitions = random_transitions(seed, len(grid[0]), n)
+        if model_class is NaiveKernelAverage:
+            for transition in transitions:
+                pairs = model.add(*transition)
+                np.testing.assert_array_equal(pairs, np.arange(model.grid.n_points) + transition[1] * model.grid.n_points)
+                # As update_rows would, at each step.
+                model.known[pairs] |= model.predict(model.grid.points(), np.full(len(pairs), transition[1])).weight >= 1.0
+        else:
+            learn(model, transitions)
+        model.update_all_rows()
+        made.append(model)
+    return made
+
+
+@slow_and_repeatable
+@given(problems)
+def test_rows_by_the_base_class_agree_with_those_of_the_kernel_average(problem):
+    model, naive = both(problem)
+    np.testing.assert_allclose(naive.own_weight, model.own_weight, rtol=1e-9)
+    np.testing.assert_array_equal(naive.known, model.known)
+    np.testing.assert_array_equal(naive.mdp.arrays.modelled, model.mdp.arrays.modelled)
+    np.testing.assert_array_equal(naive.mdp.arrays.n_optimistic, model.mdp.arrays.n_optimistic)
+    np.testing.assert_allclose(naive.mdp.arrays.reward, model.mdp.arrays.reward, rtol=1e-9, atol=1e-9)
+    for action in range(N_ACTIONS):
+        for point in range(model.grid.n_points):
+            assert_same_row(row_of(naive.mdp, point, action), row_of(model.mdp, point, action))
+    if problem[-1]:
+        assert (model.mdp.arrays.modelled & ~model.known).any(), "some pairs are modelled with transferred instances"
+
+
+@slow_and_repeatable
+@given(problems, st.integers(0, 10**6))
+def test_predictions_at_exact_states_by_the_base_class_agree_with_the_kernel_average(problem, seed):
+    model, naive = both(problem)
+    for state in np.random.default_rng(seed).random((4, len(problem[0][0]))):
+        (found, given), (expected, expected_given) = naive.predict_at(state), model.predict_at(state)
+        assert (given is None) == (expected_given is None)
+        np.testing.assert_array_equal(found.modelled, expected.modelled)
+        np.testing.assert_allclose(found.weight, expected.weight, rtol=1e-9)
+        for action in np.flatnonzero(found.modelled):
+            assert found.reward[action] == pytest.approx(expected.reward[action], abs=1e-9)
+            successors = [as_set(prediction, action) for prediction in (found, expected)]
+            np.testing.assert_allclose(*successors, rtol=1e-9, atol=1e-12)
+
+
+def as_set(prediction, action):
+    """Probability and effect of each successor with a probability above 0, in an order of their own."""
+    n = prediction.length[action]
+    rows = np.column_stack([prediction.probability[action, :n], prediction.effect[action, :n]])
+    rows = rows[rows[:, 0] > 0.0]
+    return rows[np.lexsort(np.round(rows.T, 9))]
+
+
+@slow_and_repeatable
+@given(st.integers(0, 10**6), st.integers(1, 3), st.integers(1, 6))
+def test_join_agrees_with_plain_loops(seed, n_variables, n):
+    rng = np.random.default_rng(seed)
+    points, actions = rng.random((n, n_variables)), rng.integers(2, size=n)
+    given = SomeInstances(points, 0.5).transferred(points, actions, np.zeros(n))
+    own_weight = rng.random(n) * (rng.random(n) < 0.7)
+    probability = rng.random((n, 3)) * (own_weight > 0.0)[:, None] / 3
+    reward = rng.normal(size=n) * (own_weight > 0.0)
+    own = Predictions(own_weight, reward, probability, rng.normal(size=(n, 3, n_variables)))
+    known = rng.random(n) < 0.3
+    joined, modelled = join(own, given, known)
+    np.testing.assert_array_equal(joined.weight, own_weight)
+    for row in range(n):
+        n_given = 0 if known[row] else int(given.length[row])
+        assert modelled[row] == (known[row] or n_given > 0)
+        total = own_weight[row] + sum(given.weight[row, :n_given])
+        own_share = own_weight[row] / total if n_given else 1.0
+        expected_reward = own_share * reward[row]
+        expected = [(own_share * p, tuple(effect)) for p, effect in zip(probability[row], own.effect[row], strict=True)]
+        for j in range(n_given):
+            share = given.weight[row, j] / total
+            expected_reward += share * given.reward[row, j]
+            if not given.terminated[row, j]:
+                expected.append((share, tuple(given.effect[row, j])))
+        assert joined.reward[row] == pytest.approx(expected_reward, abs=1e-12)
+        found = [(p, tuple(effect)) for p, effect in zip(joined.probability[row], joined.effect[row], strict=True) if p > 0.0]
+        expected = [(p, effect) for p, effect in expected if p > 0.0]
+        assert [effect for _, effect in found] == [effect for _, effect in expected]
+        np.testing.assert_allclose([p for p, _ in found], [p for p, _ in expected], rtol=1e-12)
+
+
+class TooLong(SomeInstances):
+    """Returns lengths beyond the room for instances."""
+
+    def transferred(self, states, actions, own_weight):
+        given = super().transferred(states, actions, own_weight)
+        given.length[:] = self.max_instances + 1
+        return given
+
+
+@pytest.mark.parametrize("model_class", [KernelAverage, NaiveKernelAverage])
+def test_a_model_refuses_transferred_instances_that_break_the_contract(model_class):
+    model = make_model(GRIDS[1], KERNELS[0], model_class=model_class)
+    model.transfer = TooLong(model.grid.points(), 1.0)
+    with pytest.raises(ValueError, match="TooLong returned length=5 for row 0"):
+        model.update_rows(np.arange(3))
+    with pytest.raises(ValueError, match="TooLong returned length=5 for row 0"):
+        model.predict_at(np.array([0.3]))

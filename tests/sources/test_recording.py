@@ -1,0 +1,171 @@
+"""Recording source instances with a behaviour, and while an SB3 algorithm learns."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from helpers.sources import Corridor, assert_same, check_corridor
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_combrel import SourceInstances
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.sources.source_recorder import SourceRecorder
+from sb3_combrel.sources.transitions import TransitionLog
+
+
+class TestRecord:
+    def test_random_actions_are_recorded_with_terminal_and_cut_off_transitions(self):
+        source = SourceInstances.record(None, Corridor(), n_instances=300, seed=1)
+        assert len(source) == 300
+        check_corridor(source)
+        assert source.terminated.any()
+        # Cut off at the limit: neither terminal nor joined to the first state of the next episode.
+        assert ((source.next_states[:, 1] == 6) & ~source.terminated).any()
+        assert source.state_names == ("place", "time")
+        assert source.action_names == ("back", "forth")
+        assert set(source.actions.tolist()) == {0, 1}
+
+    def test_the_seed_decides_everything(self):
+        one, same, other = (SourceInstances.record(None, "MountainCar-v0", 30, seed=seed) for seed in (0, 0, 1))
+        assert_same(one, same)
+        assert not np.array_equal(one.states, other.states)
+        assert one.origin["env"] == "MountainCar-v0"
+        assert one.origin["recorder"] == "random actions"
+        assert one.origin["seed"] == 0
+
+    def test_a_function_of_the_state_is_recorded(self):
+        source = SourceInstances.record(lambda state: 0 if state[0] < 0.6 else -1, Corridor(), 50, seed=0)
+        check_corridor(source)
+        np.testing.assert_array_equal(source.actions, np.where(source.states[:, 0] < 0.6, 1, 0))
+
+    @pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+    def test_vectorised_environments_are_recorded_and_left_open(self, vec_env):
+        env = vec_env([lambda: Monitor(Corridor()), lambda: Monitor(Corridor(limit=4)), lambda: Monitor(Corridor())])
+        try:
+            source = SourceInstances.record(None, env, 100, seed=0)
+            # It is the user's environment: still open.
+            env.reset()
+        finally:
+            env.close()
+        assert len(source) == 100
+        check_corridor(source)
+        assert source.terminated.any()
+        assert source.action_names == ("back", "forth")
+
+    def test_an_sb3_model_is_recorded_without_a_trace_on_global_generators(self):
+        model = DQN("MlpPolicy", "MountainCar-v0", seed=0, exploration_initial_eps=0.5)
+        np.random.seed(5)
+        th.manual_seed(5)
+        before = np.random.get_state()[1].copy(), th.get_rng_state()
+        one = SourceInstances.record(model, "MountainCar-v0", 250, seed=3)
+        assert np.array_equal(before[0], np.random.get_state()[1])
+        assert th.equal(before[1], th.get_rng_state())
+        assert_same(one, SourceInstances.record(model, "MountainCar-v0", 250, seed=3))
+        # 200 steps make an episode: the cut-off is no terminal state, and the next episode begins anew.
+        assert not one.terminated.any()
+        assert (one.next_states[:199] == one.states[1:200]).all()
+        assert (one.next_states[199] != one.states[200]).any()
+        greedy = SourceInstances.record(model, "MountainCar-v0", 50, seed=3, deterministic=True)
+        np.testing.assert_array_equal(greedy.actions, model.predict(greedy.states.astype(np.float32), deterministic=True)[0])
+        assert greedy.origin["recorder"] == "DQN"
+
+    def test_normalised_environments_give_original_states_and_rewards(self):
+        env = VecNormalize(DummyVecEnv([Corridor]))
+        model = SeesNormalised(env)
+        source = SourceInstances.record(model, env, 200, seed=0)
+        check_corridor(source)
+        assert model.saw_negative
+
+    def test_unbounded_spaces_need_bounds(self):
+        with pytest.raises(ValueError, match="bounds"):
+            SourceInstances.record(None, "CartPole-v1", 10)
+        source = SourceInstances.record(None, "CartPole-v1", 60, seed=0, bounds=(-5, 5))
+        assert source.low.tolist() == [-5] * 4
+        assert source.terminated.any()
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ((None, "Pendulum-v1"), "action space must be Discrete"),
+            ((None, "FrozenLake-v1"), "must be a one-dimensional Box"),
+            ((None, "MountainCar-v0", 0), "n_instances must be a whole number .*, got 0"),
+            (("ppo", "MountainCar-v0"), "model must be an SB3 model or policy, .* got 'ppo'"),
+        ],
+    )
+    def test_wrong_arguments_are_named(self, arguments, message):
+        with pytest.raises(ValueError, match=message):
+            SourceInstances.record(*arguments)
+
+
+class SeesNormalised:
+    """Random actions; remembers whether what it sees is normalised (the corridor's states are never negative)."""
+
+    def __init__(self, env):
+        self.action_space = env.action_space
+        self.saw_negative = False
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.saw_negative |= bool((observation < 0).any())
+        return np.array([self.action_space.sample() for _ in observation]), state
+
+
+class OneAction(gym.ActionWrapper):
+    """DQN and PPO want actions from 0 on."""
+
+    action_space = spaces.Discrete(2)
+
+    def action(self, action):
+        return int(action) - 1
+
+
+class TestSourceRecorder:
+    @pytest.mark.parametrize("normalised", [False, True])
+    @pytest.mark.parametrize("algorithm", ["DQN", "PPO"])
+    def test_everything_that_is_learned_from_is_recorded(self, algorithm, normalised):
+        env = DummyVecEnv([lambda: Monitor(OneAction(Corridor())) for _ in range(2)])
+        env = VecNormalize(env) if normalised else env
+        model = PPO("MlpPolicy", env, n_steps=32, n_epochs=1, seed=0) if algorithm == "PPO" else DQN("MlpPolicy", env, seed=0)
+        recorder = SourceRecorder()
+        # The evaluation environment's steps must not be recorded.
+        evaluation = EvalCallback(Monitor(OneAction(Corridor())), eval_freq=20, verbose=0, warn=False)
+        model.learn(128, callback=[recorder, evaluation] if not normalised else recorder)
+        source = recorder.source_instances()
+        assert len(source) == 128
+        check_corridor(source)
+        assert source.terminated.any()
+        assert source.origin["recorder"] == algorithm
+        model.learn(64, callback=recorder, reset_num_timesteps=False)
+        assert len(recorder.source_instances()) == 192
+        check_corridor(recorder.source_instances())
+
+    def test_bounded_memory_keeps_a_sample_of_all(self):
+        env = DummyVecEnv([lambda: OneAction(Corridor())])
+        recorder = SourceRecorder(max_instances=20, seed=0)
+        PPO("MlpPolicy", env, n_steps=128, n_epochs=1, seed=0).learn(256, callback=recorder)
+        source = recorder.source_instances()
+        assert len(source) == len(recorder.log) == 20
+        assert source.origin["n_seen"] == 256
+        check_corridor(source)
+
+    def test_the_sample_of_a_bounded_log_is_uniform(self):
+        counts = np.zeros(30)
+        for seed in range(400):
+            log = TransitionLog(10, seed)
+            for i in range(30):
+                log.add(np.array([float(i)]), 0, 0.0, np.array([0.0]), False)
+            kept = log.transitions(StateScaling([0.0], [30.0]), 1, {}, {}).states[:, 0].astype(int)
+            counts[kept] += 1
+        # 400 draws of probability 1/3: 5 standard deviations are 47.
+        assert abs(counts - 400 / 3).max() < 47
+
+    def test_a_recorder_that_saw_nothing_says_so(self):
+        with pytest.raises(ValueError, match="nothing has been recorded"):
+            SourceRecorder().source_instances()
+
+    def test_unbounded_spaces_are_refused_at_once(self):
+        with pytest.raises(ValueError, match="bounds"):
+            PPO("MlpPolicy", "CartPole-v1").learn(100, callback=SourceRecorder())

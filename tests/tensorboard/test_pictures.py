@@ -1,0 +1,159 @@
+"""Pictures of the dashboard: when they come, and what they show."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from helpers.dashboard import METHODS, Still, events, slow_q, walker
+
+from sb3_combrel import FittedRMax
+from sb3_combrel.tensorboard.callback import DashboardCallback
+from sb3_combrel.tensorboard.history import MAX_COLUMNS, ChoiceHistory
+from sb3_combrel.tensorboard.pictures import chosen_source_actions, greedy_actions, state_mapping_shares
+from sb3_combrel.tensorboard.plane import numbered, plane_through
+from sb3_combrel.tensorboard.readings import action_values
+
+
+def test_pictures_come_at_the_asked_steps_and_at_the_end(transfers, tmp_path):
+    walker(tmp_path, transfers["COMBREL"]).learn(250, DashboardCallback(picture_freq=100), log_interval=1)
+    found = events(tmp_path / "FittedRMax_1")
+    for tag in ("value_and_policy/place_height", "source_action/place_height", "state_mappings/chosen"):
+        assert [image.step for image in found.Images(tag)] == [100, 200, 250]
+    assert [text.step for text in found.Tensors("transfer/most_chosen_mappings/text_summary")] == [100, 200, 250]
+    assert all(image.width > 300 and image.encoded_image_string.startswith(b"\x89PNG") for image in found.Images(tag))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_its_pictures(method, transfers, tmp_path):
+    walker(tmp_path, transfers[method]).learn(120, DashboardCallback(), log_interval=1)
+    found = events(tmp_path / "FittedRMax_1")
+    of_choice = ["source_action/place_height", "state_mappings/chosen"] if method in ("TIMBREL", "COMBREL") else []
+    assert sorted(found.Tags()["images"]) == sorted(["value_and_policy/place_height", *of_choice])
+    assert ("transfer/most_chosen_mappings/text_summary" in found.Tags()["tensors"]) == (method != "none")
+
+
+def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(transfers, tmp_path, monkeypatch):
+    def slowly(self):
+        shown.append(time.perf_counter() - began)
+        time.sleep(0.05)
+
+    shown = []
+    monkeypatch.setattr(DashboardCallback, "_write_pictures", slowly)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.FIRST_PICTURES_SECONDS", 0.01)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.DEFAULT_PICTURE_FREQ", 10)
+    began = time.perf_counter()
+    walker(tmp_path, transfers["COMBREL"]).learn(3000)
+    took = time.perf_counter() - began
+    # The first set was expected to take 0.01 seconds, so it came after 0.2 seconds at the earliest.
+    assert 1 <= len(shown) <= 2 + 0.05 * took / 0.05 and shown[0] > 0.15
+
+
+def test_a_short_run_has_no_pictures_unless_they_are_asked_for(tmp_path):
+    walker(tmp_path).learn(120)
+    found = events(tmp_path / "FittedRMax_1")
+    assert not found.Tags()["images"] and "model/known" in found.Tags()["scalars"]
+
+
+@pytest.mark.integration
+def test_no_pictures_without_a_frequency(tmp_path):
+    command = (
+        "import sys; from sb3_combrel import FittedRMax; from sb3_combrel.tensorboard.callback import DashboardCallback;"
+        "model = FittedRMax('MountainCar-v0', seed=0, tensorboard_log=sys.argv[1]);"
+        "model.learn(300, DashboardCallback(picture_freq=None)); print('matplotlib' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", command, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["False"]
+    assert not events(tmp_path / "FittedRMax_1").Tags()["images"]
+
+
+def test_without_matplotlib_there_are_no_pictures_but_all_else(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.find_spec", lambda name: None)
+    walker(tmp_path).learn(150)
+    found = events(tmp_path / "FittedRMax_1")
+    assert not found.Tags()["images"] and "model/known" in found.Tags()["scalars"]
+    with pytest.raises(ModuleNotFoundError, match="matplotlib"):
+        walker(tmp_path).learn(10, DashboardCallback())
+
+
+def test_without_logs_of_the_algorithm_there_are_pictures_all_the_same(tmp_path):
+    walker(tmp_path).learn(100, DashboardCallback(), log_interval=None)
+    found = events(tmp_path / "FittedRMax_1")
+    assert not found.Tags()["scalars"] and found.Tags()["images"]
+
+
+def test_the_greedy_action_is_the_best_of_the_model():
+    agent = walker().learn(400).agent
+    points = np.arange(agent.grid.n_points)
+    q = action_values(agent, points)
+    greedy = greedy_actions(agent, points)
+    for point in points:
+        slow = [slow_q(agent, point, action) for action in range(2)]
+        assert q[:, point] == pytest.approx([np.nan if value is None else value for value in slow], nan_ok=True)
+        assert greedy[point] == (-1 if None in slow else int(np.argmax(slow)))
+    assert {-1, 0, 1} >= set(greedy) and (greedy >= 0).any()
+
+
+def test_the_plane_goes_through_the_asked_state():
+    agent = walker().agent
+    grid, scaling = agent.grid, agent.task.scaling
+    states = scaling.to_raw(grid.points())
+    plane = plane_through(grid, scaling, agent.task.state_names, (0, 1))
+    assert plane.points.shape == (9, 9) and plane.names == ("place", "height") and plane.held == ""
+    assert states[plane.points[0, 0]] == pytest.approx([-1.0, 0.0])
+    assert states[plane.points[0, -1]] == pytest.approx([1.0, 0.0])
+    assert states[plane.points[-1, 0]] == pytest.approx([-1.0, 2.0])
+    assert plane.extent == pytest.approx((-1.125, 1.125, -0.125, 2.125))
+
+
+def test_other_variables_are_held_at_the_nearest_grid_points():
+    low, high = np.float32([0, 0, -1]), np.float32([1, 10, 1])
+    agent = FittedRMax(Still(low, high), model_breadth=0.3, resolution=2).agent
+    plane = plane_through(agent.grid, agent.task.scaling, ("a", "b", "c"), (2, 0), at=[0.5, 7.0, 0.3])
+    states = agent.task.scaling.to_raw(agent.grid.points())[plane.points]
+    assert np.all(states[..., 1] == 7.5) and plane.held == "b = 7.5"
+    assert np.all(np.diff(states[..., 2], axis=1) > 0) and np.all(np.diff(states[..., 0], axis=0) > 0)
+
+
+def test_a_task_with_one_variable_has_pictures_too(tmp_path):
+    FittedRMax(Still(np.float32([0]), np.float32([1])), seed=0, tensorboard_log=str(tmp_path)).learn(50, DashboardCallback())
+    assert events(tmp_path / "FittedRMax_1").Tags()["images"] == ["value_and_policy/s0"]
+
+
+def test_the_first_two_variables_are_drawn_by_default():
+    assert numbered(None, ("a", "b", "c")) == [(0, 1)] and numbered(None, ("a",)) == [(0, 0)]
+
+
+def test_source_actions_are_those_of_the_chosen_mappings(transfers):
+    agent = walker(transfer=transfers["COMBREL"]).learn(200).agent
+    points = np.arange(agent.grid.n_points)
+    names, numbers = chosen_source_actions(agent.transfer, points, 2)
+    assert names == ["back", "forth"]
+    for action in range(2):
+        for point in points:
+            candidate = agent.transfer.choices()[action * len(points) + point]
+            description = agent.transfer.describe(candidate) if candidate >= 0 else ""
+            expected = -1 if candidate < 0 else names.index(description.split("<-")[1].split(" ")[0])
+            assert numbers[action, point] == expected
+
+
+def test_shares_of_state_mappings_add_up(transfers):
+    transfer = walker(transfer=transfers["COMBREL"]).learn(200).policy.transfer
+    history = ChoiceHistory()
+    history.note(0, np.full(9, -1))
+    history.note(100, transfer.choices())
+    names, shares = state_mapping_shares(history, transfer)
+    assert shares[:, 0].sum() == 0.0 and shares[:, 1].sum() == pytest.approx(1.0)
+    assert len(set(names)) == len(names) == len(shares)
+    chosen = [transfer.candidate(c).state_mapping for c in transfer.choices() if c >= 0]
+    assert shares[:, 1] == pytest.approx([chosen.count(name) / len(chosen) for name in names])
+
+
+def test_history_stays_small_and_spread_over_the_run():
+    history = ChoiceHistory()
+    for step in range(5 * MAX_COLUMNS):
+        history.note(step, np.array([0]))
+    assert len(history.steps) < MAX_COLUMNS
+    assert history.steps[0] == 0 and history.steps[-1] > 4.9 * MAX_COLUMNS
+    assert len(set(np.diff(history.steps))) == 1

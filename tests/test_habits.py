@@ -1,0 +1,82 @@
+"""Versions and commands are stated in several files, which must agree: pins, pre-commit, the workflow, the Makefile."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MAKEFILE = (ROOT / "Makefile").read_text()
+PRE_COMMIT = (ROOT / ".pre-commit-config.yaml").read_text()
+WORKFLOW = (ROOT / ".github/workflows/ci.yml").read_text()
+
+
+def pins_of(text):
+    """Versions by package name, lower case, of all that a text pins."""
+    return {name.lower(): version for name, version in re.findall(r"([\w.-]+)==([\w.]+)", re.sub(r"#.*", "", text))}
+
+
+PINS = pins_of((ROOT / "constraints.txt").read_text())
+OLDEST = pins_of((ROOT / "constraints-oldest.txt").read_text())
+
+
+def bounds_of(package):
+    """Lowest version allowed and the first that is not, as pyproject.toml states them."""
+    [requirement] = [line for line in PROJECT["project"]["dependencies"] if re.match(rf"{package}\b", line)]
+    lowest, highest = re.search(r">=([\d.]+)", requirement), re.search(r"<([\d.]+)", requirement)
+    return as_numbers(lowest[1]), as_numbers(highest[1])
+
+
+def as_numbers(version):
+    return tuple(map(int, version.split(".")))
+
+
+def test_pre_commit_uses_the_versions_of_the_constraints():
+    hooks = pins_of(PRE_COMMIT)
+    assert set(hooks) == {"ruff", "black"}
+    assert hooks.items() <= PINS.items()
+
+
+def test_pre_commit_runs_the_checks_of_the_makefile():
+    assert set(re.findall(r"entry: (\w+)", PRE_COMMIT)) == {"ruff", "black", "make"}
+    assert set(re.findall(r"entry: make (\w+)", PRE_COMMIT)) == {"type", "lint"}
+
+
+def test_the_workflow_tests_the_supported_versions_of_python_with_the_script_that_runs_everywhere():
+    [matrix] = re.findall(r"python-version: \[(.+)\]", WORKFLOW)
+    classifiers = [re.search(r":: (3\.\d+)$", line) for line in PROJECT["project"]["classifiers"]]
+    assert re.findall(r"[\d.]+", matrix) == [found[1] for found in classifiers if found]
+    assert "run: .ci/run\n" in WORKFLOW
+    assert re.findall(r"^make ([\w-]+)", (ROOT / ".ci/run").read_text(), flags=re.MULTILINE) == [
+        *("lint", "type", "check-codestyle", "test"),
+    ]
+
+
+@pytest.mark.parametrize("file", [".ci/run", ".github/workflows/ci.yml", ".pre-commit-config.yaml", "CONTRIBUTING.md"])
+def test_the_make_targets_named_in_other_files_exist(file):
+    rules = "\n".join(re.findall(r"^([\w -]+):", MAKEFILE, flags=re.MULTILINE)).split()
+    named = set(re.findall(r"(?:^|[`\s])make ([a-z][a-z-]+)", (ROOT / file).read_text()))
+    assert named - {"sure"} <= set(rules)
+
+
+@pytest.mark.parametrize("package", ["numba", "numpy"])
+def test_the_pinned_version_is_allowed_and_the_oldest_one_tested_is_the_oldest_allowed(package):
+    lowest, above = bounds_of(package)
+    assert lowest <= as_numbers(PINS[package]) < above
+    assert as_numbers(OLDEST[package])[: len(lowest)] == lowest
+
+
+def test_the_newest_numba_allowed_is_the_pinned_one():
+    """A new minor version of Numba is tried, and pinned, before it is allowed."""
+    _, above = bounds_of("numba")
+    assert as_numbers(PINS["numba"])[:2] == (above[0], above[1] - 1)
+
+
+def test_every_layer_of_the_import_contracts_exists_and_every_package_is_a_layer():
+    [layers] = [contract for contract in PROJECT["tool"]["importlinter"]["contracts"] if contract["type"] == "layers"]
+    on_disk = {
+        path.stem for path in (ROOT / "sb3_combrel").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert set(layers["layers"]) | set(layers["exhaustive_ignores"]) == on_disk - {"__init__"}

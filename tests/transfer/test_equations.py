@@ -1,0 +1,292 @@
+"""Eqs. 1-7 in NumPy: against plain loops, against the compiled code, and their properties."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from helpers import naive_transfer as naive
+from helpers.equation_problems import as_sample, as_transitions, problem
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.transfer import compliance as compiled_compliance
+from sb3_combrel.transfer import equations
+from sb3_combrel.transfer import relevance as compiled_relevance
+from sb3_combrel.transfer.equations import Bandwidths, Transitions
+from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
+
+seeds = st.integers(0, 2**32 - 1)
+sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))
+some_bandwidths = st.builds(Bandwidths, start=st.floats(0.003, 0.5), outcome=st.floats(0.002, 0.5), reward=st.floats(0.1, 5.0))
+some_mus = st.floats(0.02, 1.0)
+
+
+def compiled_tables(sample, source, mappings, bandwidths):
+    """Compiled compliance, shape (n_transitions, n_state_mappings, n_source_actions)."""
+    instances, table = stacked_instances([source]), stacked_table([mappings])
+    tables = np.full((len(sample.reward), len(table.variable), len(instances.size)), np.nan)
+    scratch = compiled_compliance.ComplianceScratch.for_mappings(table, instances)
+    compiled_compliance.compliance_table(
+        sample.state, sample.effect, sample.reward, instances, table, bandwidths, scratch, tables
+    )
+    return tables
+
+
+def compiled_table_of_one(sample, i, source, mappings, bandwidths):
+    """Compiled compliance of one transition, shape (n_state_mappings, n_source_actions)."""
+    instances, table = stacked_instances([source]), stacked_table([mappings])
+    found = np.full((len(table.variable), len(instances.size)), np.nan)
+    scratch = compiled_compliance.ComplianceScratch.for_mappings(table, instances)
+    compiled_compliance.transition_compliance(
+        sample.state[i], sample.effect[i], float(sample.reward[i]), instances, table, bandwidths, scratch, found
+    )
+    return found
+
+
+def compiled_relevances(sample, source, mapping, action, bandwidths, mu):
+    """Compiled relevance of the instances of ``mapping``'s source action for ``action``, in the source's order."""
+    instances, source_action = stacked_instances([source]), mapping.action[action]
+    of_action = sample.with_action(action)
+    found = np.full(int(instances.size.max()), np.nan)
+    compiled_relevance.relevance(
+        of_action.state,
+        of_action.effect,
+        of_action.reward,
+        instances,
+        source_action,
+        mapping.state_index,
+        mapping.state_sign,
+        bandwidths,
+        mu,
+        np.empty(len(of_action.reward)),
+        found,
+    )
+    return found[naive.places_of(source, instances)[source.actions == source_action]]
+
+
+GUARD = naive.LEAST_EVIDENCE
+"""The evidence guard of the compiled code and of the naive version."""
+
+
+def naive_average_distance(distances, weights, mu):
+    """Eq. 4 by trying every number of nearest transitions."""
+    near = sorted(zip(distances, weights, strict=True))
+    h = max((h for h in range(1, len(near) + 1) if sum(w for _, w in near[:h]) < mu - 1e-12), default=1)
+    return sum(d for d, _ in near[:h]) / h
+
+
+def naive_compliance(transition, source, mapping, bandwidths):
+    """Eqs. 2 and 5 without any guard."""
+    instances = naive.translated(source, mapping, transition.action, transition.state)
+    total = sum(naive.phi(naive.distance(transition.state, one.start), bandwidths.start) for one in instances)
+    of_transitions = of_rewards = 0.0
+    for one in instances if total > 0.0 else []:
+        weight = naive.phi(naive.distance(transition.state, one.start), bandwidths.start) / total
+        predicted = transition.state + (one.end - one.start)
+        of_transitions += weight * naive.phi(naive.distance(transition.next_state, predicted), bandwidths.outcome)
+        of_rewards += weight * naive.phi(abs(transition.reward - one.reward), bandwidths.reward)
+    return of_transitions * of_rewards
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, sizes, some_bandwidths, st.integers(1, 30), st.sampled_from([0.2, 1.0]))
+def test_compliance_is_that_of_plain_loops_with_and_without_a_guard(seed, sizes, bandwidths, n_instances, spread):
+    source, mapping, transitions = problem(seed, sizes, n_instances, spread=spread)
+    sample, instances = as_sample(transitions, sizes[1]), as_transitions(source)
+    without = [naive_compliance(t, source, mapping, bandwidths) for t in transitions]
+    guarded = [naive.compliance(t, source, mapping, bandwidths) for t in transitions]
+    found = equations.sample_compliance(sample, instances, mapping, bandwidths)
+    np.testing.assert_allclose(found, without, rtol=1e-9, atol=1e-12)
+    found = equations.sample_compliance(sample, instances, mapping, bandwidths, GUARD)
+    np.testing.assert_allclose(found, guarded, rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, sizes, some_bandwidths)
+def test_compiled_compliance_is_that_of_the_equations(seed, sizes, bandwidths):
+    source, mapping, transitions = problem(seed, sizes, n_instances=40)
+    sample, mappings = as_sample(transitions, sizes[1]), MappingSet.from_list([mapping])
+    expected = equations.sample_compliance(sample, as_transitions(source), mapping, bandwidths, GUARD)
+    tables = compiled_tables(sample, source, mappings, bandwidths)
+    found = tables[np.arange(len(transitions)), 0, np.array(mapping.action)[sample.action]]
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    last = compiled_table_of_one(sample, -1, source, mappings, bandwidths)[0, mapping.action[sample.action[-1]]]
+    assert last == pytest.approx(expected[-1], rel=1e-9, abs=1e-12)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds, some_bandwidths)
+def test_task_compliance_is_that_of_loops_and_of_the_compiled_tables(seed, bandwidths):
+    source, _, transitions = problem(seed, (2, 3, 2, 3), n_instances=60, n_transitions=5)
+    sample, mappings = as_sample(transitions, 3), MappingSet.injective(2, 3, 2, 3, signs=True)
+    tables = compiled_tables(sample, source, mappings, bandwidths)
+    for number in np.random.default_rng(seed).choice(len(mappings), 4):
+        mapping, row = mappings[int(number)], int(number) // mappings.n_action_mappings
+        compliances = equations.sample_compliance(sample, as_transitions(source), mapping, bandwidths, GUARD)
+        whole = equations.task_compliance(compliances)
+        assert whole == pytest.approx(naive.whole_compliance(transitions, source, mapping, bandwidths), rel=1e-9, abs=1e-12)
+        compiled = compiled_compliance.task_compliance(tables, sample.action, row, np.array(mapping.action))
+        assert whole == pytest.approx(compiled, rel=1e-9, abs=1e-12)
+        assert equations.task_compliance(compliances, prior=0.25) == pytest.approx(whole / 4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, sizes, some_bandwidths, st.sampled_from([0.0, 0.1, 1.0]))
+def test_compliance_is_between_0_and_1_and_does_not_depend_on_the_order_of_instances(seed, sizes, bandwidths, guard):
+    source, mapping, transitions = problem(seed, sizes)
+    sample, instances = as_sample(transitions, sizes[1]), as_transitions(source)
+    found = equations.sample_compliance(sample, instances, mapping, bandwidths, guard)
+    assert ((found >= 0.0) & (found <= 1.0 + 1e-12)).all()
+    order = np.random.default_rng(seed).permutation(len(source))
+    shuffled = Transitions(*(column[order] for column in instances))
+    again = equations.sample_compliance(sample, shuffled, mapping, bandwidths, guard)
+    np.testing.assert_allclose(again, found, rtol=1e-12, atol=1e-15)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, sizes, some_bandwidths)
+def test_more_evidence_demanded_makes_compliances_0_and_changes_no_other(seed, sizes, bandwidths):
+    source, mapping, transitions = problem(seed, sizes)
+    sample, instances = as_sample(transitions, sizes[1]), as_transitions(source)
+    paper = equations.sample_compliance(sample, instances, mapping, bandwidths)
+    kept = [equations.sample_compliance(sample, instances, mapping, bandwidths, e) for e in (0.0, 0.1, 1.0, 16.0)]
+    np.testing.assert_array_equal(kept[0], paper)
+    for less, more in pairwise(kept):
+        assert ((more == less) | (more == 0.0)).all()
+    assert not kept[-1].any(), "15 instances cannot weigh 16"
+
+
+def test_compliance_of_the_source_with_itself_is_1_where_instances_do_not_overlap():
+    """Far enough from each other, each instance is predicted by itself alone."""
+    at = np.linspace(0.0, 1.0, 5)[:, None]
+    effect = np.array([[0.1], [-0.1], [0.05], [0.0], [-0.2]])
+    instances = Transitions(at, np.array([0, 1, 0, 1, 0]), effect, np.arange(5.0), np.zeros(5, dtype=bool))
+    identity = InterTaskMapping([0], [0, 1])
+    bandwidths = Bandwidths(0.001, 0.0001, 0.1)
+    np.testing.assert_allclose(equations.sample_compliance(instances, instances, identity, bandwidths), 1.0, rtol=1e-12)
+    swapped = InterTaskMapping([0], [1, 0])
+    assert equations.sample_compliance(instances, instances, swapped, bandwidths).max() < 1e-3
+
+
+def test_compliance_with_unmapped_variables_depends_on_their_change_and_not_on_their_value():
+    source = Transitions(np.array([[0.3]]), np.array([0]), np.array([[0.1]]), np.zeros(1), np.zeros(1, dtype=bool))
+    states = np.array([[0.3, 0.0], [0.3, 0.9], [0.3, 0.9]])
+    effects = np.array([[0.1, 0.0], [0.1, 0.0], [0.1, -0.2]])
+    sample = Transitions(states, np.zeros(3, dtype=int), effects, np.zeros(3), np.zeros(3, dtype=bool))
+    found = equations.sample_compliance(sample, source, InterTaskMapping([0, None], [0]), Bandwidths(0.02, 0.04, 1.0))
+    np.testing.assert_allclose(found, [1.0, 1.0, math.exp(-1.0)], rtol=1e-12)
+
+
+neighbourhoods = st.lists(st.floats(0.0, 2.0), min_size=1, max_size=25)
+
+
+@settings(max_examples=100, deadline=None)
+@given(neighbourhoods, st.floats(0.01, 1.0), some_mus)
+@example([0.5, 0.5, 0.5], 0.1, 1.0)
+def test_average_distance_takes_the_nearest_whose_weights_stay_below_mu(distances, delta, mu):
+    distances = np.array(distances)
+    [weights] = equations.normalized_weights(distances[None, :], delta)
+    found = equations.average_distance(distances, weights, mu)
+    assert found == pytest.approx(naive_average_distance(distances, weights, mu), rel=1e-12)
+    assert distances.min() <= found + 1e-15
+    assert found <= distances.mean() + 1e-12
+    larger = equations.average_distance(distances, weights, min(1.0, 1.5 * mu))
+    assert larger >= found - 1e-12, "a larger fraction reaches at least as far"
+
+
+def test_average_distance_leaves_out_the_transition_that_crosses_mu_but_never_the_nearest():
+    distances, weights = np.array([3.0, 1.0, 2.0, 4.0]), np.array([0.2, 0.4, 0.3, 0.1])
+    for mu, expected in ((0.1, 1.0), (0.4, 1.0), (0.5, 1.0), (0.7, 1.0), (0.71, 1.5), (0.9, 1.5), (0.95, 2.0), (1.0, 2.0)):
+        assert equations.average_distance(distances, weights, mu) == pytest.approx(expected), mu
+
+
+@pytest.mark.parametrize("mu", [0.0, -0.5, 1.01, float("nan")])
+def test_average_distance_refuses_a_mu_that_is_no_fraction(mu):
+    with pytest.raises(ValueError, match="mu must be above 0 and at most 1, got"):
+        equations.average_distance(np.ones(2), np.full(2, 0.5), mu)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, sizes, some_bandwidths, st.integers(0, 20))
+def test_relevance_is_that_of_loops_and_of_compiled_code(seed, sizes, bandwidths, n_transitions):
+    """With mu below the largest weight, where it does not matter whether the transition that crosses mu is included."""
+    source, mapping, transitions = problem(seed, sizes, n_transitions=n_transitions)
+    sample, mu = as_sample(transitions, sizes[1]), 1.0 / (n_transitions + 1)
+    for action in range(sizes[3]):
+        found = equations.source_relevances(as_transitions(source), mapping, action, sample, bandwidths, mu)
+        numbers = np.flatnonzero(source.actions == mapping.action[action])
+        expected = [naive.relevance(source, j, mapping, action, transitions, bandwidths, mu) for j in numbers]
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
+        compiled = compiled_relevances(sample, source, mapping, action, bandwidths, mu)
+        np.testing.assert_allclose(found, compiled, rtol=1e-7, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.integers(1, 3), some_bandwidths, some_mus)
+def test_relevance_is_compliance_with_the_roles_of_source_and_target_exchanged(seed, d, bandwidths, mu):
+    """lambda_{T,sigma_j} is the compliance of a sample that is instance j alone, with the target as its source."""
+    source, _, transitions = problem(seed, (d, d, 1, 1))
+    instances, sample, identity = as_transitions(source), as_sample(transitions, d), InterTaskMapping(range(d), [0])
+    found = equations.source_relevances(instances, identity, 0, sample, bandwidths, mu)
+    with_target = equations.sample_compliance(instances, sample, identity, bandwidths)
+    for j, rho in enumerate(found):
+        distances = np.linalg.norm(sample.state - instances.state[j], axis=1)
+        [weights] = equations.normalized_weights(distances[None, :], bandwidths.start)
+        expected = math.exp(-(((with_target[j] - 1.0) / naive_average_distance(distances, weights, mu)) ** 2))
+        assert rho == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, sizes, some_bandwidths, some_mus)
+def test_relevance_does_not_depend_on_the_order_of_transitions(seed, sizes, bandwidths, mu):
+    source, mapping, transitions = problem(seed, sizes)
+    instances, sample = as_transitions(source), as_sample(transitions, sizes[1])
+    order = np.random.default_rng(seed).permutation(len(transitions))
+    shuffled = Transitions(*(column[order] for column in sample))
+    found = equations.source_relevances(instances, mapping, 0, sample, bandwidths, mu)
+    assert ((found >= 0.0) & (found <= 1.0)).all()
+    again = equations.source_relevances(instances, mapping, 0, shuffled, bandwidths, mu)
+    np.testing.assert_allclose(again, found, rtol=1e-6, atol=1e-12)
+
+
+def test_relevance_is_1_for_perfect_compliance_and_for_instances_without_evidence():
+    instances = Transitions(np.array([[0.2], [0.9]]), np.zeros(2, int), np.full((2, 1), 0.1), -np.ones(2), np.zeros(2, bool))
+    agrees = Transitions(np.array([[0.2], [0.9]]), np.zeros(2, int), np.full((2, 1), 0.1), -np.ones(2), np.zeros(2, bool))
+    identity, bandwidths = InterTaskMapping([0], [0]), Bandwidths(1e-4, 0.01, 1.0)
+    assert equations.source_relevances(instances, identity, 0, agrees, bandwidths, 0.5).tolist() == [1.0, 1.0]
+    nothing = agrees.with_action(1)
+    assert equations.source_relevances(instances, identity, 0, nothing, bandwidths, 0.5).tolist() == [1.0, 1.0]
+    differs = agrees._replace(state=np.array([[0.2], [0.21]]), effect=np.array([[0.5], [0.5]]))
+    contradicted, far = equations.source_relevances(instances, identity, 0, differs, bandwidths, 0.5)
+    assert contradicted < 1e-6
+    assert far == 1.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(1, 12), some_bandwidths, some_mus)
+def test_relevance_is_1_for_an_instance_that_every_transition_repeats(seed, n, bandwidths, mu):
+    """Also where rounding makes its compliance a little less than 1."""
+    rng = np.random.default_rng(seed)
+    instance = Transitions(
+        rng.random((1, 2)), np.zeros(1, int), rng.normal(size=(1, 2)), rng.normal(size=1), np.zeros(1, bool)
+    )
+    sample = Transitions(*(np.repeat(column, n, axis=0) for column in instance))
+    found = equations.source_relevances(instance, InterTaskMapping([0, 1], [0]), 0, sample, bandwidths, mu)
+    assert found.tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("with_target", "distance", "expected"),
+    [
+        (1.0, 0.0, 1.0),
+        (1.0, 0.3, 1.0),
+        (0.5, 0.0, 0.0),
+        (0.5, 1e-300, 0.0),
+        (0.0, 1.0, math.exp(-1)),
+        (0.8, 0.1, math.exp(-4)),
+    ],
+)
+def test_relevance_of_eq_7(with_target, distance, expected):
+    assert equations.relevance(with_target, distance) == pytest.approx(expected, rel=1e-12)

@@ -1,0 +1,130 @@
+"""A transfer method of a user's own, in at most 20 lines: it learns, is saved and loaded, and shown on the dashboard."""
+
+import inspect
+
+import numpy as np
+import pytest
+from helpers.asking import bound, changed_pairs, transferred_to_pairs
+from helpers.naive_transfer import target_task
+from helpers.walk import Walk, same_parameters, small
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_combrel import FittedRMax
+from sb3_combrel.common.transferred import TransferredInstances, check_transferred
+from sb3_combrel.tensorboard.callback import DashboardCallback
+from sb3_combrel.transfer.base import Transfer
+
+
+class Mine(Transfer):
+    """Predicts what the last transition with the same action did."""
+
+    def __init__(self, reward=-1.0):
+        self.reward = reward
+
+    def observe(self, state, action, reward, next_state, terminated):
+        self.effects = getattr(self, "effects", np.zeros((self.task.n_actions, self.task.n_variables)))
+        self.effects[action] = next_state - state
+
+    def transferred(self, states, actions, own_weight):
+        found = TransferredInstances.empty(len(actions), self.task.n_variables, 1)
+        if hasattr(self, "effects"):
+            found.length[:] = own_weight < self.task.exploration_threshold
+            found.weight[:], found.reward[:] = self.task.exploration_threshold, self.reward
+            found.effect[:, 0] = self.effects[actions]
+        return found
+
+
+def test_it_takes_at_most_20_lines():
+    assert len([line for line in inspect.getsource(Mine).splitlines() if line.strip()]) <= 20
+
+
+def test_by_default_it_is_asked_for_everything_after_each_transition():
+    task = target_task(np.random.default_rng(0).random((7, 2)), 3)
+    method = bound(Mine(), task)
+    assert changed_pairs(method).tolist() == list(range(21))
+    method.observe(np.zeros(2), 1, -1.0, np.array([0.1, 0.0]), False)
+    assert changed_pairs(method).tolist() == list(range(21))
+    found = transferred_to_pairs(method, np.array([0, 8, 20]), np.array([0.0, 0.5, 1.0]))
+    assert found.length.tolist() == [1, 1, 0]
+    np.testing.assert_array_equal(found.effect[:, 0], [[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]])
+    assert method.get_state() == {} and method.statistics() == {} and method.lowest_reward() == 0.0
+
+
+def test_it_learns_and_is_saved_and_loaded(tmp_path):
+    model = small(transfer=Mine(reward=-2.0)).learn(60)
+    assert model.agent.statistics()["model/transferred"] > 0.0
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert type(loaded.policy.transfer) is Mine
+    assert loaded.policy.transfer.reward == -2.0
+    assert same_parameters(model, loaded)
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.agent.model.n_instances == 80
+
+
+def test_it_is_shown_on_the_dashboard(tmp_path):
+    model = small(transfer=Mine(), tensorboard_log=str(tmp_path))
+    model.learn(100, DashboardCallback(scalar_share=1.0), tb_log_name="mine")
+    events = EventAccumulator(str(next(tmp_path.glob("mine_*"))))
+    events.Reload()
+    [*_, last] = events.Scalars("model/transferred")
+    assert last.value > 0.0
+
+
+# ------------------------------------------------------------------- the contract
+
+
+def one_row(**changes):
+    row = TransferredInstances(
+        np.ones(1, dtype=np.int64), np.ones((1, 2)), np.zeros((1, 2, 3)), np.zeros((1, 2)), np.zeros((1, 2), dtype=np.bool_)
+    )
+    return row._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (None, "Mine must return TransferredInstances, got None"),
+        (one_row(weight=[[1.0, 1.0]]), "weight of type list; it must be a C-contiguous array of float64"),
+        (one_row(weight=np.ones(2)), r"weight of shape \(2,\); it must be"),
+        (one_row(weight=np.ones((1, 2), dtype=np.float32)), "weight of type float32"),
+        (one_row(effect=np.zeros((3, 2, 1)).T), "effect of type float64; it must be a C-contiguous"),
+        (one_row(effect=np.zeros((1, 2, 2))), r"with 3 state variables it must be \(1, 2, 3\)"),
+        (one_row(length=np.zeros(0, dtype=np.int64)), r"length of shape \(0,\)"),
+        (TransferredInstances.empty(0, 3, 2), "returned 0 rows, but was asked for 1"),
+        (one_row(length=np.array([-1])), "length=-1 for row 0; it must be from 0 to 2"),
+        (one_row(length=np.array([3])), "length=3 for row 0; it must be from 0 to 2"),
+        (one_row(weight=np.array([[0.0, 1.0]])), "must be finite and above 0"),
+        (one_row(weight=np.array([[np.inf, 1.0]])), "must be finite and above 0"),
+        (one_row(weight=np.array([[np.nan, 1.0]])), "must be finite and above 0"),
+        (one_row(weight=np.full((1, 2), 1e-6)), "add up to 1e-06 for row 0, with 0.25 .* threshold of 1,"),
+        (one_row(reward=np.full((1, 2), np.nan)), "an effect or a reward that is not finite for row 0"),
+        (one_row(effect=np.full((1, 2, 3), np.inf)), "an effect or a reward that is not finite for row 0"),
+    ],
+)
+def test_whatever_breaks_the_contract_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        check_transferred(given, Mine(), np.full(1, 0.25), 3, 1.0)
+
+
+def test_whatever_keeps_the_contract_is_taken():
+    check_transferred(one_row(), Mine(), np.zeros(1), 3, 1.0)
+    check_transferred(one_row(weight=np.array([[0.75, np.nan]])), Mine(), np.full(1, 0.25), 3, 1.0)
+    check_transferred(one_row(length=np.zeros(1, dtype=np.int64), weight=np.zeros((1, 2))), Mine(), np.zeros(1), 3, 1.0)
+    check_transferred(TransferredInstances.empty(5, 3), Mine(), np.zeros(2), 3, 1.0)
+
+
+def test_a_method_that_breaks_it_at_an_exact_state_or_on_the_grid_stops_the_learning(monkeypatch):
+    def too_light(self, states, actions, own_weight):
+        n, d = states.shape
+        return TransferredInstances(
+            np.ones(n, dtype=np.int64),
+            np.full((n, 1), 1e-6),
+            np.zeros((n, 1, d)),
+            np.zeros((n, 1)),
+            np.zeros((n, 1), np.bool_),
+        )
+
+    monkeypatch.setattr(Mine, "transferred", too_light)
+    with pytest.raises(ValueError, match="Mine returned weights that add up to 1e-06"):
+        small(transfer=Mine()).learn(5)
