@@ -13,6 +13,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
 
+# Instances of a state and action by distance, at most; by relevance room is made for as many as it takes.
 MAX_TRANSFERRED = 32
 
 # Columns of the scratch arrays of the selected instances.
@@ -88,6 +89,7 @@ class TranslationScratch(NamedTuple):
     :param variable: int64, shape (n_variables,): source variables that a candidate compares with
     :param at: float64, same shape: where the state lies along each
     :param gap: float64, shape (n_blocks,): squared distances of the blocks' boxes
+    :param full: bool, shape (1,): an instance that was needed did not fit
     """
 
     number: np.ndarray
@@ -95,6 +97,7 @@ class TranslationScratch(NamedTuple):
     variable: np.ndarray
     at: np.ndarray
     gap: np.ndarray
+    full: np.ndarray
 
     @classmethod
     def empty(cls, max_instances: int, n_variables: int, n_blocks: int) -> TranslationScratch:
@@ -105,11 +108,12 @@ class TranslationScratch(NamedTuple):
             variable=np.empty(n_variables, dtype=np.int64),
             at=np.empty(n_variables),
             gap=np.empty(n_blocks),
+            full=np.zeros(1, dtype=np.bool_),
         )
 
 
 @part
-def consider(j, candidate, weight, rank, own, kept, rules, number, value):
+def consider(j, candidate, weight, rank, own, kept, rules, scratch):
     """
     Add an instance to the list of the selected, the highest rank first, and cut what is not needed any more.
 
@@ -117,8 +121,10 @@ def consider(j, candidate, weight, rank, own, kept, rules, number, value):
     ``min_fraction`` of their weight. These sums only grow, so what is cut once would be cut for ever.
 
     :param kept: how many are in the list
+    :param scratch: TranslationScratch that holds it
     :return: how many are now, and the least weight with which a further instance could enter (by weight)
     """
+    number, value = scratch.number, scratch.value
     room = len(value) - 1
     k = kept
     while k > 0 and value[k - 1, _RANK] < rank:
@@ -140,6 +146,8 @@ def consider(j, candidate, weight, rank, own, kept, rules, number, value):
         total += value[k, _WEIGHT]
         if total >= rules.threshold:
             return k + 1, value[k, _WEIGHT]
+    if kept + 1 > room:
+        scratch.full[0] = True
     return min(kept + 1, room), value[room - 1, _WEIGHT] if kept + 1 >= room else 0.0
 
 
@@ -180,7 +188,7 @@ def gather(state, source, action, variable, sign, rules, relevance, own, kept, s
             if apart <= nearest:
                 weight = np.exp(apart * scale)
                 rank = relevance[j] if rules.by_relevance else weight
-                kept, least = consider(j, candidate, weight, rank, own, kept, rules, scratch.number, scratch.value)
+                kept, least = consider(j, candidate, weight, rank, own, kept, rules, scratch)
                 if least > rules.min_weight and not rules.by_relevance:
                     nearest = np.log(least) / scale * (1 + 1e-12)
     return kept
@@ -287,10 +295,15 @@ class Translator:
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
         self._source = SourceArrays.of_instances(candidates.instances)
         self._mappings = CandidateMappings(candidates.arrays.row, candidates.arrays.action, *candidates.table)
-        n_blocks = (largest + BLOCK - 1) // BLOCK
-        self._scratch = TranslationScratch.empty(self._max_instances, task.n_variables, max(1, n_blocks))
-        self._transferred = TransferredInstances.empty(task.n_actions, task.n_variables, self._max_instances)
+        self._n_blocks = max(1, (largest + BLOCK - 1) // BLOCK)
+        self._n_variables = task.n_variables
+        self._allocate(task.n_actions)
         self._translate = EntryPoint(translate)
+
+    def _allocate(self, n: int) -> None:
+        """Make room for ``n`` states."""
+        self._scratch = TranslationScratch.empty(self._max_instances, self._n_variables, self._n_blocks)
+        self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
 
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""
@@ -308,8 +321,12 @@ class Translator:
         :return: instances, in arrays that the next call uses again
         """
         if len(own_weight) > len(self._transferred.length):
-            self._transferred = TransferredInstances.empty(2 * len(own_weight), states.shape[1], self._max_instances)
-        transferred = self._transferred
-        arrays = self._source, self._mappings, self.rules, self.relevance, self._scratch, transferred
-        self._translate(states, own_weight, first, last, *arrays)
-        return transferred
+            self._allocate(2 * len(own_weight))
+        while True:
+            work = self._scratch, self._transferred
+            self._translate(states, own_weight, first, last, self._source, self._mappings, self.rules, self.relevance, *work)
+            # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
+            if not (self.rules.by_relevance and self._scratch.full[0]):
+                return self._transferred
+            self._max_instances *= 2
+            self._allocate(len(self._transferred.length))

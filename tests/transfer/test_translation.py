@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
-from helpers.asking import transferred_to_pairs
+from helpers.asking import bound, transferred_at, transferred_to_pairs
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -172,3 +172,17 @@ def test_a_method_has_room_for_all_that_a_pair_may_need(min_fraction):
     method.bind(task, np.random.default_rng(0))
     found = transferred_to_pairs(method, np.zeros(1, dtype=int), np.zeros(1))
     assert found.length[0] == reachable
+
+
+def test_by_relevance_as_many_light_instances_are_transferred_as_it_takes():
+    """Each weighs 0.0183, so 55 of them reach the threshold; by distance the smallest fraction allows no more than ten."""
+    points = np.array([[0.5], [0.9]])
+    task = naive.target_task(points, 1, min_fraction=0.1)
+    source = row_of_instances([0.5 + 0.2] * 100)
+    method = bound(TIMBREL(source, InterTaskMapping([0], [0]), breadth=0.1, relevance=True), task)
+    for _ in range(2):
+        found = transferred_to_pairs(method, np.arange(2), np.zeros(2))
+        assert found.length[:2].tolist() == [55, 55]
+        assert found.weight[0, :55].sum() >= 1.0 > found.weight[0, :54].sum()
+    at = transferred_at(method, points[0], np.full(1, 0.5))
+    assert at.length[0] == 28
