@@ -50,7 +50,8 @@ def relevance(states, effects, rewards, source, action, index, sign, bandwidths,
 
     rho_j = exp(-((lambda_j - 1) / d_j)^2). lambda_j is the compliance of instance j with the target's transitions:
     weights normalized over these, so a perfectly compliant instance has 1. d_j is the mean distance to the nearest
-    transitions, as many as make up the fraction ``mu`` of the weight (Eq. 4). Without transitions everything is relevant.
+    transitions, as many as weigh less than the fraction ``mu`` of all together, but at least one (Eq. 4). Without
+    transitions everything is relevant.
 
     :param states: target states of one target action, unit coordinates, shape (n, n_target_variables)
     :param effects: next states minus states; ``rewards``: shape (n,)
@@ -92,19 +93,21 @@ def relevance(states, effects, rewards, source, action, index, sign, bandwidths,
 @inner
 def _mean_distance(weight, total, mu, bandwidth):
     """
-    Return d_j of Eq. 4: mean distance of the heaviest transitions that together make up ``mu`` of the weight.
+    Return d_j of Eq. 4: mean distance of the heaviest transitions whose sum stays below ``mu`` of the weight.
 
-    The weights are used up; distances are read back from them.
+    Where the first alone does not stay below, it is the only one. The weights are used up; distances are read back from
+    them. A sum that reaches ``mu`` but for rounding does not stay below.
     """
+    limit = mu * total * (1.0 - 1e-12)
     gathered = 0.0
     distance = 0.0
     n_taken = 0
-    while gathered < mu * total:
+    while n_taken < len(weight):
         best = 0
         for i in range(1, len(weight)):
             if weight[i] > weight[best]:
                 best = i
-        if weight[best] <= 0.0:
+        if weight[best] <= 0.0 or (n_taken > 0 and gathered + weight[best] >= limit):
             break
         gathered += weight[best]
         distance += np.sqrt(-bandwidth * np.log(weight[best]))

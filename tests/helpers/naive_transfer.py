@@ -155,9 +155,9 @@ def relevance(source, j, mapping, action, transitions, bandwidths, mu):
         of_rewards += weight / total * phi(abs(r - one.reward), bandwidths.reward)
     apart = []
     for weight, along, *_ in sorted(seen, key=lambda entry: -entry[0]):
-        if gathered >= mu * total:
-            break
         gathered += weight
+        if apart and gathered >= mu * total * (1.0 - 1e-12):
+            break
         apart.append(along)
     off, d = of_transitions * of_rewards - 1.0, sum(apart) / len(apart)
     return 1.0 if off == 0.0 else 0.0 if d == 0.0 else math.exp(-((off / d) ** 2))

@@ -269,3 +269,14 @@ def test_relevance_is_full_without_evidence_or_with_nothing_but_good_and_low_whe
     contradicted, far = relevances(source, 0, mapping, 0, [differs], bandwidths, 0.5)
     assert contradicted < 1e-6
     assert contradicted < far < 1.0
+
+
+@pytest.mark.parametrize(("mu", "n_counted"), [(0.05, 1), (0.55, 1), (0.75, 1), (0.85, 2), (0.97, 3), (1.0, 3)])
+def test_distances_are_averaged_while_the_weights_stay_below_mu_of_their_sum(mu, n_counted):
+    """The transition with which the sum would reach mu is not counted (Eq. 4); the nearest always is."""
+    fractions, bandwidth = np.array([0.5, 0.3, 0.15, 0.05]), 0.02
+    apart = np.sqrt(-bandwidth * np.log(fractions))
+    transitions = [naive.Transition(np.array([0.2 + x]), 0, -1.0, np.array([0.2 + x])) for x in apart]
+    [found] = relevances(line([[0.2]], [[0.1]]), 0, InterTaskMapping([0], [0]), 0, transitions, Bandwidths(bandwidth, 0.01, 1.0), mu)
+    expected = np.exp(-(((np.exp(-1.0) - 1.0) / apart[:n_counted].mean()) ** 2))
+    assert found == pytest.approx(expected, rel=1e-6)
