@@ -73,6 +73,8 @@ class MappingTransfer(Transfer):
                 raise ValueError(f"bandwidths must be three numbers (start, outcome, reward) or None, got {bandwidths!r}")
             for value in bandwidths:
                 check_positive("bandwidths", value)
+        check_boolean("transfer_terminals", transfer_terminals)
+        check_boolean("relevance", relevance)
         self.source = source
         self.mappings = mappings
         self.breadth = breadth
@@ -256,6 +258,14 @@ class MappingTransfer(Transfer):
         self._instances_used = int(state["instances_used"][0])
         if self.relevance and self._selector.n_used():
             self._renew_relevance(self._selector.n_used())
+
+
+def check_boolean(name: str, value: object) -> None:
+    """
+    :raises ValueError: unless ``value`` is True or False
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
 def __getattr__(name: str) -> Any:

@@ -116,6 +116,13 @@ BAD_ARGUMENTS = [
     ("bandwidths", (0.1, np.nan, 1.0)),
     ("bandwidths", 0.1),
     ("bandwidths", "auto"),
+    ("relevance", np.nan),
+    ("relevance", None),
+    ("relevance", "no"),
+    ("relevance", 1),
+    ("transfer_terminals", np.nan),
+    ("transfer_terminals", None),
+    ("transfer_terminals", 0.0),
 ]
 BAD_ARGUMENTS_OF_COMBREL = [
     ("min_compliance", -0.1),
