@@ -23,7 +23,10 @@ class TargetTask:
     :param scaling: raw <-> unit coordinates
     :param n_actions: number of actions
     :param sample_states: the finite sample of states that is planned with, unit coordinates, shape (n_points, n_variables)
-    :param exploration_threshold: weight that own and transferred instances of a state-action pair must reach together
+    :param exploration_threshold: weight that own and transferred instances of a state-action pair must reach together. It
+        stays as it is where the model lowers its own after many episodes that reached their time limit: with that, the
+        model no longer waits for data of the target that cannot be had, whereas a source must always bring the full
+        weight. Otherwise time limits, which are evidence against what was transferred, would extend its reach.
     :param min_weight: instances with less weight do not count
     :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
     :param state_names: names of the state variables, for display

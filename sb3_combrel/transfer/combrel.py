@@ -30,8 +30,9 @@ class COMBREL(MappingTransfer):
     :param source: source instances, a path to them, or a list of several, among which is selected as well
     :param mappings: "injective" (each source variable is mapped to by one target variable, the other target variables are
         left unmapped), "surjective", "all", "balanced", these with "signed_" before them (variables may be mirrored as
-        well), "paper_mountain_car", "paper_icub", a list of mappings or a ``MappingSet``. The paper uses sets without
-        unmapped variables, which help much less.
+        well), "paper_mountain_car", "paper_icub", a list of mappings or a ``MappingSet``. Where every target variable is
+        mapped, as in "surjective", translated instances lie on diagonals of the target's space and help much less. The
+        sets named after the paper's experiments leave two of the four target variables unmapped.
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
     :param choice: "best": the mapping with the highest mean compliance is selected, as in the paper; or "drawn": one is
         drawn, each with a probability in proportion to its mean compliance. Where many mappings comply about equally

@@ -277,6 +277,8 @@ def test_distances_are_averaged_while_the_weights_stay_below_mu_of_their_sum(mu,
     fractions, bandwidth = np.array([0.5, 0.3, 0.15, 0.05]), 0.02
     apart = np.sqrt(-bandwidth * np.log(fractions))
     transitions = [naive.Transition(np.array([0.2 + x]), 0, -1.0, np.array([0.2 + x])) for x in apart]
-    [found] = relevances(line([[0.2]], [[0.1]]), 0, InterTaskMapping([0], [0]), 0, transitions, Bandwidths(bandwidth, 0.01, 1.0), mu)
+    [found] = relevances(
+        line([[0.2]], [[0.1]]), 0, InterTaskMapping([0], [0]), 0, transitions, Bandwidths(bandwidth, 0.01, 1.0), mu
+    )
     expected = np.exp(-(((np.exp(-1.0) - 1.0) / apart[:n_counted].mean()) ** 2))
     assert found == pytest.approx(expected, rel=1e-6)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import target_task
-from helpers.walk import Walk, same_parameters, small
+from helpers.walk import Walk, same_parameters, small, walk_source
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_combrel import FittedRMax
+from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.common.transferred import TransferredInstances, check_transferred
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.transfer.base import Transfer
@@ -128,3 +128,42 @@ def test_a_method_that_breaks_it_at_an_exact_state_or_on_the_grid_stops_the_lear
     monkeypatch.setattr(Mine, "transferred", too_light)
     with pytest.raises(ValueError, match="Mine returned weights that add up to 1e-06"):
         small(transfer=Mine()).learn(5)
+
+
+def steady_timbrel():
+    return TIMBREL(walk_source(), InterTaskMapping([0, 1], [0, 1]), breadth_decay=1.0)
+
+
+@pytest.mark.parametrize("make", [steady_timbrel, Mine], ids=["TIMBREL", "Mine"])
+def test_a_source_must_bring_the_full_weight_when_the_model_has_lowered_its_threshold(make, monkeypatch):
+    """Time limits are evidence against what was transferred: they must not extend its reach."""
+    method, reached = type(make()), []
+
+    def checked(self, states, actions, own_weight):
+        found = transferred(self, states, actions, own_weight)
+        weights = np.where(np.arange(found.weight.shape[1]) < found.length[:, None], found.weight, 0.0).sum(axis=1)
+        used = found.length[: len(own_weight)] > 0
+        reached.append((own_weight + weights[: len(own_weight)])[used])
+        return found
+
+    transferred = method.transferred
+    monkeypatch.setattr(method, "transferred", checked)
+    # Every episode is cut off before the goal, so the model lowers its threshold from the eleventh on.
+    model = small(Walk(limit=3), transfer=make(), model_breadth=0.03, resolution=5).learn(60)
+    assert model.policy.statistics()["model/threshold"] < 0.9
+    assert model.policy.transfer.task.exploration_threshold == 1.0
+    before = len(reached)
+    model.learn(30, reset_num_timesteps=False)
+    assert np.concatenate(reached[before:]).min() >= 1.0 - 1e-9
+    # Weights that the lowered threshold would accept are refused.
+    with pytest.raises(ValueError, match="must reach the threshold of 1,"):
+        monkeypatch.setattr(method, "transferred", too_light)
+        model.learn(30, reset_num_timesteps=False)
+
+
+def too_light(self, states, actions, own_weight):
+    """Return weights that fail the full threshold only."""
+    found = TransferredInstances.empty(len(own_weight), states.shape[1], 1)
+    found.length[:] = own_weight < 0.9
+    found.weight[:, 0] = 0.95 - own_weight
+    return found
