@@ -7,6 +7,7 @@ import numpy as np
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.compliance_selector import ComplianceSelector
 from sb3_combrel.transfer.mapping_transfer import (
     DEFAULT_BREADTH,
@@ -46,6 +47,10 @@ class COMBREL(MappingTransfer):
     :param min_compliance: a mapping transfers nothing where its mean compliance does not exceed this many times that of
         the no-change baseline, the prediction that no variable ever changes; so a source that has nothing to do with the
         target is left alone. 0: any mapping that has evidence may transfer, as in the paper.
+    :param min_evidence: a mapping's compliance with a transition counts as 0 where the start kernels of its instances (Eq. 2,
+        before they are normalized) add up to less: with weights that are normalized, a mapping whose instances are all far
+        away could look as good as one with near ones. 0.1 is one instance at 1.5 times the square root of the bandwidth.
+        0: every mapping counts, as in the paper.
     :param breadth: kernel breadth of transferred instances, in unit coordinates; the paper names none
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit (the paper: none, 1). So pairs
         for which the source is wrong are explored in the end, whatever the source.
@@ -54,7 +59,7 @@ class COMBREL(MappingTransfer):
     :param relevance: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful.
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
-        from the data. The paper names none.
+        from the data, that of starts by the variables that a mapping compares. The paper names none.
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
@@ -70,6 +75,7 @@ class COMBREL(MappingTransfer):
         measured: str = "online",
         max_transitions: int = 3000,
         min_compliance: float = 0.8,
+        min_evidence: float = DEFAULT_MIN_EVIDENCE,
         breadth: float = DEFAULT_BREADTH,
         breadth_decay: float = DEFAULT_BREADTH_DECAY,
         transfer_terminals: bool = True,
@@ -80,10 +86,13 @@ class COMBREL(MappingTransfer):
         check_count("n_neighbors", n_neighbors)
         check_count("max_transitions", max_transitions)
         check_finite("min_compliance", min_compliance)
+        check_finite("min_evidence", min_evidence)
         if neighbor_radius is not None:
             check_positive("neighbor_radius", neighbor_radius)
         if min_compliance < 0.0:
             raise ValueError(f"min_compliance must be at least 0, got {min_compliance!r}")
+        if min_evidence < 0.0:
+            raise ValueError(f"min_evidence must be at least 0, got {min_evidence!r}")
         if choice not in ("best", "drawn"):
             raise ValueError(f'choice must be "best" or "drawn", got {choice!r}')
         if measured not in ("online", "first_episode"):
@@ -104,6 +113,7 @@ class COMBREL(MappingTransfer):
         self.measured = measured
         self.max_transitions = max_transitions
         self.min_compliance = min_compliance
+        self.min_evidence = min_evidence
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
@@ -117,11 +127,13 @@ class COMBREL(MappingTransfer):
             self._transitions,
             self.rng,
             bandwidths=self._bandwidths,
+            starts=self._starts,
             n_neighbors=self.n_neighbors,
             neighbor_radius=self.neighbor_radius,
             drawn=self.choice == "drawn",
             online=self.measured == "online",
             max_transitions=self.max_transitions,
+            min_evidence=self.min_evidence,
             min_compliance=self.min_compliance,
         )
         return self._compliance_selector

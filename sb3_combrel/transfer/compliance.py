@@ -13,21 +13,12 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner_fast, part
 from sb3_combrel.common.instances import Instances
+from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.candidates import MappingTable
 
-
-class Bandwidths(NamedTuple):
-    """
-    Bandwidths delta of phi(x) = exp(-x^2 / delta), in unit coordinates (reward: raw).
-
-    :param start: of the distance between the states where two transitions start (delta_sa)
-    :param outcome: of the distance between outcomes (delta_s')
-    :param reward: of the difference of rewards (delta_r)
-    """
-
-    start: float
-    outcome: float
-    reward: float
+# The weight of one instance at a distance of sqrt(2.3 delta). Where the sum of start kernels is less, no instance is near
+# enough to be evidence: normalized, a far instance would look as good as a near one.
+DEFAULT_MIN_EVIDENCE = 0.1
 
 
 class RewardCounts(NamedTuple):
@@ -53,7 +44,8 @@ class ComplianceScratch(NamedTuple):
     """
     Work space, and the state mappings in the form that the inner loop reads.
 
-    A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses.
+    A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses; a *start
+    factor* is one with a start bandwidth.
 
     :param variable: int64, shape (n_factors,): target variable of each factor
     :param source: int64, same shape: source variable
@@ -61,13 +53,16 @@ class ComplianceScratch(NamedTuple):
     :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are
         ``factors[first[m] : first[m + 1]]``
     :param factors: int64
+    :param starts: int64, shape of ``factors``: the same for start factors
+    :param start_factor: int64, shape (n_start_factors,): the factor of each; ``start_bandwidth``: float64, same shape
     :param state: float64, shape (n_source_actions, n_source_variables, n): the source instances' states, variable by
         variable: the inner loops read them in a row; ``effect``: the same of their effects
-    :param start: float64, shape (n_factors, n): kernel of where a transition and each source instance start
-    :param outcome: the same for outcomes
+    :param start: float64, shape (n_start_factors, n): kernel of where a transition and each source instance start
+    :param outcome: float64, shape (n_factors, n): the same for outcomes
     :param reward: float64, shape (n,): the same for rewards
     :param weight: float64, shape (n,): product of a mapping's start kernels; ``hit``: of its outcome kernels
     :param still: float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
+    :param min_evidence: sum of start kernels below which a mapping has no compliance
     """
 
     variable: np.ndarray
@@ -75,6 +70,9 @@ class ComplianceScratch(NamedTuple):
     mirrored: np.ndarray
     first: np.ndarray
     factors: np.ndarray
+    starts: np.ndarray
+    start_factor: np.ndarray
+    start_bandwidth: np.ndarray
     state: np.ndarray
     effect: np.ndarray
     start: np.ndarray
@@ -83,16 +81,27 @@ class ComplianceScratch(NamedTuple):
     weight: np.ndarray
     hit: np.ndarray
     still: np.ndarray
+    min_evidence: float
 
     @classmethod
-    def for_mappings(cls, mappings: MappingTable, source: Instances) -> "ComplianceScratch":
-        """Make work space for a table of state mappings and the instances of a source."""
+    def for_mappings(
+        cls, mappings: MappingTable, source: Instances, start: np.ndarray | float, min_evidence: float = DEFAULT_MIN_EVIDENCE
+    ) -> "ComplianceScratch":
+        """
+        Make work space for a table of state mappings and the instances of a source.
+
+        :param start: start bandwidth, of all mappings or of each, shape (n_state_mappings,)
+        :param min_evidence: see the class
+        """
         largest = int(source.size.max())
         number: dict[tuple[int, int, bool], int] = {}
-        first, factors = [0], []
-        for index, sign in zip(mappings.variable, mappings.sign, strict=True):
+        start_number: dict[tuple[int, float], int] = {}
+        first, factors, starts = [0], [], []
+        of_mapping = np.broadcast_to(start, len(mappings.variable))
+        for index, sign, bandwidth in zip(mappings.variable, mappings.sign, of_mapping.tolist(), strict=True):
             for v in np.flatnonzero(index >= 0):
                 factors.append(number.setdefault((int(v), int(index[v]), bool(sign[v] < 0.0)), len(number)))
+                starts.append(start_number.setdefault((factors[-1], bandwidth), len(start_number)))
             first.append(len(factors))
         n_mappings, keys = len(mappings.variable), list(number)
         return cls(
@@ -101,20 +110,19 @@ class ComplianceScratch(NamedTuple):
             mirrored=np.array([m for _, _, m in keys], dtype=np.bool_),
             first=np.array(first, dtype=np.int64),
             factors=np.array(factors, dtype=np.int64),
+            starts=np.array(starts, dtype=np.int64),
+            start_factor=np.array([f for f, _ in start_number], dtype=np.int64),
+            start_bandwidth=np.array([bandwidth for _, bandwidth in start_number]),
             state=np.ascontiguousarray(source.state[:, :largest].transpose(0, 2, 1)),
             effect=np.ascontiguousarray(source.effect[:, :largest].transpose(0, 2, 1)),
-            start=np.empty((len(keys), largest)),
+            start=np.empty((len(start_number), largest)),
             outcome=np.empty((len(keys), largest)),
             reward=np.empty(largest),
             weight=np.empty(largest),
             hit=np.empty(largest),
             still=np.empty(n_mappings),
+            min_evidence=float(min_evidence),
         )
-
-
-# Below this sum of kernel weights (that of one instance at a distance of sqrt(2.3 delta)) no instance is near enough to be
-# evidence: normalized, a far instance would look as good as a near one.
-LEAST_EVIDENCE = 0.1
 
 
 # Kernel arguments beyond this make less than 1e-17: the kernel is cut there.
@@ -169,11 +177,14 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
         v = scratch.variable[f]
         k = scratch.source[f]
         side = -1.0 if scratch.mirrored[f] else 1.0
-        offset = 1.0 if scratch.mirrored[f] else 0.0
-        _squares(side * (state[v] - offset), scratch.state[action, k], bandwidths.start, scratch.start[f], n)
         _squares(side * effect[v], scratch.effect[action, k], bandwidths.outcome, scratch.outcome[f], n)
-        _exponentiate(scratch.start[f], n)
         _exponentiate(scratch.outcome[f], n)
+    for s in range(len(scratch.start_factor)):
+        f = scratch.start_factor[s]
+        at = state[scratch.variable[f]]
+        at = 1.0 - at if scratch.mirrored[f] else at
+        _squares(at, scratch.state[action, scratch.source[f]], scratch.start_bandwidth[s], scratch.start[s], n)
+        _exponentiate(scratch.start[s], n)
     for j in range(n):
         off = reward - source.reward[action, j]
         scratch.reward[j] = off * off / bandwidths.reward
@@ -188,8 +199,9 @@ def _mapping_compliance(m, n, scratch):
         scratch.hit[j] = 1.0
     for t in range(scratch.first[m], scratch.first[m + 1]):
         f = scratch.factors[t]
+        s = scratch.starts[t]
         for j in range(n):
-            scratch.weight[j] *= scratch.start[f, j]
+            scratch.weight[j] *= scratch.start[s, j]
             scratch.hit[j] *= scratch.outcome[f, j]
     total = 0.0
     transition = 0.0
@@ -198,7 +210,7 @@ def _mapping_compliance(m, n, scratch):
         total += scratch.weight[j]
         transition += scratch.weight[j] * scratch.hit[j]
         rewarded += scratch.weight[j] * scratch.reward[j]
-    return 0.0 if total < LEAST_EVIDENCE else (transition / total) * (rewarded / total)
+    return 0.0 if total < scratch.min_evidence else (transition / total) * (rewarded / total)
 
 
 @part
@@ -225,6 +237,7 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
     :param state: unit coordinates of the target, shape (n_target_variables,)
     :param effect: next state minus state, same shape
     :param source: Instances of the source, in its own unit coordinates
+    :param bandwidths: of outcome and reward; those of starts are in ``scratch``
     :param scratch: ComplianceScratch for ``mappings``
     :param table: receives the compliances, shape (n_state_mappings, n_source_actions); 0 where no instance is near
     """
@@ -265,30 +278,3 @@ def task_compliance(tables: np.ndarray, actions: np.ndarray, state_index: int, a
     :param action_mapping: source action of each target action, shape (n_target_actions,)
     """
     return float(tables[np.arange(len(actions)), state_index, np.asarray(action_mapping)[actions]].mean())
-
-
-def default_bandwidths(source: Instances) -> Bandwidths:
-    """
-    Choose bandwidths from a source's instances.
-
-    The start bandwidth is the squared distance to about the 20th instance of the same action (their median): that many
-    share in the prediction. The outcome bandwidth is the mean squared effect: an outcome missed by as much as things
-    usually move counts as 1/e. The reward bandwidth is the rewards' variance; 1 where they are all alike.
-    """
-    from scipy.spatial import cKDTree
-
-    distances, effects, rewards = [], [], []
-    for action, n in enumerate(source.size):
-        if n > 1:
-            states = source.state[action, :n]
-            nth = min(20, n - 1) + 1
-            distances.append(cKDTree(states).query(states, k=[nth])[0].ravel())
-        effects.append((source.effect[action, :n] ** 2).sum(axis=1))
-        rewards.append(source.reward[action, :n])
-    start = float(np.median(np.concatenate(distances))) ** 2 if distances else 0.02
-    variance = float(np.concatenate(rewards).var())
-    return Bandwidths(
-        start=max(start, 1e-6),
-        outcome=max(float(np.concatenate(effects).mean()), 1e-9),
-        reward=variance if variance > 1e-12 else 1.0,
-    )

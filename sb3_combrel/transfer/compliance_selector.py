@@ -7,8 +7,8 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.compliance import (
-    Bandwidths,
     ComplianceScratch,
     RewardCounts,
     no_change_compliance,
@@ -32,11 +32,13 @@ class ComplianceSelector(Selector):
     (lines 9-13); here that of a transition is computed when a choice first needs it.
 
     :param bandwidths: of compliance
+    :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
     :param n_neighbors: k of line 2
     :param neighbor_radius: how far a neighbour may be, unit coordinates; None: any distance
     :param drawn: candidates are drawn in proportion to their mean compliance, instead of line 20
     :param online: transitions of all episodes are recorded and used at once, not those of the first after its end
     :param max_transitions: how many are recorded
+    :param min_evidence: sum of start kernels below which a candidate has no compliance
     :param min_compliance: a candidate's mean compliance must exceed this many times that of the no-change baseline
     """
 
@@ -51,11 +53,13 @@ class ComplianceSelector(Selector):
         rng: np.random.Generator,
         *,
         bandwidths: Bandwidths,
+        starts: np.ndarray,
         n_neighbors: int,
         neighbor_radius: float | None,
         drawn: bool,
         online: bool,
         max_transitions: int,
+        min_evidence: float,
         min_compliance: float,
     ):
         super().__init__(candidates, task, transitions, rng)
@@ -69,13 +73,13 @@ class ComplianceSelector(Selector):
         self.limit = np.inf if neighbor_radius is None else float(neighbor_radius) ** 2
         self.first_episode = True
         self.n_switches = 0
+        self._scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances, starts, min_evidence)
         self._allocate()
 
     def _allocate(self) -> None:
         """Make the arrays: compliance of transitions, nearest transitions and choices."""
         candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
         n_rows, n_source_actions = len(candidates.table.variable), len(candidates.instances.size)
-        self._scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances)
         self._table = np.empty((n_rows, n_source_actions))
         # Where in that table the candidates of each action stand.
         columns = candidates.arrays.row * n_source_actions + candidates.arrays.action

@@ -15,7 +15,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike
-from sb3_combrel.transfer.compliance import Bandwidths, default_bandwidths
+from sb3_combrel.transfer.bandwidths import Bandwidths, default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
@@ -96,7 +96,7 @@ class MappingTransfer(Transfer):
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         self.candidates = Candidates(self.source, self.mappings, task)
-        self._bandwidths = self._resolved_bandwidths()
+        self._choose_bandwidths()
         self._transitions = RecordedTransitions(task.n_variables)
         self._translator = Translator(
             self.candidates,
@@ -113,8 +113,14 @@ class MappingTransfer(Transfer):
         # What has been returned for any state of the sample may have changed.
         self._all_changed = True
 
-    def _resolved_bandwidths(self) -> Bandwidths:
-        return default_bandwidths(self.candidates.instances) if self.bandwidths is None else Bandwidths(*self.bandwidths)
+    def _choose_bandwidths(self) -> None:
+        """Take the bandwidths given, the same for all mappings; or choose them from the data."""
+        if self.bandwidths is None:
+            self._bandwidths = default_bandwidths(self.candidates.instances)
+            self._starts = start_bandwidths(self.candidates, self._bandwidths.start)
+        else:
+            self._bandwidths = Bandwidths(*self.bandwidths)
+            self._starts = np.full(len(self.candidates.table.variable), self._bandwidths.start)
 
     @abstractmethod
     def _make_selector(self, task: TargetTask) -> Selector:
@@ -178,7 +184,7 @@ class MappingTransfer(Transfer):
 
     def _renew_relevance(self, n_used: int) -> None:
         mu, values = float(self.relevance_fraction), self._translator.relevance
-        renew_relevance(self.candidates, self._transitions, n_used, self._bandwidths, mu, values)
+        renew_relevance(self.candidates, self._transitions, n_used, self._bandwidths, self._starts, mu, values)
         self._n_of_relevance = n_used
 
     # --------------------------------------------------------------- describing

@@ -4,7 +4,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.compliance import Bandwidths
+from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 
@@ -13,6 +13,7 @@ def renew_relevance(
     transitions: RecordedTransitions,
     n_used: int,
     bandwidths: Bandwidths,
+    starts: np.ndarray,
     mu: float,
     values: np.ndarray,
 ) -> None:
@@ -21,7 +22,7 @@ def renew_relevance(
 
     :param candidates: the candidates of every target action
     :param transitions: the target transitions, of which the first ``n_used`` count
-    :param bandwidths: of Eq. 2
+    :param bandwidths: of Eq. 2; ``starts``: the start bandwidth of each state mapping, shape (n_state_mappings,)
     :param mu: fraction of the weight of Eq. 4
     :param values: receives the relevances, shape (n_candidates, most instances of an action)
     """
@@ -36,7 +37,7 @@ def renew_relevance(
             candidates.arrays.action[c],
             candidates.table.variable[row],
             candidates.table.sign[row],
-            bandwidths,
+            bandwidths._replace(start=float(starts[row])),
             mu,
             np.empty(len(rows)),
             values[c],

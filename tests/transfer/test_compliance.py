@@ -3,20 +3,21 @@
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
+from helpers.asking import bound, choices_of, show
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.bandwidths import Bandwidths, default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.compliance import (
-    Bandwidths,
     ComplianceScratch,
     compliance_table,
-    default_bandwidths,
     task_compliance,
     transition_compliance,
 )
-from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
+from sb3_combrel.transfer.candidates import Candidates, stacked_instances, stacked_table
 from sb3_combrel.transfer.relevance import relevance
 
 seeds = st.integers(0, 2**32 - 1)
@@ -35,7 +36,7 @@ def tables_of(transitions, sources, sets, bandwidths):
         instances,
         table,
         bandwidths,
-        ComplianceScratch.for_mappings(table, instances),
+        ComplianceScratch.for_mappings(table, instances, bandwidths.start),
         tables,
     )
     return tables
@@ -168,7 +169,7 @@ def test_one_transition_and_many_go_through_the_same_equations():
     bandwidths = Bandwidths(0.1, 0.1, 1.0)
     tables = tables_of(transitions, [source], [mappings], bandwidths)
     table = stacked_table([mappings])
-    scratch = ComplianceScratch.for_mappings(table, stacked_instances([source]))
+    scratch = ComplianceScratch.for_mappings(table, stacked_instances([source]), bandwidths.start)
     for i in reversed(range(5)):
         t, one = transitions[i], np.full(tables[0].shape, np.nan)
         effect = t.next_state - t.state
@@ -282,3 +283,35 @@ def test_distances_are_averaged_while_the_weights_stay_below_mu_of_their_sum(mu,
     )
     expected = np.exp(-(((np.exp(-1.0) - 1.0) / apart[:n_counted].mean()) ** 2))
     assert found == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("state", [(0, 0, None), (0, 1, 0), (0, 0, 1), (1, None, None), (0, 1, None)], ids=str)
+def test_mappings_of_more_variables_have_about_as_much_evidence(state):
+    """The sum of start kernels at states all over the target's space, against that of a mapping of each variable once."""
+    rng = np.random.default_rng(0)
+    source = naive.random_source(rng, 1000, 2, 2)
+    task = naive.target_task(np.zeros((1, 3)), 1)
+    candidates = Candidates(source, [InterTaskMapping([0, 1, None], [0]), InterTaskMapping(state, [0])], task)
+    starts = start_bandwidths(candidates, default_bandwidths(candidates.instances).start)
+    states, evidence = rng.random((200, 3)), []
+    for row in (0, len(starts) - 1):
+        index = candidates.table.variable[row]
+        of_source = candidates.instances.state[0, : candidates.instances.size[0]][:, index[index >= 0]]
+        squared = ((states[:, None, index >= 0] - of_source) ** 2).sum(axis=2)
+        evidence.append(np.exp(-squared / starts[row]).sum(axis=1))
+    usual, other = (np.median(each) for each in evidence)
+    assert 0.5 * usual < other < 2.5 * usual
+    assert (evidence[1] < 0.1).mean() <= 0.02
+    assert starts[0] == default_bandwidths(candidates.instances).start
+
+
+def test_min_evidence_is_the_sum_of_kernels_below_which_nothing_counts():
+    source, transition = line([[0.3], [0.3]], [[0.1], [0.1]]), naive.Transition(np.array([0.4]), 0, -1.0, np.array([0.5]))
+    evidence = 2 * np.exp(-0.01 / 0.005)
+    task = naive.target_task(np.array([[0.4]]), 1)
+    for least, expected in ((0.0, 1.0), (0.99 * evidence, 1.0), (1.01 * evidence, np.nan)):
+        arguments = dict(bandwidths=(0.005, 0.01, 1.0), min_evidence=least, min_compliance=0.0)
+        method = bound(COMBREL(source, InterTaskMapping([0], [0]), **arguments), task)
+        show(method, transition)
+        choices_of(method)
+        np.testing.assert_allclose(method.chosen_compliance(np.zeros(1, dtype=int)), [expected], rtol=1e-9)
