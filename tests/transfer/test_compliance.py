@@ -286,7 +286,7 @@ def test_distances_are_averaged_while_the_weights_stay_below_mu_of_their_sum(mu,
 
 
 @pytest.mark.parametrize("state", [(0, 0, None), (0, 1, 0), (0, 0, 1), (1, None, None), (0, 1, None)], ids=str)
-def test_mappings_of_more_variables_have_about_as_much_evidence(state):
+def test_mappings_of_more_variables_have_no_less_evidence(state):
     """The sum of start kernels at states all over the target's space, against that of a mapping of each variable once."""
     rng = np.random.default_rng(0)
     source = naive.random_source(rng, 1000, 2, 2)
@@ -300,7 +300,9 @@ def test_mappings_of_more_variables_have_about_as_much_evidence(state):
         squared = ((states[:, None, index >= 0] - of_source) ** 2).sum(axis=2)
         evidence.append(np.exp(-squared / starts[row]).sum(axis=1))
     usual, other = (np.median(each) for each in evidence)
-    assert 0.5 * usual < other < 2.5 * usual
+    n_mapped = len(state) - state.count(None)
+    assert 0.6 * usual < other < (2.0 if len({*state} - {None}) == n_mapped else 5.0) * usual
+    assert np.sign(starts[-1] - starts[0]) == np.sign(n_mapped - 2) or state == (0, 0, None)
     assert (evidence[1] < 0.1).mean() <= 0.02
     assert starts[0] == default_bandwidths(candidates.instances).start
 
