@@ -17,6 +17,10 @@ SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances
 MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
 
+# Compliance is stored with every candidate, for thousands of transitions.
+MAX_WHOLE_MAPPINGS = 20_000
+
+
 class Candidate(NamedTuple):
     """
     What a candidate stands for.
@@ -78,16 +82,19 @@ class Candidates:
     The candidates of each target action: pairs of a state mapping and a source action.
 
     Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The rest of a
-    mapping, the source actions of other target actions, plays no part in what is translated for an action.
+    mapping, the source actions of other target actions, plays no part in what is translated for an action. It does where
+    whole mappings are to be told apart: then each is a candidate of every action, in the same order.
 
     :param source: instances, a path to them, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
     :param task: the target task
-    :raises ValueError: if source or mappings do not fit the target
+    :param whole: whether whole mappings are the candidates
+    :raises ValueError: if source or mappings do not fit the target, or if there are too many whole mappings
     """
 
-    def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask):
+    def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask, whole: bool = False):
         self.task = task
+        self.whole = whole
         self.sources = load_sources(source)
         self.sets = [
             resolve(mappings, **_sizes(one, task)).with_names(
@@ -98,7 +105,25 @@ class Candidates:
         self.instances = stacked_instances(self.sources)
         self.table = stacked_table(self.sets)
         self.origins: list[Origin] = []
+        self._action_mappings = self._whole_mappings() if whole else []
         self.arrays = self._numbered()
+
+    def _whole_mappings(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return, for each source, the state mapping of every mapping, and its source actions, one row a mapping."""
+        n_all = sum(map(len, self.sets))
+        if n_all > MAX_WHOLE_MAPPINGS:
+            raise ValueError(
+                f'mappings must hold at most {MAX_WHOLE_MAPPINGS} whole mappings with neighbors="state_action", got {n_all}; '
+                'a list of mappings or a smaller set would do, or neighbors="action", which needs no whole mappings'
+            )
+        found = []
+        for mappings in self.sets:
+            state = [(*index, *sign) for index, sign in zip(mappings.state_mappings, mappings.state_signs, strict=True)]
+            number = {key: k for k, key in enumerate(state)}
+            each = [mappings[k] for k in range(len(mappings))]
+            index = [number[(*mapping.state_index, *mapping.state_sign)] for mapping in each]
+            found.append((np.array(index), np.array([mapping.action for mapping in each])))
+        return found
 
     def _numbered(self) -> CandidateArrays:
         """Number the candidates of every target action, over all sources."""
@@ -108,7 +133,10 @@ class Candidates:
         for a in range(self.task.n_actions):
             row_offset = action_offset = 0
             for number, (source, mappings) in enumerate(zip(self.sources, self.sets, strict=True)):
-                state_index, source_action = mappings.candidates(a)
+                if self.whole:
+                    state_index, source_action = self._action_mappings[number][0], self._action_mappings[number][1][:, a]
+                else:
+                    state_index, source_action = mappings.candidates(a)
                 rows.append(state_index + row_offset)
                 actions.append(source_action + action_offset)
                 self.origins += [Origin(number, a, int(s), int(u)) for s, u in zip(state_index, source_action, strict=True)]
@@ -146,7 +174,16 @@ class Candidates:
         """Return target action, source action and pairs of variables of a candidate as text."""
         parts = self.parts(candidate)
         words = f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
+        if self.whole:
+            words += f", of the actions {', '.join(self._whole_action_names(candidate))}"
         return words if len(self.sources) == 1 else f"source {self.origins[candidate].source}: {words}"
+
+    def _whole_action_names(self, candidate: int) -> list[str]:
+        """Return the names of the source actions of all target actions, in their order."""
+        origin = self.origins[candidate]
+        place = candidate - self.arrays.first[origin.target_action] - sum(map(len, self.sets[: origin.source]))
+        names = self.sources[origin.source].action_names
+        return [names[action] for action in self._action_mappings[origin.source][1][place]]
 
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions of all sources, each name once."""

@@ -25,8 +25,12 @@ class COMBREL(MappingTransfer):
     Paper: Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection" (Algorithm
     1). Each mapping makes a virtual source task. For a state and an action, the mapping with the highest mean compliance
     with the nearest recorded target transitions of that action is selected; it translates the source instances that are
-    missing. Because compliance depends only on the state mapping and on the one source action that the target action
-    maps to, any number of action mappings costs nothing.
+    missing. Because compliance with transitions of that action depends only on the state mapping and on the one source
+    action that the target action maps to, any number of action mappings costs nothing.
+
+    That is one reading of the paper: compliance is computed "only to the target task instances that apply action a"
+    (Section 5.1). Its Table 2 contradicts it, where two mappings with the same source action for an action have different
+    shares. ``neighbors="state_action"`` is the other reading.
 
     :param source: source instances, a path to them, or a list of several, among which is selected as well
     :param mappings: "injective" (each source variable is mapped to by one target variable, the other target variables are
@@ -35,6 +39,9 @@ class COMBREL(MappingTransfer):
         mapped, as in "surjective", translated instances lie on diagonals of the target's space and help much less. The
         sets named after the paper's experiments leave two of the four target variables unmapped.
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
+    :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the
+        nearest whatever their action, each judged by the source action that the mapping has for *its* action. So whole
+        mappings differ; they must be at most 20,000.
     :param choice: "best": the mapping with the highest mean compliance is selected, as in the paper; or "drawn": one is
         drawn, each with a probability in proportion to its mean compliance. Where many mappings comply about equally
         well none of them then determines all predictions alone.
@@ -70,6 +77,7 @@ class COMBREL(MappingTransfer):
         mappings: MappingsLike = "injective",
         *,
         n_neighbors: int = 3,
+        neighbors: str = "action",
         choice: str = "best",
         neighbor_radius: float | None = None,
         measured: str = "online",
@@ -93,6 +101,8 @@ class COMBREL(MappingTransfer):
             raise ValueError(f"min_compliance must be at least 0, got {min_compliance!r}")
         if min_evidence < 0.0:
             raise ValueError(f"min_evidence must be at least 0, got {min_evidence!r}")
+        if neighbors not in ("action", "state_action"):
+            raise ValueError(f'neighbors must be "action" or "state_action", got {neighbors!r}')
         if choice not in ("best", "drawn"):
             raise ValueError(f'choice must be "best" or "drawn", got {choice!r}')
         if measured not in ("online", "first_episode"):
@@ -108,6 +118,7 @@ class COMBREL(MappingTransfer):
             bandwidths=bandwidths,
         )
         self.n_neighbors = n_neighbors
+        self.neighbors = neighbors
         self.choice = choice
         self.neighbor_radius = neighbor_radius
         self.measured = measured
@@ -120,6 +131,9 @@ class COMBREL(MappingTransfer):
         # Nothing is selected before the first transition, so nothing is returned for any state of the sample.
         self._all_changed = False
 
+    def _whole_mappings(self) -> bool:
+        return self.neighbors == "state_action"
+
     def _make_selector(self, task: TargetTask) -> ComplianceSelector:
         self._compliance_selector = ComplianceSelector(
             self.candidates,
@@ -129,6 +143,7 @@ class COMBREL(MappingTransfer):
             bandwidths=self._bandwidths,
             starts=self._starts,
             n_neighbors=self.n_neighbors,
+            all_actions=self._whole_mappings(),
             neighbor_radius=self.neighbor_radius,
             drawn=self.choice == "drawn",
             online=self.measured == "online",

@@ -34,6 +34,7 @@ class ComplianceSelector(Selector):
     :param bandwidths: of compliance
     :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
     :param n_neighbors: k of line 2
+    :param all_actions: transitions of all actions are neighbours, not those with the same action; for whole mappings
     :param neighbor_radius: how far a neighbour may be, unit coordinates; None: any distance
     :param drawn: candidates are drawn in proportion to their mean compliance, instead of line 20
     :param online: transitions of all episodes are recorded and used at once, not those of the first after its end
@@ -55,6 +56,7 @@ class ComplianceSelector(Selector):
         bandwidths: Bandwidths,
         starts: np.ndarray,
         n_neighbors: int,
+        all_actions: bool,
         neighbor_radius: float | None,
         drawn: bool,
         online: bool,
@@ -65,6 +67,7 @@ class ComplianceSelector(Selector):
         super().__init__(candidates, task, transitions, rng)
         self.bandwidths = bandwidths
         self.n_neighbors = n_neighbors
+        self.all_actions = all_actions
         self.drawn = drawn
         self.online = online
         self.max_transitions = max_transitions
@@ -183,9 +186,13 @@ class ComplianceSelector(Selector):
     # ------------------------------------------------------ line 17: the k nearest recorded transitions
 
     def _use(self, i: int) -> None:
-        """List transition ``i`` under its action, and among the nearest of sample states."""
+        """Make transition ``i`` a neighbour for its action, or for all."""
         self._cache = self._cache.with_room(i)
-        action = int(self.transitions.actions[i])
+        for action in range(self.task.n_actions) if self.all_actions else [int(self.transitions.actions[i])]:
+            self._use_for(i, action)
+
+    def _use_for(self, i: int, action: int) -> None:
+        """List transition ``i`` under ``action``, and among the nearest of sample states."""
         n = self._n_listed[action]
         if n == self._listed.shape[1]:
             self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)

@@ -95,7 +95,7 @@ class MappingTransfer(Transfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
-        self.candidates = Candidates(self.source, self.mappings, task)
+        self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         self._choose_bandwidths()
         self._transitions = RecordedTransitions(task.n_variables)
         self._translator = Translator(
@@ -112,6 +112,10 @@ class MappingTransfer(Transfer):
         self._n_of_relevance = 0
         # What has been returned for any state of the sample may have changed.
         self._all_changed = True
+
+    def _whole_mappings(self) -> bool:
+        """Return whether whole mappings are the candidates."""
+        return False
 
     def _choose_bandwidths(self) -> None:
         """Take the bandwidths given, the same for all mappings; or choose them from the data."""
