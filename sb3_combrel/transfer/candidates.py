@@ -83,7 +83,7 @@ class Candidates:
 
     Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The rest of a
     mapping, the source actions of other target actions, plays no part in what is translated for an action. It does where
-    whole mappings are to be told apart: then each is a candidate of every action, in the same order.
+    whole mappings are to be distinguished: then each is a candidate of every action, in the same order.
 
     :param source: instances, a path to them, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)

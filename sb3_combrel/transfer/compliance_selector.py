@@ -155,7 +155,7 @@ class ComplianceSelector(Selector):
             compliance = self._table.ravel()[self._columns[int(self.transitions.actions[i])]]
             self._cache.compliance[i, : len(compliance)] = compliance
             no_change = no_change_compliance(effect, reward, self._rewards, self.bandwidths)
-            self._cache.least[i] = self.min_compliance * no_change
+            self._cache.required[i] = self.min_compliance * no_change
             self._cache.measured[i] = True
 
     # --------------------------------------------- lines 15-16: for each state and action with too few data of its own

@@ -39,7 +39,7 @@ _RENAMED_ATTRIBUTES = {**RENAMED_ARGUMENTS, "target": "task", "way": "candidate"
 
 class MappingTransfer(Transfer):
     """
-    Translates source instances through mappings: a selector says whose, and a translator how many of them.
+    Translates source instances through mappings: a selector chooses the mappings, a translator the instances.
 
     :param source: instances, a path to them, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)

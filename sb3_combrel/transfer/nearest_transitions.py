@@ -12,13 +12,13 @@ class ComplianceCache(NamedTuple):
     Compliance of target transitions, computed once; that of transition i is with the candidates of its action only.
 
     :param compliance: float64, shape (n_transitions, most candidates of an action): with each of them, in their order
-    :param least: float64, shape (n_transitions,): what the mean compliance of the nearest transitions must exceed
+    :param required: float64, shape (n_transitions,): what the mean compliance of the nearest transitions must exceed
     :param measured: bool, shape (n_transitions,): whether the compliance has been computed
     :param total: float64 scratch, shape (most candidates of an action,)
     """
 
     compliance: np.ndarray
-    least: np.ndarray
+    required: np.ndarray
     measured: np.ndarray
     total: np.ndarray
 
@@ -27,18 +27,18 @@ class ComplianceCache(NamedTuple):
         """Make room for ``capacity`` transitions."""
         return cls(
             compliance=np.empty((capacity, max_candidates)),
-            least=np.empty(capacity),
+            required=np.empty(capacity),
             measured=np.zeros(capacity, dtype=np.bool_),
             total=np.empty(max_candidates),
         )
 
     def with_room(self, i: int) -> "ComplianceCache":
         """Return itself, or a copy of twice the size if transition ``i`` would not fit."""
-        if i < len(self.least):
+        if i < len(self.required):
             return self
         return self._replace(
             compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
-            least=np.concatenate([self.least, np.empty_like(self.least)]),
+            required=np.concatenate([self.required, np.empty_like(self.required)]),
             measured=np.concatenate([self.measured, np.zeros_like(self.measured)]),
         )
 
@@ -86,7 +86,7 @@ def find_nearest(states, actions, own_weight, threshold, recorded, listed, n_lis
     :param recorded: states of the recorded transitions
     :param listed: int64, shape (n_actions, capacity): the transitions that count for each action; the first ``n_listed``
     :param limit: squared distance from which on a transition does not count
-    :param near: receives the transitions, the nearest first, -1 for none, shape (at least n, n_neighbors)
+    :param near: receives the transitions, the nearest first, -1 for none, shape (at required n, n_neighbors)
     :param distance: float64 scratch, same shape
     """
     last = near.shape[1] - 1
@@ -107,12 +107,12 @@ def find_nearest(states, actions, own_weight, threshold, recorded, listed, n_lis
 
 
 @inner
-def choose_one(near, compliance, least, n_candidates, draw, total):
+def choose_one(near, compliance, required, n_candidates, draw, total):
     """
-    Choose a candidate by the mean compliance of the transitions ``near``; -1 if none exceeds the least (lines 19-20).
+    Choose a candidate by the mean compliance of the transitions ``near``; -1 if none exceeds what is required (lines 19-20).
 
     :param n_candidates: of the action
-    :param draw: a random number from [0, 1): each candidate that exceeds the least is chosen with a probability in
+    :param draw: a random number from [0, 1): each candidate that exceeds it is chosen with a probability in
         proportion to its mean compliance; below 0: the one with the highest is (of equal ones the first)
     :param total: see ``ComplianceCache``
     """
@@ -121,7 +121,7 @@ def choose_one(near, compliance, least, n_candidates, draw, total):
     for k in range(len(near)):
         i = near[k]
         if i >= 0:
-            bar += least[i]
+            bar += required[i]
             for c in range(n_candidates):
                 total[c] += compliance[i, c]
     best = -1
@@ -152,7 +152,7 @@ def choose(rows, actions, near, cache, first, draws, choice):
 
     :param rows: int64, shape (n,): rows of ``near`` and ``choice``
     :param actions: int64, shape (n,): their actions
-    :param near: int64, shape (at least n, n_neighbors): nearest transitions, -1 for none
+    :param near: int64, shape (at required n, n_neighbors): nearest transitions, -1 for none
     :param cache: ComplianceCache, in which they are measured
     :param first: see ``CandidateArrays``
     :param draws: a random number for each of ``rows``; or nothing, shape (0,): the best is chosen (see ``choose_one``)
@@ -165,7 +165,7 @@ def choose(rows, actions, near, cache, first, draws, choice):
         action = actions[k]
         draw = draws[k] if len(draws) > 0 else -1.0
         n_candidates = first[action + 1] - first[action]
-        chosen = choose_one(near[row], cache.compliance, cache.least, n_candidates, draw, cache.total)
+        chosen = choose_one(near[row], cache.compliance, cache.required, n_candidates, draw, cache.total)
         if chosen >= 0:
             chosen += first[action]
         if chosen != choice[row]:

@@ -188,9 +188,9 @@ def gather(state, source, action, variable, sign, rules, relevance, own, kept, s
             if apart <= nearest:
                 weight = np.exp(apart * scale)
                 rank = relevance[j] if rules.by_relevance else weight
-                kept, least = consider(j, candidate, weight, rank, own, kept, rules, scratch)
-                if least > rules.min_weight and not rules.by_relevance:
-                    nearest = np.log(least) / scale * (1 + 1e-12)
+                kept, enters = consider(j, candidate, weight, rank, own, kept, rules, scratch)
+                if enters > rules.min_weight and not rules.by_relevance:
+                    nearest = np.log(enters) / scale * (1 + 1e-12)
     return kept
 
 

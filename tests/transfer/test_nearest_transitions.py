@@ -17,7 +17,7 @@ POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), a
 def random_cache(rng, n_transitions, n_candidates, least=0.4):
     cache = ComplianceCache.empty(n_candidates + 2, n_transitions)
     cache.compliance[:] = rng.random(cache.compliance.shape)
-    cache.least[:] = least
+    cache.required[:] = least
     return cache
 
 
