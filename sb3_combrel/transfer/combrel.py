@@ -52,8 +52,12 @@ class COMBREL(MappingTransfer):
         default, which works best); or "first_episode": those of the first episode, used after its end, as in the paper
     :param max_transitions: target transitions that are recorded, at most
     :param min_compliance: a mapping transfers nothing where its mean compliance does not exceed this many times that of
-        the no-change baseline, the prediction that no variable ever changes; so a source that has nothing to do with the
-        target is left alone. 0: any mapping that has evidence may transfer, as in the paper.
+        the no-change baseline, the prediction that no variable ever changes. It excludes sources that predict large changes
+        wrongly. A source of small random effects complies about as well as the baseline and is *not* excluded: with effects
+        of standard deviation 0.01 from anywhere (unit coordinates; MountainCar4D, breadth 0.1, 12 episodes, 6 seeds) its
+        instances were used 20,000 times, and learning took 16,613 +- 949 steps instead of 15,897 +- 244 without transfer;
+        with 1.0 instead of 0.8 it took 18,912 +- 780, so a higher bar does not help. ``breadth_decay`` is what ends it. 0:
+        any mapping that has evidence may transfer, as in the paper.
     :param min_evidence: a mapping's compliance with a transition counts as 0 where the start kernels of its instances (Eq. 2,
         before they are normalized) add up to less: with weights that are normalized, a mapping whose instances are all far
         away could look as good as one with near ones. 0.1 is one instance at 1.5 times the square root of the bandwidth.
