@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, part
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.kernels import near_instances
+from sb3_combrel.common.kernels import near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.planning.q_values import Prediction
 
@@ -29,7 +29,8 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
 
     :param kernel: (breadth, min_weight, min_fraction)
     :param near: receives these instances; those of the last query make the search shorter
-    :param prediction: receives the prediction; an action of less weight than ``threshold`` has none
+    :param prediction: receives the prediction; an action of less weight than ``threshold`` has none. An action that was
+        known stays known: one whose list a nearer instance has shortened counts as weighing ``threshold``.
     :return: the least weight that an action has
     """
     least = np.inf
@@ -38,14 +39,39 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
         weight = near.weight[action]
         n, total = near_instances(instances, action, state, kernel, item, weight, near.length[action])
         near.length[action] = n
-        prediction.weight[action] = total
-        prediction.modelled[action] = total >= threshold
-        least = min(least, total)
         prediction.reward[action] = 0.0
         prediction.length[action] = 0
         if total > 0.0:
             predict_from_lists(instances, action, near, total, prediction)
+        if total < threshold and known_before(instances, action, state, kernel, threshold, total):
+            total = threshold
+        prediction.weight[action] = total
+        prediction.modelled[action] = total >= threshold
+        least = min(least, total)
     return least
+
+
+@part
+def known_before(instances, action, state, kernel, threshold, total):
+    """Whether the kept instances at ``state``, of weight ``total``, reached the threshold before nearer ones came.
+
+    Let f be ``min_fraction`` and T the threshold. An instance with which a list reaches T weighs at least f times the sum P
+    of those before it, and T - P, hence f T / (1 + f). So lists that reach T consist, up to there, of instances of at
+    least that weight, and once all of these sum to T they always will. A nearer instance can only push such a list below T
+    when what remains has at least T / (1 + f).
+    """
+    breadth, _, min_fraction = kernel
+    if total * (1.0 + min_fraction) < threshold:
+        return False
+    least = min_fraction * threshold / (1.0 + min_fraction)
+    scale = -1.0 / (breadth * breadth)
+    farthest = np.log(least) / scale
+    everything = 0.0
+    for i in range(instances.size[action]):
+        distance = squared_distance(state, instances.state[action, i])
+        if distance <= farthest:
+            everything += np.exp(distance * scale)
+    return everything >= threshold
 
 
 @compiled
