@@ -8,8 +8,8 @@ from sb3_combrel.experiments import bench
 pytestmark = pytest.mark.integration
 
 
-def test_bench_prints_the_cost_of_transfer_for_each_pair_and_its_mean(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["bench", "--pairs", "2", "--part", "0.005"])
+def test_what_transfer_adds_is_printed_pair_by_pair_and_in_the_mean(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["bench", "--pairs", "2", "--fraction", "0.005"])
     bench.main()
     printed = capsys.readouterr().out
     assert re.findall(r"breadth ([\d.]+)", printed) == ["0.4", "0.1"]
@@ -20,6 +20,6 @@ def test_bench_prints_the_cost_of_transfer_for_each_pair_and_its_mean(monkeypatc
         assert int(added) == pytest.approx(100 * (float(transferring) / float(without) - 1.0), rel=0.02, abs=2)
 
 
-def test_bench_repeats_a_case_with_the_same_steps_each_time():
-    steps, milliseconds, memory = bench.measure(0, part=0.04)
+def test_a_fraction_of_a_cases_episodes_is_learnt_with_the_same_steps_each_time():
+    steps, milliseconds, memory = bench.measure(0, fraction=0.04)
     assert (steps, milliseconds > 0.0, memory > 0.0) == (bench.learn(bench.CASES[0], 2)[0], True, True)

@@ -143,13 +143,24 @@ class NaiveFittedRMax:
                 return values
         raise AssertionError("value iteration did not converge")
 
+    def known_at(self, state, action):
+        """Whether some of an action's instances alone reach the threshold at an exact state.
+
+        Of any instances those that weigh f T / (1 + f) or more suffice, f being min_fraction and T the threshold.
+        """
+        breadth, min_weight, min_fraction = self.kernel
+        kept = kept_instances(state, self.instances[action], breadth, min_weight, min_fraction)
+        heavy = kept_instances(state, self.instances[action], breadth, min_weight, 0.0)
+        least = min_fraction * self.threshold / (1.0 + min_fraction)
+        return max(sum(w for _, w in kept), sum(w for _, w in heavy if w >= least)) >= self.threshold
+
     def q_values(self, state, values, min_value):
         """Q at an exact state from values at the grid points; staying put is worth the state's own Q."""
         q = []
         for action in range(self.n_actions):
             kept = self.kept_at(state, action)
             total = sum(w for _, w in kept)
-            if total < self.threshold:
+            if not self.known_at(state, action):
                 q.append(self.max_value)
                 continue
             reward = after = stay = 0.0
