@@ -10,12 +10,38 @@ machine only.
 
 import gc
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from numba import njit
 from numba.core import event
+
+# The packages with compiled functions.
+ROOMS = ("common", "planning", "models", "transfer")
+
+
+def remove_outdated(folders: Sequence[Path]) -> None:
+    """
+    Remove compiled code that is older than any source file in some folders.
+
+    Numba compiles a function again when its own file has changed, not when a file has changed whose functions it calls.
+
+    :param folders: they and those within them, with the cache beside each source file; another cache (``NUMBA_CACHE_DIR``)
+        is left alone
+    """
+    newest = max((file.stat().st_mtime for folder in folders for file in folder.rglob("*.py")), default=0.0)
+    for index in (file for folder in folders for file in folder.rglob("__pycache__/*.nbi")):
+        try:
+            if index.stat().st_mtime < newest:
+                index.unlink()
+        except OSError:
+            # Another process was quicker, or the folder cannot be written to.
+            continue
+
+
+remove_outdated([Path(__file__).parent.parent / room for room in ROOMS])
 
 _njit: Any = njit
 # Three options that are not in Numba's documentation, here alone and worth it; what they give up is noted with each.

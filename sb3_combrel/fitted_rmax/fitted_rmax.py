@@ -26,8 +26,8 @@ from sb3_combrel.fitted_rmax.arguments import (
     DEFAULT_POLICY,
     check_policy_kwargs,
     check_seed,
-    check_type,
     check_total_timesteps,
+    check_type,
     policy_and_env,
     warn_of_max_value,
 )

@@ -3,7 +3,6 @@
 import os
 import warnings
 from collections.abc import Sequence
-
 from typing import NamedTuple
 
 import numpy as np

@@ -19,9 +19,9 @@ from sb3_combrel.common.checks import as_count
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.common.serialisation import damage_text, register_reader, register_writer
 from sb3_combrel.sources import fitted_rmax_source, minari_datasets, q_learning, recording
+from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, flag_array
 from sb3_combrel.sources.source_file import ARRAY_NAMES, read_source, source_from_bytes, source_to_bytes, write_source
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
-from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, flag_array
 from sb3_combrel.sources.transitions import MAX_STEPS, WHY_MAX_STEPS, Transitions, count_actions
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.compliance import (
     ComplianceScratch,
     RewardCounts,

@@ -13,9 +13,9 @@ import numpy as np
 from sb3_combrel.common.checks import check_positive
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.bandwidths import Bandwidths, default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike
-from sb3_combrel.transfer.bandwidths import Bandwidths, default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name

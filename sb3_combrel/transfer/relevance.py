@@ -3,8 +3,8 @@
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner
-from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.bandwidths import Bandwidths
+from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 

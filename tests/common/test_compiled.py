@@ -12,7 +12,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 
-from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.compiled import EntryPoint, remove_outdated
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 
 
@@ -89,7 +89,7 @@ def run(code, cache):
 COMPILE_TWO = """
 import gc
 import numpy as np
-from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.compiled import EntryPoint, remove_outdated
 from sb3_combrel.common.instances import Instances, put_instance_at
 from sb3_combrel.common.scaling import scale_into_box
 
@@ -119,7 +119,7 @@ import sb3_combrel
 from numba import njit
 from numba.core import event
 from sb3_combrel import COMBREL, FittedRMax
-from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.compiled import EntryPoint, remove_outdated
 
 def plus(x):
     return x + 1
@@ -161,3 +161,16 @@ def test_the_import_leaves_the_compilation_of_other_people_s_functions_alone(tmp
     printed, errors = run(OTHER_PEOPLE_S_FUNCTIONS, tmp_path)
     assert printed == "fine\n"
     assert MESSAGE not in errors, "only functions of this package are announced"
+
+
+def test_compiled_code_older_than_any_source_file_is_removed(tmp_path):
+    cache = tmp_path / "room" / "__pycache__"
+    cache.mkdir(parents=True)
+    for name, age in (("old.f-1.nbi", 100), ("new.f-1.nbi", 0), ("old.f-1.1.nbc", 100), ("a.cpython-311.pyc", 100)):
+        (cache / name).touch()
+        os.utime(cache / name, (2_000_000_000 - age,) * 2)
+    for name, age in (("a.py", 1000), ("room/b.py", 50)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (2_000_000_000 - age,) * 2)
+    remove_outdated([tmp_path])
+    assert sorted(file.name for file in cache.iterdir()) == ["a.cpython-311.pyc", "new.f-1.nbi", "old.f-1.1.nbc"]

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
-from sb3_combrel.mappings import AllActionMappings, BalancedActionMappings, ListedActionMappings
-from sb3_combrel.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.mappings import AllActionMappings, BalancedActionMappings, InterTaskMapping, ListedActionMappings, MappingSet
 
 
 def there_and_back(value):

@@ -3,8 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers.sources import Corridor, assert_same, some_source
 from gymnasium import spaces
+from helpers.sources import Corridor, assert_same, some_source
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -14,8 +14,8 @@ from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.transfer import compliance as compiled_compliance
 from sb3_combrel.transfer import equations
 from sb3_combrel.transfer import relevance as compiled_relevance
-from sb3_combrel.transfer.equations import Bandwidths, Transitions
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
+from sb3_combrel.transfer.equations import Bandwidths, Transitions
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))
