@@ -7,12 +7,12 @@ from numbers import Integral, Real
 import numpy as np
 
 
-def check_positive(name: str, value: object, *, largest: float = float("inf")) -> None:
+def check_positive(name: str, value: object, *, max: float = float("inf")) -> None:
     """
-    :raises ValueError: unless ``value`` is a number above 0 and not above ``largest``
+    :raises ValueError: unless ``value`` is a number above 0 and not above ``max``
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= largest or not math.isfinite(value):
-        limit = "" if largest == float("inf") else f" and at most {largest:g}"
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= max or not math.isfinite(value):
+        limit = "" if max == float("inf") else f" and at most {max:g}"
         raise ValueError(f"{name} must be a number above 0{limit}, got {value!r}")
 
 

@@ -60,7 +60,8 @@ class FittedRMax(PersistentAlgorithm):
 
     - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables and the box
       itself for more: far fewer states, and no worse learning.
-    - A pair that was known once stays known (the original falls back when a nearer instance shortens its list).
+    - What was known once stays known, on the grid and at exact states (the original falls back when a nearer instance
+      shortens the list).
     - Planning is bounded by ``max_backups`` a step, points around the agent first; the others are backed up later, most of
       them at an episode's end. Staying in a grid point is summed in closed form.
     - Where the agent returns to the same small cell many times in an episode, an interpolated value that is too high is
@@ -98,7 +99,8 @@ class FittedRMax(PersistentAlgorithm):
         where those are infinite
     :param stats_window_size: window size for the rollout logging, in episodes
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param policy_kwargs: additional arguments to be passed to the policy on creation; ``dict(model_class=...)`` for another
+        model of the dynamics, a subclass of :class:`~sb3_combrel.models.base.Model`
     :param verbose: verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: random seed, of the environment as well; None: the state of NumPy's own generator decides
     :param device: where the tensors of a saved policy go; the work is done on the CPU

@@ -40,10 +40,10 @@ class FittedRMaxSettings:
     def __post_init__(self) -> None:
         if self.model_breadth is not None:
             check_positive("model_breadth", self.model_breadth)
-        check_positive("min_fraction", self.min_fraction, largest=1.0)
-        check_positive("min_weight", self.min_weight, largest=0.99)
+        check_positive("min_fraction", self.min_fraction, max=1.0)
+        check_positive("min_weight", self.min_weight, max=0.99)
         check_positive("exploration_threshold", self.exploration_threshold)
-        check_positive("gamma", self.gamma, largest=1.0)
+        check_positive("gamma", self.gamma, max=1.0)
         check_positive("planning_tolerance", self.planning_tolerance)
         check_finite("max_value", self.max_value)
         check_count("max_backups", self.max_backups, min=0, max=MAX_BACKUPS, none_allowed=True)

@@ -128,10 +128,10 @@ def coarsest_in_reach(n_variables: int, reach: float) -> int:
     return max(1, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
 
 
-# Arrays of a pair and of a point when all of them are settled, from the sizes of ModelArrays and SweepQueue.
+# Arrays of a pair and of a point when all pairs have a model, from the sizes of KernelLists, MDPArrays and SweepQueue.
 BYTES_PER_PAIR = 1000
 BYTES_PER_POINT = 200
-MOST_PAIRS_BY_DEFAULT = 1_000_000
+MAX_PAIRS_BY_DEFAULT = 1_000_000
 
 
 def fitting_grid(
@@ -148,7 +148,7 @@ def fitting_grid(
     margin = 1 if n_variables <= 2 else 0
     if resolution is None:
         resolution = default_resolution(n_variables, reach)
-        while resolution > 1 and _n_points(n_variables, resolution, margin) * n_actions > MOST_PAIRS_BY_DEFAULT:
+        while resolution > 1 and _n_points(n_variables, resolution, margin) * n_actions > MAX_PAIRS_BY_DEFAULT:
             resolution -= 1
     n_points = _n_points(n_variables, resolution, margin)
     size = n_points * (n_actions * BYTES_PER_PAIR + BYTES_PER_POINT)

@@ -76,8 +76,8 @@ class DashboardCallback(BaseCallback):
     ):
         super().__init__(verbose)
         check_count("picture_freq", picture_freq, none_allowed=True)
-        check_positive("scalar_share", scalar_share, largest=1.0)
-        check_positive("picture_share", picture_share, largest=1.0)
+        check_positive("scalar_share", scalar_share, max=1.0)
+        check_positive("picture_share", picture_share, max=1.0)
         self.picture_freq = picture_freq
         self.variables = variables
         self.at = at

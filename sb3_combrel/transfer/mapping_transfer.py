@@ -66,8 +66,8 @@ class MappingTransfer(Transfer):
         bandwidths: tuple[float, float, float] | None,
     ):
         check_positive("breadth", breadth)
-        check_positive("breadth_decay", breadth_decay, largest=1.0)
-        check_positive("relevance_fraction", relevance_fraction, largest=1.0)
+        check_positive("breadth_decay", breadth_decay, max=1.0)
+        check_positive("relevance_fraction", relevance_fraction, max=1.0)
         if bandwidths is not None:
             if isinstance(bandwidths, str) or not isinstance(bandwidths, Sequence | np.ndarray) or len(bandwidths) != 3:
                 raise ValueError(f"bandwidths must be three numbers (start, outcome, reward) or None, got {bandwidths!r}")
