@@ -17,6 +17,7 @@ class Task:
     :param n_actions: number of actions
     :param state_names: names of the state variables, for display; by default s0, s1, ...
     :param action_names: names of the actions, for display; by default a0, a1, ...
+    :raises ValueError: if there are names, but not one for each variable or action
     """
 
     scaling: StateScaling
@@ -25,9 +26,12 @@ class Task:
     action_names: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        names = self.state_names or [f"s{k}" for k in range(self.n_variables)]
-        object.__setattr__(self, "state_names", tuple(names))
-        object.__setattr__(self, "action_names", tuple(self.action_names or [f"a{k}" for k in range(self.n_actions)]))
+        for argument, n, letter in (("state_names", self.n_variables, "s"), ("action_names", self.n_actions, "a")):
+            names = getattr(self, argument)
+            is_list = isinstance(names, Sequence) and not isinstance(names, str)
+            if not (is_list and len(names) in (0, n) and all(isinstance(name, str) for name in names)):
+                raise ValueError(f"{argument} must be {n} names or None, got {names!r}")
+            object.__setattr__(self, argument, tuple(names or (f"{letter}{k}" for k in range(n))))
 
     @property
     def n_variables(self) -> int:

@@ -13,8 +13,8 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_combrel.common.compiled import EntryPoint
-from sb3_combrel.common.scaling import StateScaling, scale_into_box
+from sb3_combrel.common.observations import ObservationScaler
+from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.loop_detection import EpisodeMemory, memories
@@ -24,8 +24,6 @@ from sb3_combrel.models.base import Model
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
-
-_scale_into_box = EntryPoint(scale_into_box)
 
 # What was the policy's in version 0.1.0, and where it is in the agent; the old names work for one version.
 MOVED_TO_AGENT = {
@@ -43,14 +41,6 @@ MOVED_TO_AGENT = {
     "state_names": "task.state_names",
     "action_names": "task.action_names",
 }
-
-
-def _check_names(state_names: Any, action_names: Any, observation_space: spaces.Space, action_space: spaces.Discrete) -> None:
-    shape = observation_space.shape or (0,)
-    for argument, names, n in (("state_names", state_names, shape[0]), ("action_names", action_names, int(action_space.n))):
-        is_list = isinstance(names, Sequence) and not isinstance(names, str)
-        if names is not None and not (is_list and len(names) in (0, n) and all(isinstance(name, str) for name in names)):
-            raise ValueError(f"{argument} must be {n} names or None, got {names!r}")
 
 
 class FittedRMaxPolicy(BasePolicy):
@@ -84,18 +74,17 @@ class FittedRMaxPolicy(BasePolicy):
         **settings: Any,
     ):
         super().__init__(observation_space, action_space, normalize_images=False)
-        _check_names(state_names, action_names, observation_space, action_space)
         if not (isinstance(model_class, type) and issubclass(model_class, Model)):
             raise ValueError(f"model_class must be a subclass of Model, got {model_class!r}")
         given = FittedRMaxSettings(**settings)
         self.scaling = StateScaling.from_space(observation_space, given.bounds)
-        task = Task(self.scaling, int(action_space.n), state_names or (), action_names or ())
+        names = (() if given_names is None else given_names for given_names in (state_names, action_names))
+        task = Task(self.scaling, int(action_space.n), *names)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
-        self._low, self._range = self.scaling.low.copy(), self.scaling.high - self.scaling.low
+        #: Observations, raw units, to unit coordinates; what is outside the bounds is moved to the boundary.
+        self.to_unit = ObservationScaler(self.scaling)
         self._first_action = int(action_space.start)
         self._settings = settings
-        self._episodes: tuple[Any, Any] = (None, None)
-        self._warned_outside = False
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not there otherwise.
@@ -115,32 +104,6 @@ class FittedRMaxPolicy(BasePolicy):
         parameters = {**spaces_of_both, **self._settings, "transfer": describe_transfer(self.transfer)}
         # A class is pickled by its name, and imported by who reads it: only one of the user's own has to be.
         return parameters if self.agent.model_class is KernelAverage else {**parameters, "model_class": self.agent.model_class}
-
-    def to_unit(self, observations: np.ndarray) -> np.ndarray:
-        """
-        Scale observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
-
-        :param observations: raw units, shape (..., n_variables)
-        :raises ValueError: if an observation is not finite
-        """
-        raw = np.ascontiguousarray(observations, dtype=np.float64)
-        inside = np.empty_like(raw)
-        flat = (-1, self.scaling.n_variables)
-        if _scale_into_box.call(raw.reshape(flat), self._low, self._range, inside.reshape(flat)):
-            self._check_outside(observations, self.scaling.to_unit(raw) - inside)
-        return inside
-
-    def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:
-        """Refuse what is not finite, warn once of what is outside the bounds by more than rounding."""
-        if not np.isfinite(excess).all():
-            raise ValueError(f"the environment returned an observation that is not finite: {observations}")
-        if not self._warned_outside and np.abs(excess).max() > 1e-6:
-            self._warned_outside = True
-            warnings.warn(
-                f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
-                "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)",
-                stacklevel=3,
-            )
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)

@@ -10,7 +10,7 @@ from helpers.dashboard import METHODS, Witness, events, scalars, slow_q, walker
 
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
-from sb3_combrel.transfer.compliance import default_bandwidths
+from sb3_combrel.transfer.bandwidths import default_bandwidths
 
 
 @pytest.mark.parametrize("method", METHODS)

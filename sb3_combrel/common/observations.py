@@ -1,0 +1,55 @@
+"""Observations of an environment as states in unit coordinates."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.scaling import StateScaling, scale_into_box
+
+_scale_into_box = EntryPoint(scale_into_box)
+# Excess over the bounds, in unit coordinates, that rounding can explain.
+ROUNDING = 1e-6
+
+
+class ObservationScaler:
+    """
+    Scales observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
+
+    :param scaling: raw <-> unit coordinates
+    """
+
+    def __init__(self, scaling: StateScaling):
+        self.scaling = scaling
+        # Compiled code takes arrays that can be written to, and those of the scaling cannot.
+        self._low, self._range = scaling.low.copy(), scaling.high - scaling.low
+        self._warned = False
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """
+        Scale observations.
+
+        :param observations: raw units, shape (..., n_variables)
+        :return: unit coordinates in [0, 1], same shape
+        :raises ValueError: if an observation is not finite
+        """
+        raw = np.ascontiguousarray(observations, dtype=np.float64)
+        inside = np.empty_like(raw)
+        flat = (-1, self.scaling.n_variables)
+        if _scale_into_box.call(raw.reshape(flat), self._low, self._range, inside.reshape(flat)):
+            self._check_outside(observations, self.scaling.to_unit(raw) - inside)
+        return inside
+
+    def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:
+        """Refuse what is not finite, warn once of what is outside the bounds by more than rounding."""
+        if not np.isfinite(excess).all():
+            raise ValueError(f"the environment returned an observation that is not finite: {observations}")
+        if not self._warned and np.abs(excess).max() > ROUNDING:
+            self._warned = True
+            warnings.warn(
+                f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
+                "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)",
+                stacklevel=3,
+            )
