@@ -17,7 +17,7 @@ from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.planning.corrections import MAX_VISITS, CorrectionArrays
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
-from sb3_combrel.planning.q_values import NOBODY, Prediction, QValues, ValueFunction
+from sb3_combrel.planning.q_values import NOBODY, PlainValueFunction, Prediction, QValues
 from sb3_combrel.planning.sweeping import NOWHERE, Planner
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
@@ -108,8 +108,11 @@ class FittedRMaxAgent:
         self.planner = Planner(
             self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=self.settings.planning_tolerance
         )
-        self.corrections = CorrectionArrays.empty(self.task.n_variables)
+        self._set_corrections(CorrectionArrays.empty(self.task.n_variables))
         self._outdated: list[np.ndarray] = []
+
+    def _set_corrections(self, corrections: CorrectionArrays) -> None:
+        self.corrections, self._plain_corrections = corrections, tuple(corrections)
 
     def reseed(self, rng: np.random.Generator) -> None:
         """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
@@ -142,7 +145,8 @@ class FittedRMaxAgent:
             return self._explore(state, episode) if explore else self._exploit(state, memory)
 
     def _explore(self, state: np.ndarray, episode: int) -> int:
-        self.corrections = self.corrections.with_room()
+        if self.corrections.n_states[0] == len(self.corrections.key):
+            self._set_corrections(self.corrections.with_room())
         prediction, given = self.model.predict_at(state)
         if given is not None:
             assert self.transfer is not None
@@ -192,8 +196,8 @@ class FittedRMaxAgent:
         self._q.compute(prediction, state, function, NOBODY)
         return prediction
 
-    def _value_function(self, values: np.ndarray) -> ValueFunction:
-        return ValueFunction(values, self.corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds)
+    def _value_function(self, values: np.ndarray) -> PlainValueFunction:
+        return values, self._plain_corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds
 
     # ---------------------------------------------------------------- learning
 
@@ -324,7 +328,7 @@ class FittedRMaxAgent:
             self.model.set_state(state)
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
             self.planner.restore(state["values"])
-            self.corrections = CorrectionArrays.of_rows(state["corrections"])
+            self._set_corrections(CorrectionArrays.of_rows(state["corrections"]))
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

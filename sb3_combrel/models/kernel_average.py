@@ -107,13 +107,14 @@ class KernelAverage(Model):
 
     def _slot_for(self, action: int) -> tuple[int, np.ndarray]:
         """Where a new instance goes, and the pairs that lost one to make room."""
-        size = int(self.instances.size[action])
+        instances = self._instances
+        size = int(instances.size[action])
         if self.settings.max_instances is not None and size >= self.settings.max_instances:
             slot = int(self.arrays.n_lists[action, :size].argmin())
             return slot, self._leave(action, slot)
-        self.instances = self.instances.with_room(action)
-        room = self.arrays.n_lists.shape[1]
-        if room < self.instances.capacity:
+        if size == instances.capacity:
+            self.instances = instances.with_room(action)
+            room = self.arrays.n_lists.shape[1]
             larger = self._of_instances()
             for name, array in larger.items():
                 array[:, :room] = getattr(self.arrays, name)
@@ -158,7 +159,7 @@ class KernelAverage(Model):
         return np.flatnonzero(~arrays.known & (arrays.total != arrays.last_total))
 
     def update_rows(self, pairs: np.ndarray) -> None:
-        mdp, instances, arrays = self.mdp, self.instances, self._plain_arrays
+        mdp, instances, arrays = self.mdp, self._instances, self._plain_arrays
         transferred = tuple(self._transferred_to(pairs))
         outcomes = instances.effect, instances.reward, instances.terminated
         done = 0

@@ -237,11 +237,14 @@ def note_corners(arrays, effect, grid, action, slot):
 
 
 @part
-def add_instance(p, arrays, effect, action, i, point, scratch, grid, n_touched):
+def add_instance(p, arrays, instance, effect, point, scratch, grid, n_touched):
     """Add the successors of an instance, of probability ``p``, at a grid point with coordinates ``scratch.at``.
 
+    :param instance: (action, number)
+    :param effect: of the instance
     :return: see ``add_successor``
     """
+    action, i = instance
     for k in range(len(grid.shape)):
         low = scratch.at[k] + arrays.corner_low[action, i, k]
         if low < 0 or low + 1 >= grid.shape[k]:
@@ -275,7 +278,7 @@ def add_own(arrays, outcomes, pair, total, grid, scratch):
         reward += p * outcomes.reward[action, i]
         if not outcomes.terminated[action, i]:
             effect = outcomes.effect[action, i]
-            n_touched = add_instance(p, arrays, effect, action, i, point, scratch, grid, n_touched)
+            n_touched = add_instance(p, arrays, (action, i), effect, point, scratch, grid, n_touched)
     return reward, n_touched
 
 

@@ -47,20 +47,20 @@ class ValueFunction(NamedTuple):
 
     :param values: float64, shape (n_points,), at the grid points
     :param corrections: caps on what is interpolated between them
-    :param grid: the arrays of the grid; from Python, ``StateGrid.plain``
+    :param grid: the grid
     :param gamma: discount factor
     :param bounds: (min_value, max_value); an optimistic action has the latter
     """
 
     values: np.ndarray
     corrections: CorrectionArrays
-    grid: Any
+    grid: GridArrays
     gamma: float
     bounds: tuple[float, float]
 
-    def plain(self) -> tuple[Any, ...]:
-        """The same as plain tuples (see ``common.compiled``)."""
-        return self.values, tuple(self.corrections), self.grid, self.gamma, self.bounds
+
+# The same as plain tuples (see ``common.compiled``).
+PlainValueFunction = tuple[np.ndarray, tuple[Any, ...], tuple[Any, ...], float, tuple[float, float]]
 
 
 @inlined
@@ -161,15 +161,16 @@ class QValues:
         self,
         prediction: Prediction,
         state: np.ndarray,
-        function: ValueFunction,
+        function: PlainValueFunction,
         visitor: tuple[int, float, int] = NOBODY,
     ) -> int:
         """
         Compute :attr:`q` at a state from what the model predicts there.
 
         :param state: unit coordinates, shape (n_variables,)
+        :param function: a ValueFunction as plain tuples
         :param visitor: who is there: (episode, tolerance, max_visits), see ``corrections.visit``
         :return: the best action, -1 if several are
         """
-        best: int = _evaluate_actions.call(tuple(prediction), state, function.plain(), self.q, visitor, self._scratch)
+        best: int = _evaluate_actions.call(tuple(prediction), state, function, self.q, visitor, self._scratch)
         return best

@@ -73,7 +73,7 @@ class TransitionRecorder(BaseCallback):
                 "record the trained model with SourceInstances.record(model, env)"
             )
         step = (self.locals["new_obs"], self.locals["rewards"], self.locals["dones"], self.locals["infos"])
-        self._states = _log_step(self.log, self.training_env, self._states, self.locals["actions"], *step)
+        self._states = _log_step(self.log, self.training_env, self._states, self.locals["actions"], step)
         return True
 
     def transitions(self) -> Transitions:
@@ -115,8 +115,9 @@ def record(
             starts = np.ones(venv.num_envs, dtype=bool)
             while len(log) < n_instances:
                 actions = act(seen, states, starts)
-                seen, rewards, starts, infos = venv.step(actions)  # type: ignore[assignment]
-                states = _log_step(log, venv, states, actions, seen, rewards, starts, infos, n_instances)
+                step = venv.step(actions)
+                states = _log_step(log, venv, states, actions, step, n_instances)
+                seen, _, starts, _ = step  # type: ignore[assignment]
         origin = describe_origin(venv, _recorder_name(model), seed)
         return log.transitions(scaling, n_actions, task_names(venv), origin)
     finally:
@@ -129,13 +130,18 @@ def _log_step(
     env: VecEnv,
     states: NDArray[Any],
     actions: NDArray[Any],
-    seen: Any,
-    rewards: NDArray[Any],
-    dones: NDArray[Any],
-    infos: Sequence[Mapping[str, Any]],
+    step: tuple[Any, NDArray[Any], NDArray[Any], Sequence[Mapping[str, Any]]],
     max_transitions: int | None = None,
 ) -> NDArray[Any]:
-    """Add one step of all environments, up to ``max_transitions`` in all; returns the raw states in which they now are."""
+    """
+    Add one step of all environments.
+
+    :param states: raw states in which the step began; ``actions``: what was done there
+    :param step: what ``env.step`` returned: states as a model sees them, rewards, dones, infos
+    :param max_transitions: up to so many in all
+    :return: the raw states in which the environments now are
+    """
+    seen, rewards, dones, infos = step
     normalize = unwrap_vec_normalize(env)
     following = np.array(seen if normalize is None else normalize.get_original_obs())
     rewards = rewards if normalize is None else normalize.get_original_reward()

@@ -1,28 +1,13 @@
-"""Kernel bandwidths of compliance and relevance, chosen from a source's instances."""
-
-from typing import NamedTuple
+"""Kernel bandwidths of compliance and relevance, chosen from a source's instances and a mapping's variables."""
 
 import numpy as np
 
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.equations import Bandwidths
 
 # So many instances are to share in a prediction, typically.
 N_SHARING = 20
-
-
-class Bandwidths(NamedTuple):
-    """
-    Bandwidths delta of phi(x) = exp(-x^2 / delta), in unit coordinates (reward: raw).
-
-    :param start: of the distance between the states where two transitions start (delta_sa)
-    :param outcome: of the distance between outcomes (delta_s')
-    :param reward: of the difference of rewards (delta_r)
-    """
-
-    start: float
-    outcome: float
-    reward: float
 
 
 def default_bandwidths(source: Instances) -> Bandwidths:
@@ -54,54 +39,22 @@ def default_bandwidths(source: Instances) -> Bandwidths:
 
 def start_bandwidths(candidates: Candidates, start: float) -> np.ndarray:
     """
-    Choose the start bandwidth of every state mapping, by the variables that it compares.
+    Choose the start bandwidth of every state mapping, in proportion to how many variables it compares.
 
-    A distance over three or four variables is longer than one over two, so with the same bandwidth a mapping of more
-    variables would have less evidence, for no other reason. ``start`` is for mappings that use every source variable once;
-    others get as many times more or less as their squared distance to the 20th instance is (the median again). Distances
-    are from states that are like the target's: a variable that is used once more varies independently of the others, so it
-    is taken from another of the source's instances.
+    A squared distance over more variables has more terms. With this bandwidth an instance that is equally far along each
+    variable weighs the same, however many there are, so mappings of more variables do not lose evidence for that reason.
+    They still have less where a source variable is used twice, off the diagonals on which translated instances lie: no
+    instance is near there. Bandwidths that make up for this as well (4 to 13 times as large) have such mappings selected
+    where their instances are of no use: 12 episodes of MountainCar4D with ``mappings="all"`` took 4,428 +- 180 steps
+    instead of 3,819 +- 150 (12 seeds; with one bandwidth for all 3,666 +- 87).
 
     :param candidates: the candidates, with all state mappings
-    :param start: start bandwidth for mappings that use every source variable once
+    :param start: start bandwidth for mappings that compare as many variables as their source has
     :return: float64, shape (n_state_mappings,)
     """
-    found, row, action = np.full(len(candidates.table.variable), start), 0, 0
-    for source, mappings in zip(candidates.sources, candidates.sets, strict=True):
-        actions = range(action, action + source.n_actions)
-        states = [candidates.instances.state[a, : candidates.instances.size[a]] for a in actions]
-        usual = _squared_distance(states, (1,) * source.n_variables)
-        ratios: dict[tuple[int, ...], float] = {}
-        for index in mappings.state_mappings:
-            counts = tuple(np.bincount(index[index >= 0], minlength=source.n_variables).tolist())
-            if counts not in ratios:
-                ratios[counts] = _squared_distance(states, counts) / usual if usual > 0.0 and set(counts) != {1} else 1.0
-            # Instances that are all alike in the variables compared have no distance.
-            found[row] = max(start * ratios[counts], 1e-6)
-            row += 1
-        action += source.n_actions
-    return found
-
-
-def _squared_distance(states: list[np.ndarray], counts: tuple[int, ...]) -> float:
-    """
-    Return the median squared distance to the 20th instance of the same action; 0 if no action has two.
-
-    :param states: states of the instances of each action
-    :param counts: how often each source variable is used
-    """
-    from scipy.spatial import cKDTree
-
-    columns = np.repeat(np.arange(len(counts)), counts)
-    copy = np.concatenate([np.arange(n) for n in counts])
-    rng = np.random.default_rng(0)
-    distances = []
-    for of_action in states:
-        n = len(of_action)
-        if n > 1:
-            others = [np.arange(n), *(rng.permutation(n) for _ in range(1, max(counts)))]
-            queries = np.column_stack([of_action[others[c], k] for k, c in zip(columns, copy, strict=True)])
-            # With repeated variables no instance is at a distance of 0; without, each is its own nearest.
-            nth = min(N_SHARING, n - 1) + (max(counts) == 1)
-            distances.append(cKDTree(of_action[:, columns]).query(queries, k=[nth])[0].ravel())
-    return float(np.median(np.concatenate(distances))) ** 2 if distances else 0.0
+    fractions = [
+        (mappings.state_mappings >= 0).sum(axis=1) / source.n_variables
+        for source, mappings in zip(candidates.sources, candidates.sets, strict=True)
+    ]
+    # A mapping of no variables compares nothing; the bandwidth must be above 0 all the same.
+    return np.maximum(start * np.concatenate(fractions), 1e-6)

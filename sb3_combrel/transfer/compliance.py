@@ -13,8 +13,8 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner_fast, part
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.candidates import MappingTable
+from sb3_combrel.transfer.equations import Bandwidths
 
 # The weight of one instance at a distance of sqrt(2.3 delta). Where the sum of start kernels is less, no instance is near
 # enough to be evidence: normalized, a far instance would look as good as a near one.
@@ -224,7 +224,7 @@ def _still_factors(effect, mappings, bandwidth, still):
         still[m] = np.exp(-missed / bandwidth)
 
 
-@compiled
+@part
 def transition_compliance(state, effect, reward, source, mappings, bandwidths, scratch, table):
     """
     Compute the compliance of one target transition through every state mapping, for every source action (Eq. 5).
@@ -246,6 +246,13 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
         _kernel_factors(state, effect, reward, source, action, bandwidths, scratch)
         for m in range(mappings.variable.shape[0]):
             table[m, action] = scratch.still[m] * _mapping_compliance(m, source.size[action], scratch)
+
+
+@compiled
+def transition_compliance_plain(state, effect, reward, source, mappings, bandwidths, scratch, table):
+    """:func:`transition_compliance` for callers from Python, with plain tuples."""
+    source, mappings, scratch = Instances(*source), MappingTable(*mappings), ComplianceScratch(*scratch)
+    transition_compliance(state, effect, reward, source, mappings, Bandwidths(*bandwidths), scratch, table)
 
 
 def no_change_compliance(effect: np.ndarray, reward: float, rewards: RewardCounts, bandwidths: Bandwidths) -> float:

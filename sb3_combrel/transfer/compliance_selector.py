@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
-from sb3_combrel.transfer.bandwidths import Bandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.compliance import (
     ComplianceScratch,
     RewardCounts,
     no_change_compliance,
-    transition_compliance,
+    transition_compliance_plain,
 )
-from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose, find_nearest
+from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.selectors import Ranges, Selector
 
@@ -23,13 +25,14 @@ from sb3_combrel.transfer.selectors import Ranges, Selector
 RENEWAL_GROWTH = 1.2
 NO_DRAWS = np.empty(0)
 
+_transition_compliance, _add_to_sample = EntryPoint(transition_compliance_plain), EntryPoint(add_to_sample)
+_choose, _select = EntryPoint(choose_plain), EntryPoint(select_plain)
 
-class ComplianceSelector(Selector):
+
+@dataclass(frozen=True)
+class SelectionOptions:
     """
-    Selects the candidate with the highest mean compliance with the nearest recorded transitions (Algorithm 1).
-
-    The methods stand in the order of the algorithm. It computes the compliance of every transition of the first episode
-    (lines 9-13); here that of a transition is computed when a choice first needs it.
+    How candidates are selected by compliance.
 
     :param bandwidths: of compliance
     :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
@@ -43,6 +46,30 @@ class ComplianceSelector(Selector):
     :param min_compliance: a candidate's mean compliance must exceed this many times that of the no-change baseline
     """
 
+    bandwidths: Bandwidths
+    starts: np.ndarray
+    n_neighbors: int
+    all_actions: bool
+    neighbor_radius: float | None
+    drawn: bool
+    online: bool
+    max_transitions: int
+    min_evidence: float
+    min_compliance: float
+
+
+class ComplianceSelector(Selector):
+    """
+    Selects the candidate with the highest mean compliance with the nearest recorded transitions (Algorithm 1).
+
+    The methods stand in the order of the algorithm. It computes the compliance of every transition of the first episode
+    (lines 9-13); here that of a transition is computed when a choice first needs it.
+
+    Parameters: see :class:`~sb3_combrel.transfer.selectors.Selector`, and
+
+    :param options: how candidates are selected
+    """
+
     makes_choices = True
     needs_transitions = True
 
@@ -52,62 +79,55 @@ class ComplianceSelector(Selector):
         task: TargetTask,
         transitions: RecordedTransitions,
         rng: np.random.Generator,
-        *,
-        bandwidths: Bandwidths,
-        starts: np.ndarray,
-        n_neighbors: int,
-        all_actions: bool,
-        neighbor_radius: float | None,
-        drawn: bool,
-        online: bool,
-        max_transitions: int,
-        min_evidence: float,
-        min_compliance: float,
+        options: SelectionOptions,
     ):
         super().__init__(candidates, task, transitions, rng)
-        self.bandwidths = bandwidths
-        self.n_neighbors = n_neighbors
-        self.all_actions = all_actions
-        self.drawn = drawn
-        self.online = online
-        self.max_transitions = max_transitions
-        self.min_compliance = min_compliance
+        self.options = options
         # An empty place counts as a neighbour at the limit: what is farther away does not enter.
-        self.limit = np.inf if neighbor_radius is None else float(neighbor_radius) ** 2
+        self.limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
         self.first_episode = True
         self.n_switches = 0
-        self._scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances, starts, min_evidence)
         self._allocate()
+        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
+        scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances, options.starts, options.min_evidence)
+        source, mappings = tuple(candidates.instances), tuple(candidates.table)
+        self._measuring = source, mappings, tuple(options.bandwidths), tuple(scratch), self._table
+        self._limits = float(task.exploration_threshold), self.limit
 
     def _allocate(self) -> None:
         """Make the arrays: compliance of transitions, nearest transitions and choices."""
         candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
         n_rows, n_source_actions = len(candidates.table.variable), len(candidates.instances.size)
+        n_neighbors = self.options.n_neighbors
         self._table = np.empty((n_rows, n_source_actions))
         # Where in that table the candidates of each action stand.
         columns = candidates.arrays.row * n_source_actions + candidates.arrays.action
         self._columns = np.split(columns, self.first[1:-1])
         self._rewards = RewardCounts.of_instances(candidates.instances)
-        self._cache = ComplianceCache.empty(int(np.diff(self.first).max()))
+        self._set_cache(ComplianceCache.empty(int(np.diff(self.first).max())))
         self._listed = np.empty((n_actions, 64), dtype=np.int64)
         self._n_listed = np.zeros(n_actions, dtype=np.int64)
-        self._near = np.full((n_actions, n_points, self.n_neighbors), -1, dtype=np.int64)
-        self._distance = np.full((n_actions, n_points, self.n_neighbors), self.limit)
+        # Variable by variable: the loop over all states reads them in a row.
+        self._sample = np.ascontiguousarray(self.task.sample_states.T)
+        self._apart = np.empty(n_points)
+        self._near = np.full((n_actions, n_points, n_neighbors), -1, dtype=np.int64)
+        self._distance = np.full((n_actions, n_points, n_neighbors), self.limit)
+        self._near_of_pair = self._near.reshape(-1, n_neighbors)
         self._choice = np.full(n_actions * n_points, -1, dtype=np.int64)
         self._due = np.zeros((n_actions, n_points), dtype=np.bool_)
         self._renewal_due = 0.0
         # Nothing is asked before the first transition. To draw here would change what a loaded model draws.
-        self._draws_at = np.zeros(n_actions) if self.drawn else NO_DRAWS
+        self._draws_at = np.zeros(n_actions) if self.options.drawn else NO_DRAWS
         self._make_room_at(n_actions)
-        self._transition_compliance, self._add_to_sample, self._choose, self._find_nearest = map(
-            EntryPoint, (transition_compliance, add_to_sample, choose, find_nearest)
-        )
+
+    def _set_cache(self, cache: ComplianceCache) -> None:
+        self._cache, self._plain_cache = cache, tuple(cache)
 
     def _make_room_at(self, n: int) -> None:
-        """Make work space for ``n`` exact states."""
-        self._near_at = np.empty((n, self.n_neighbors), dtype=np.int64)
-        self._distance_at = np.empty((n, self.n_neighbors))
-        self._choice_at = np.empty(n, dtype=np.int64)
+        """Make work space for ``n`` exact states: nearest transitions, their distances, and the candidates selected."""
+        shape = n, self.options.n_neighbors
+        first, last = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+        self._found_at = np.empty(shape, dtype=np.int64), np.empty(shape), first, last
 
     # ------------------------------------------------- lines 6-8: record transitions of the first episode, or of all
 
@@ -116,19 +136,19 @@ class ComplianceSelector(Selector):
         self._draws_at = self._draws(self.task.n_actions)
 
     def takes_transitions(self) -> bool:
-        return self.transitions.n < self.max_transitions and (self.first_episode or self.online)
+        return self.transitions.n < self.options.max_transitions and (self.first_episode or self.options.online)
 
     def add_transition(self, i: int) -> None:
-        if self.online or not self.first_episode:
+        if self.options.online or not self.first_episode:
             self._use(i)
 
     def n_used(self) -> int:
-        return self.transitions.n if self.online or not self.first_episode else 0
+        return self.transitions.n if self.options.online or not self.first_episode else 0
 
     def end_episode(self) -> bool:
         # At an episode's end there is time to renew all choices that are due.
         self._renewal_due = 0.0
-        ends_recording = self.first_episode and not self.online
+        ends_recording = self.first_episode and not self.options.online
         if ends_recording:
             for i in range(self.transitions.n):
                 self._use(i)
@@ -142,37 +162,29 @@ class ComplianceSelector(Selector):
         near = near[near >= 0]
         for i in set(near[~self._cache.measured[near]].tolist()):
             effect, reward = self.transitions.effects[i], float(self.transitions.rewards[i])
-            self._transition_compliance(
-                self.transitions.states[i],
-                effect,
-                reward,
-                self.candidates.instances,
-                self.candidates.table,
-                self.bandwidths,
-                self._scratch,
-                self._table,
-            )
+            _transition_compliance.call(self.transitions.states[i], effect, reward, *self._measuring)
             compliance = self._table.ravel()[self._columns[int(self.transitions.actions[i])]]
             self._cache.compliance[i, : len(compliance)] = compliance
-            no_change = no_change_compliance(effect, reward, self._rewards, self.bandwidths)
-            self._cache.required[i] = self.min_compliance * no_change
+            no_change = no_change_compliance(effect, reward, self._rewards, self.options.bandwidths)
+            self._cache.required[i] = self.options.min_compliance * no_change
             self._cache.measured[i] = True
 
     # --------------------------------------------- lines 15-16: for each state and action with too few data of its own
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         n = len(actions)
-        if n > len(self._choice_at):
+        if n > len(self._found_at[0]):
             self._make_room_at(2 * n)
-        near = self._find_neighbors(states, actions, own_weight)
-        self._measure(near)
-        draws = self._draws_at[actions] if self.drawn else NO_DRAWS
-        # Rows are overwritten where the choice changes, in order: never one that is still to come.
-        self._choose(np.arange(n), actions, near, self._cache, self.first, draws, self._choice_at)
-        return _range(self._choice_at[:n])
+        near, _, first, last = self._found_at
+        query, recorded = (states, actions, own_weight), (self.transitions.states, self._listed, self._n_listed)
+        while not _select.call(query, recorded, self._limits, self._plain_cache, self.first, self._draws_at, self._found_at):
+            self._measure(near[:n])
+        return first[:n], last[:n]
 
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        return _range(self._choice[actions * len(self.task.sample_states) + points])
+        chosen = self._choice[actions * self._near.shape[1] + points]
+        first = np.maximum(chosen, 0)
+        return first, first + (chosen >= 0)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         if self.transitions.n < self._renewal_due:
@@ -187,8 +199,9 @@ class ComplianceSelector(Selector):
 
     def _use(self, i: int) -> None:
         """Make transition ``i`` a neighbour for its action, or for all."""
-        self._cache = self._cache.with_room(i)
-        for action in range(self.task.n_actions) if self.all_actions else [int(self.transitions.actions[i])]:
+        if i >= len(self._cache.required):
+            self._set_cache(self._cache.with_room(i))
+        for action in range(self.task.n_actions) if self.options.all_actions else [int(self.transitions.actions[i])]:
             self._use_for(i, action)
 
     def _use_for(self, i: int, action: int) -> None:
@@ -199,40 +212,24 @@ class ComplianceSelector(Selector):
         self._listed[action, n] = i
         self._n_listed[action] += 1
         near, distance, due = self._near[action], self._distance[action], self._due[action]
-        self._add_to_sample(i, self.transitions.states[i], self.task.sample_states, near, distance, due)
-
-    def _find_neighbors(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> np.ndarray:
-        """Return the nearest transitions of exact states, shape (n, n_neighbors)."""
-        near = self._near_at[: len(actions)]
-        self._find_nearest(
-            states,
-            actions,
-            own_weight,
-            self.task.exploration_threshold,
-            self.transitions.states,
-            self._listed,
-            self._n_listed,
-            self.limit,
-            near,
-            self._distance_at,
-        )
-        return near
+        _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
 
     # -------------------------------------- lines 19-20: mean compliance of the neighbours, and the best candidate
 
     def _renew(self, pairs: np.ndarray) -> np.ndarray:
         """Renew the choices of pairs of the sample; return those that changed."""
-        near = self._near.reshape(-1, self.n_neighbors)
+        near = self._near_of_pair
         self._measure(near[pairs])
         rows, actions = pairs.copy(), pairs // len(self.task.sample_states)
-        n_changed = self._choose(rows, actions, near, self._cache, self.first, self._draws(len(pairs)), self._choice)
+        draws = self._draws(len(pairs))
+        n_changed = int(_choose.call(rows, actions, near, self._plain_cache, self.first, draws, self._choice))
         self._due.ravel()[pairs] = False
         self.n_switches += n_changed
         return rows[:n_changed]
 
     def _draws(self, n: int) -> np.ndarray:
         """Draw random numbers for so many choices, if they are drawn."""
-        return self.rng.random(n) if self.drawn else NO_DRAWS
+        return self.rng.random(n) if self.options.drawn else NO_DRAWS
 
     # ------------------------------------------------------------------------------ figures, saving
 
@@ -246,7 +243,7 @@ class ComplianceSelector(Selector):
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
         :return: float64, shape (n,); NaN where nothing is chosen
         """
-        near = self._near.reshape(-1, self.n_neighbors)[pairs]
+        near = self._near_of_pair[pairs]
         self._measure(near)
         counted = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
         chosen = np.maximum(self._choice[pairs], 0)[:, None]
@@ -288,9 +285,3 @@ class ComplianceSelector(Selector):
             "transfer/distinct_mappings": len(shares),
             "transfer/target_transitions": self.transitions.n,
         }
-
-
-def _range(chosen: np.ndarray) -> Ranges:
-    """Return the range of one candidate, or of none where it is -1."""
-    first = np.maximum(chosen, 0)
-    return first, first + (chosen >= 0)

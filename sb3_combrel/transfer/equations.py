@@ -50,7 +50,7 @@ class Transitions(NamedTuple):
 
 
 class Bandwidths(NamedTuple):
-    """Bandwidths delta of the kernel :func:`phi`.
+    """Bandwidths delta of the kernel :func:`phi`, in squared units of the distances: unit coordinates, rewards raw.
 
     :param start: delta_sa, of the distance between the states where two transitions start
     :param outcome: delta_s', of the distance between an outcome and the predicted one

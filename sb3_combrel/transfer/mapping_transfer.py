@@ -13,9 +13,10 @@ import numpy as np
 from sb3_combrel.common.checks import check_positive
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.bandwidths import Bandwidths, default_bandwidths, start_bandwidths
+from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike
+from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
@@ -139,12 +140,12 @@ class MappingTransfer(Transfer):
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         self._last_selected = self._selector.select(states, actions, own_weight)
-        return self._translator(states, own_weight, *self._last_selected)
+        return self._translator(states, own_weight, self._last_selected)
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         assert self.task is not None
         selected = self._selector.select_at_sample(points, actions, own_weight)
-        return self._translator(self.task.sample_states[points], own_weight, *selected)
+        return self._translator(self.task.sample_states[points], own_weight, selected)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         if self._all_changed:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inner
+from sb3_combrel.common.compiled import compiled, inner, part
 
 
 class ComplianceCache(NamedTuple):
@@ -44,23 +44,28 @@ class ComplianceCache(NamedTuple):
 
 
 @compiled
-def add_to_sample(i, state, sample_states, near, distance, due):
+def add_to_sample(i, state, sample_states, near, distance, due, apart):
     """
     Add transition ``i`` to the nearest ones of every sample state that has it among them.
 
+    :param sample_states: one variable a row, shape (n_variables, n_points): many states at once in vector registers
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
     :param distance: squared distances to them, the limit for none, updated
     :param due: bool, shape (n_points,): becomes True where it was added: the choice there has to be renewed
+    :param apart: float64 scratch, shape (n_points,)
     """
-    n_points, d = sample_states.shape
+    n_points = len(apart)
     last = near.shape[1] - 1
+    apart[:] = 0.0
+    for v in range(len(state)):
+        at = state[v]
+        of_sample = sample_states[v]
+        for p in range(n_points):
+            along = of_sample[p] - at
+            apart[p] += along * along
     for p in range(n_points):
-        apart = 0.0
-        for v in range(d):
-            along = sample_states[p, v] - state[v]
-            apart += along * along
-        if apart < distance[p, last]:
-            add_neighbor(i, apart, near[p], distance[p])
+        if apart[p] < distance[p, last]:
+            add_neighbor(i, apart[p], near[p], distance[p])
             due[p] = True
 
 
@@ -76,19 +81,22 @@ def add_neighbor(i, apart, near, distance):
     near[k] = i
 
 
-@compiled
-def find_nearest(states, actions, own_weight, threshold, recorded, listed, n_listed, limit, near, distance):
+@part
+def find_nearest(query, recorded, limits, near, distance):
     """
     Find the nearest transitions of exact states and actions (line 17).
 
-    :param states: shape (n, n_variables); ``actions``: shape (n,)
-    :param own_weight: shape (n,); where it reaches ``threshold`` none are needed, and none are found
-    :param recorded: states of the recorded transitions
-    :param listed: int64, shape (n_actions, capacity): the transitions that count for each action; the first ``n_listed``
-    :param limit: squared distance from which on a transition does not count
-    :param near: receives the transitions, the nearest first, -1 for none, shape (at required n, n_neighbors)
+    :param query: (states, actions, own_weight), shapes (n, n_variables), (n,) and (n,): where ``own_weight`` reaches the
+        threshold none are needed, and none are found
+    :param recorded: (states of the recorded transitions; those that count for each action, int64, shape (n_actions,
+        capacity); how many these are, shape (n_actions,))
+    :param limits: (threshold, squared distance from which on a transition does not count)
+    :param near: receives the transitions, the nearest first, -1 for none, int64, shape (at least n, n_neighbors)
     :param distance: float64 scratch, same shape
     """
+    states, actions, own_weight = query
+    at, listed, n_listed = recorded
+    threshold, limit = limits
     last = near.shape[1] - 1
     for r in range(len(actions)):
         near[r] = -1
@@ -100,7 +108,7 @@ def find_nearest(states, actions, own_weight, threshold, recorded, listed, n_lis
             i = listed[action, n]
             apart = 0.0
             for v in range(states.shape[1]):
-                along = recorded[i, v] - states[r, v]
+                along = at[i, v] - states[r, v]
                 apart += along * along
             if apart < distance[r, last]:
                 add_neighbor(i, apart, near[r], distance[r])
@@ -145,7 +153,7 @@ def choose_one(near, compliance, required, n_candidates, draw, total):
     return best
 
 
-@compiled
+@part
 def choose(rows, actions, near, cache, first, draws, choice):
     """
     Renew the choices of some rows; those for which it changed are moved to the front of ``rows``.
@@ -173,3 +181,40 @@ def choose(rows, actions, near, cache, first, draws, choice):
             rows[n_changed] = row
             n_changed += 1
     return n_changed
+
+
+@compiled
+def choose_plain(rows, actions, near, cache, first, draws, choice):
+    """:func:`choose` for callers from Python, with plain tuples."""
+    return choose(rows, actions, near, ComplianceCache(*cache), first, draws, choice)
+
+
+@compiled
+def select_plain(query, recorded, limits, cache, first, draws, found):
+    """
+    Choose candidates for exact states and actions (lines 17-20), if all that are needed have been measured.
+
+    :param query: see :func:`find_nearest`; ``recorded`` and ``limits``: the same
+    :param cache: ComplianceCache as a plain tuple
+    :param first: see ``CandidateArrays``
+    :param draws: a random number for each action; or nothing, shape (0,): the best is chosen (see ``choose_one``)
+    :param found: (nearest transitions, scratch for their distances, first candidate, one past the last: none if equal); see
+        :func:`find_nearest` for the first two; the others int64, shape (at least n,)
+    :return: whether all nearest transitions have been measured; otherwise nothing is chosen
+    """
+    cache = ComplianceCache(*cache)
+    _, actions, _ = query
+    near, distance, begin, end = found
+    find_nearest(query, recorded, limits, near, distance)
+    for r in range(len(actions)):
+        for k in range(near.shape[1]):
+            if near[r, k] >= 0 and not cache.measured[near[r, k]]:
+                return False
+    for r in range(len(actions)):
+        action = actions[r]
+        draw = draws[action] if len(draws) > 0 else -1.0
+        n_candidates = first[action + 1] - first[action]
+        chosen = choose_one(near[r], cache.compliance, cache.required, n_candidates, draw, cache.total)
+        begin[r] = chosen + first[action] if chosen >= 0 else 0
+        end[r] = begin[r] + 1 if chosen >= 0 else 0
+    return True

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inner
-from sb3_combrel.transfer.bandwidths import Bandwidths
+from sb3_combrel.common.compiled import EntryPoint, compiled, inner
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 
@@ -29,23 +29,15 @@ def renew_relevance(
     for c, origin in enumerate(candidates.origins):
         rows = np.flatnonzero(transitions.actions[:n_used] == origin.target_action)
         row = candidates.arrays.row[c]
-        relevance(
-            transitions.states[rows],
-            transitions.effects[rows],
-            transitions.rewards[rows],
-            candidates.instances,
-            candidates.arrays.action[c],
-            candidates.table.variable[row],
-            candidates.table.sign[row],
-            bandwidths._replace(start=float(starts[row])),
-            mu,
-            np.empty(len(rows)),
-            values[c],
-        )
+        target = transitions.states[rows], transitions.effects[rows], transitions.rewards[rows]
+        mapping = candidates.table.variable[row], candidates.table.sign[row]
+        of_row = bandwidths._replace(start=float(starts[row]))
+        action, weight = candidates.arrays.action[c], np.empty(len(rows))
+        _relevance.call(target, candidates.instances, action, mapping, of_row, mu, weight, values[c])
 
 
 @compiled
-def relevance(states, effects, rewards, source, action, index, sign, bandwidths, mu, weight, values):
+def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
     """
     Compute the relevance of the source instances of one action, through one state mapping, to target transitions.
 
@@ -54,12 +46,16 @@ def relevance(states, effects, rewards, source, action, index, sign, bandwidths,
     transitions, as many as weigh less than the fraction ``mu`` of all together, but at least one (Eq. 4). Without
     transitions everything is relevant.
 
-    :param states: target states of one target action, unit coordinates, shape (n, n_target_variables)
-    :param effects: next states minus states; ``rewards``: shape (n,)
-    :param index: source variable of each target variable, -1 for none; ``sign``: -1 where mirrored
+    :param target: (states, effects, rewards) of the transitions with one target action: unit coordinates, shape (n,
+        n_target_variables); next states minus states, same shape; raw, shape (n,)
+    :param source: Instances of the source; ``action``: the source action
+    :param mapping: (source variable of each target variable, -1 for none; sign, -1 where mirrored)
+    :param bandwidths: of Eq. 2; ``mu``: fraction of the weight of Eq. 4
     :param weight: float64 scratch, shape (n,)
     :param values: receives the relevances, at least as many as ``source.size[action]``
     """
+    states, effects, rewards = target
+    index, sign = mapping
     n, d = states.shape
     for j in range(source.size[action]):
         total = 0.0
@@ -115,3 +111,6 @@ def _mean_distance(weight, total, mu, bandwidth):
         weight[best] = -1.0
         n_taken += 1
     return distance / max(n_taken, 1)
+
+
+_relevance = EntryPoint(relevance)

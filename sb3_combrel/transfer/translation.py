@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, part
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
 from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.selectors import Ranges
 
 # Instances of a state and action by distance, at most; by relevance room is made for as many as it takes.
 MAX_TRANSFERRED = 32
@@ -60,9 +61,9 @@ class CandidateMappings(NamedTuple):
     sign: np.ndarray
 
 
-class TransferRules(NamedTuple):
+class TranslationRules(NamedTuple):
     """
-    When and how instances are transferred.
+    When and how instances are translated: ``equations.TransferRules``, and two choices.
 
     :param threshold: weight that own and transferred instances must reach together
     :param breadth: kernel breadth of transferred instances, unit coordinates
@@ -112,6 +113,35 @@ class TranslationScratch(NamedTuple):
         )
 
 
+class TranslationArrays(NamedTuple):
+    """
+    All that the translator's loops read, and their work space.
+
+    :param source: the source instances
+    :param mappings: the candidates
+    :param rules: when and how instances are translated
+    :param relevance: float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
+    :param scratch: work space
+    """
+
+    source: SourceArrays
+    mappings: CandidateMappings
+    rules: TranslationRules
+    relevance: np.ndarray
+    scratch: TranslationScratch
+
+    def plain(self) -> tuple[Any, ...]:
+        """The same as plain tuples (see ``common.compiled``)."""
+        return tuple(self.source), tuple(self.mappings), tuple(self.rules), self.relevance, tuple(self.scratch)
+
+
+@inlined
+def as_arrays(plain):
+    """:class:`TranslationArrays` from plain tuples."""
+    source, mappings, rules = SourceArrays(*plain[0]), CandidateMappings(*plain[1]), TranslationRules(*plain[2])
+    return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]))
+
+
 @part
 def consider(j, candidate, weight, rank, own, kept, rules, scratch):
     """
@@ -152,15 +182,20 @@ def consider(j, candidate, weight, rank, own, kept, rules, scratch):
 
 
 @part
-def gather(state, source, action, variable, sign, rules, relevance, own, kept, scratch, candidate):
+def gather(state, own, candidate, arrays, kept):
     """
     Add the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` to the selected.
 
-    :param action: source action of the candidate; ``variable``, ``sign``: its state mapping
-    :param relevance: of the candidate's instances; read only if ``rules.by_relevance``
-    :param scratch: TranslationScratch, of which ``kept`` are filled
+    :param own: weight of the target's own instances at ``state``
+    :param arrays: TranslationArrays, whose scratch holds the selected
+    :param kept: how many there are
     :return: how many are now
     """
+    source, rules, scratch = arrays.source, arrays.rules, arrays.scratch
+    row = arrays.mappings.row[candidate]
+    action = arrays.mappings.action[candidate]
+    variable = arrays.mappings.variable[row]
+    sign = arrays.mappings.sign[row]
     scale = -1.0 / (rules.breadth * rules.breadth)
     far = np.log(rules.min_weight) / scale
     n_mapped = 0
@@ -187,7 +222,7 @@ def gather(state, source, action, variable, sign, rules, relevance, own, kept, s
                 apart += along * along
             if apart <= nearest:
                 weight = np.exp(apart * scale)
-                rank = relevance[j] if rules.by_relevance else weight
+                rank = arrays.relevance[candidate, j] if rules.by_relevance else weight
                 kept, enters = consider(j, candidate, weight, rank, own, kept, rules, scratch)
                 if enters > rules.min_weight and not rules.by_relevance:
                     nearest = np.log(enters) / scale * (1 + 1e-12)
@@ -214,8 +249,10 @@ def measure_blocks(low, high, size, n_mapped, variable, at, gap):
 
 
 @part
-def write_row(s, own, kept, source, mappings, rules, number, value, transferred):
+def write_row(s, own, kept, arrays, transferred):
     """Write the selected instances to row ``s`` of ``transferred``, if they and ``own`` reach the threshold."""
+    source, mappings, rules = arrays.source, arrays.mappings, arrays.rules
+    number, value = arrays.scratch.number, arrays.scratch.value
     total = own
     for n in range(kept):
         total += value[n, _WEIGHT]
@@ -234,39 +271,35 @@ def write_row(s, own, kept, source, mappings, rules, number, value, transferred)
             transferred.effect[s, n, v] = mappings.sign[row, v] * source.effect[action, j, k] if k >= 0 else 0.0
 
 
-@compiled
-def translate(states, own, first, last, source, mappings, rules, relevance, scratch, transferred):
+@part
+def translate(states, own, ranges, arrays, transferred):
     """
     Translate instances for states and actions (see ``Transfer.transferred``).
 
     :param states: unit coordinates, shape (n, n_variables)
     :param own: weight of the target's own instances there, shape (n,)
-    :param first: first candidate whose instances may be used; ``last``: one past the last (none if equal); shape (n,)
-    :param source: SourceArrays; ``mappings``: CandidateMappings
-    :param relevance: shape (n_candidates, most instances of an action); or (1, 0) if not used
-    :param transferred: receives them, at least n rows
+    :param ranges: (first candidate whose instances may be used, one past the last: none if equal), shape (n,) each
+    :param arrays: TranslationArrays
+    :param transferred: receives the instances, at least n rows
     """
+    first, last = ranges
     for s in range(len(own)):
         transferred.length[s] = 0
-        if own[s] >= rules.threshold:
+        if own[s] >= arrays.rules.threshold:
             continue
         kept = np.int64(0)
-        for c in range(first[s], last[s]):
-            row = mappings.row[c]
-            kept = gather(
-                states[s],
-                source,
-                mappings.action[c],
-                mappings.variable[row],
-                mappings.sign[row],
-                rules,
-                relevance[c] if rules.by_relevance else relevance[0],
-                own[s],
-                kept,
-                scratch,
-                c,
-            )
-        write_row(s, own[s], kept, source, mappings, rules, scratch.number, scratch.value, transferred)
+        for candidate in range(first[s], last[s]):
+            kept = gather(states[s], own[s], candidate, arrays, kept)
+        write_row(s, own[s], kept, arrays, transferred)
+
+
+@compiled
+def translate_plain(states, own, ranges, arrays, transferred):
+    """:func:`translate` for callers from Python, with plain tuples."""
+    translate(states, own, ranges, as_arrays(arrays), TransferredInstances(*transferred))
+
+
+_translate = EntryPoint(translate_plain)
 
 
 class Translator:
@@ -276,57 +309,78 @@ class Translator:
     :param candidates: the candidates of every target action
     :param task: the target task
     :param breadth: kernel breadth of transferred instances, unit coordinates
-    :param transfer_terminals: see ``TransferRules``; ``by_relevance``: the same
+    :param transfer_terminals: see ``TranslationRules``; ``by_relevance``: the same
     """
 
     def __init__(
         self, candidates: Candidates, task: TargetTask, *, breadth: float, transfer_terminals: bool, by_relevance: bool
     ):
-        self.rules = TransferRules(
-            threshold=task.exploration_threshold,
-            breadth=breadth,
-            min_weight=task.min_weight,
-            min_fraction=task.min_fraction,
-            transfer_terminals=transfer_terminals,
-            by_relevance=by_relevance,
-        )
         largest = int(candidates.instances.size.max())
-        self.relevance = np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0))
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
-        self._source = SourceArrays.of_instances(candidates.instances)
-        self._mappings = CandidateMappings(candidates.arrays.row, candidates.arrays.action, *candidates.table)
         self._n_blocks = max(1, (largest + BLOCK - 1) // BLOCK)
         self._n_variables = task.n_variables
-        self._allocate(task.n_actions)
-        self._translate = EntryPoint(translate)
+        self._set_arrays(
+            TranslationArrays(
+                source=SourceArrays.of_instances(candidates.instances),
+                mappings=CandidateMappings(candidates.arrays.row, candidates.arrays.action, *candidates.table),
+                rules=TranslationRules(
+                    threshold=float(task.exploration_threshold),
+                    breadth=float(breadth),
+                    min_weight=float(task.min_weight),
+                    min_fraction=float(task.min_fraction),
+                    transfer_terminals=transfer_terminals,
+                    by_relevance=by_relevance,
+                ),
+                relevance=np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0)),
+                scratch=self._make_scratch(),
+            )
+        )
+        self._make_room(task.n_actions)
 
-    def _allocate(self, n: int) -> None:
-        """Make room for ``n`` states."""
-        self._scratch = TranslationScratch.empty(self._max_instances, self._n_variables, self._n_blocks)
+    # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
+
+    def _set_arrays(self, arrays: TranslationArrays) -> None:
+        self._arrays, self._plain_arrays = arrays, arrays.plain()
+
+    def _make_scratch(self) -> TranslationScratch:
+        return TranslationScratch.empty(self._max_instances, self._n_variables, self._n_blocks)
+
+    def _make_room(self, n: int) -> None:
+        """Make room for the instances of ``n`` states."""
+        self._room = n
         self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
+        self._plain_transferred = tuple(self._transferred)
+
+    @property
+    def rules(self) -> TranslationRules:
+        """When and how instances are translated."""
+        return self._arrays.rules
+
+    @property
+    def relevance(self) -> np.ndarray:
+        """Relevance of each candidate's instances, shape (n_candidates, most instances of an action); (1, 0) if not used."""
+        return self._arrays.relevance
 
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""
-        self.rules = self.rules._replace(breadth=breadth)
+        self._set_arrays(self._arrays._replace(rules=self.rules._replace(breadth=breadth)))
 
-    def __call__(
-        self, states: np.ndarray, own_weight: np.ndarray, first: np.ndarray, last: np.ndarray
-    ) -> TransferredInstances:
+    def __call__(self, states: np.ndarray, own_weight: np.ndarray, ranges: Ranges) -> TransferredInstances:
         """
         Translate instances for states and actions (see ``Transfer.transferred``).
 
         :param states: unit coordinates, shape (n, n_variables)
         :param own_weight: shape (n,)
-        :param first: first candidate whose instances may be used; ``last``: one past the last; shape (n,)
+        :param ranges: (first candidate whose instances may be used, one past the last), int64, shape (n,) each
         :return: instances, in arrays that the next call uses again
         """
-        if len(own_weight) > len(self._transferred.length):
-            self._allocate(2 * len(own_weight))
-        while True:
-            work = self._scratch, self._transferred
-            self._translate(states, own_weight, first, last, self._source, self._mappings, self.rules, self.relevance, *work)
-            # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
-            if not (self.rules.by_relevance and self._scratch.full[0]):
-                return self._transferred
+        if len(own_weight) > self._room:
+            self._make_room(2 * len(own_weight))
+        _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
+        # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
+        while self.rules.by_relevance and self._arrays.scratch.full[0]:
             self._max_instances *= 2
-            self._allocate(len(self._transferred.length))
+            self._set_arrays(self._arrays._replace(scratch=self._make_scratch()))
+            self._make_room(self._room)
+            _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
+        return self._transferred

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sb3_combrel import MappingSet, SourceInstances
+from sb3_combrel.transfer.bandwidths import default_bandwidths
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
-from sb3_combrel.transfer.compliance import ComplianceScratch, compliance_table, default_bandwidths
+from sb3_combrel.transfer.compliance import ComplianceScratch, compliance_table
 
 N_TRANSITIONS = 3000
 SETS = {"injective (12 x 243)": (MappingSet.injective, 12), "all (50 x 243)": (MappingSet.all, 50)}
@@ -27,14 +28,15 @@ def test_compliance_of_3000_transitions_with_every_mapping(benchmark, name):
     instances, table = stacked_instances([source_of_random_walks()]), stacked_table([mappings])
     rng = np.random.default_rng(0)
     states = rng.uniform(0.3, 0.7, (N_TRANSITIONS, 4))
+    bandwidths = default_bandwidths(instances)
     arguments = (
         states,
         0.02 * rng.normal(size=states.shape),
         -np.ones(N_TRANSITIONS),
         instances,
         table,
-        default_bandwidths(instances),
-        ComplianceScratch.for_mappings(table, instances),
+        bandwidths,
+        ComplianceScratch.for_mappings(table, instances, bandwidths.start),
         np.empty((N_TRANSITIONS, len(table.variable), len(instances.size))),
     )
     benchmark.pedantic(compliance_table, args=arguments, rounds=5, warmup_rounds=1)

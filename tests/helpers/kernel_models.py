@@ -55,7 +55,7 @@ def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model
 def model_and_definition(grid, kernel, gamma=1.0, max_instances=None):
     resolution, margin = grid
     model = make_model(grid, kernel, gamma, max_instances)
-    return model, NaiveFittedRMax(resolution, margin, N_ACTIONS, gamma=gamma, **kernel)
+    return model, NaiveFittedRMax(resolution, margin, N_ACTIONS, kernel, gamma=gamma)
 
 
 def learn(model, transitions):

@@ -79,13 +79,12 @@ class NaiveGrid:
 class NaiveFittedRMax:
     """The model, its values and Q, all from scratch."""
 
-    def __init__(
-        self, resolution, margin, n_actions, *, breadth, min_weight, min_fraction, threshold=1.0, gamma=1.0, max_value=0.0
-    ):
+    def __init__(self, resolution, margin, n_actions, kernel, *, threshold=1.0, gamma=1.0, max_value=0.0):
+        """:param kernel: dict of ``breadth``, ``min_weight`` and ``min_fraction``"""
         self.grid = NaiveGrid(resolution, margin)
         self.n_points = len(self.grid.coordinates)
         self.n_actions = n_actions
-        self.kernel = (breadth, min_weight, min_fraction)
+        self.kernel = (kernel["breadth"], kernel["min_weight"], kernel["min_fraction"])
         self.threshold = threshold
         self.gamma = gamma
         self.max_value = max_value

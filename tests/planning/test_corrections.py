@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sb3_combrel.planning.corrections import CELL_OFFSET, CELLS_PER_GRID_CELL, MAX_VISITS, CorrectionArrays
 from sb3_combrel.planning.grid import StateGrid
-from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
+from sb3_combrel.planning.q_values import Prediction, QValues
 
 GRID = StateGrid(2, 3, 0)
 LAST = 8  # the last grid coordinate of each axis
@@ -16,7 +16,7 @@ BOUNDS = (-1e6, 1e6)
 
 
 def function_of(values, corrections):
-    return ValueFunction(values, corrections, GRID.arrays, 1.0, BOUNDS)
+    return values, tuple(corrections), GRID.plain, 1.0, BOUNDS
 
 
 def visit(values, corrections, state, best_q, episode=0, times=1, tolerance=0.05, max_visits=MAX_VISITS):

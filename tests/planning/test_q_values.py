@@ -30,7 +30,7 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     )
     grid = agent.grid
     naive = NaiveFittedRMax(
-        grid.resolution, grid.margin, N_ACTIONS, threshold=threshold, gamma=gamma, max_value=max_value, **kernel
+        grid.resolution, grid.margin, N_ACTIONS, kernel, threshold=threshold, gamma=gamma, max_value=max_value
     )
     return agent, naive
 

@@ -17,7 +17,7 @@ class Problem:
 
     def __init__(self, resolution=(2, 2), margin=1, gamma=1.0, max_value=0.0, tolerance=1e-11, max_instances=None):
         self.model = make_model((resolution, margin), KERNEL, gamma, max_instances)
-        self.naive = NaiveFittedRMax(resolution, margin, N_ACTIONS, gamma=gamma, max_value=max_value, **KERNEL)
+        self.naive = NaiveFittedRMax(resolution, margin, N_ACTIONS, KERNEL, gamma=gamma, max_value=max_value)
         self.planner = Planner(self.model.mdp, max_value=max_value, min_value=MIN_VALUE, tolerance=tolerance)
 
     def update(self, transition, max_backups=NO_LIMIT):

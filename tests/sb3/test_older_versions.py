@@ -30,7 +30,8 @@ def test_a_file_of_version_0_1_0_loads_with_all_that_was_learned(former):
     saved = {name.removeprefix("parameter_"): array for name, array in expected.items() if name.startswith("parameter_")}
     assert parameters.keys() == saved.keys() | set(COUNTS)
     for name, array in saved.items():
-        np.testing.assert_array_equal(parameters[name].numpy(), array, err_msg=name)
+        # Weights and the like are computed again, by whatever compiler there is.
+        np.testing.assert_allclose(parameters[name].numpy(), array, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
 def test_arguments_of_version_0_1_0_have_their_new_names():

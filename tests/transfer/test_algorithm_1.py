@@ -1,17 +1,22 @@
-"""The lines of Algorithm 1 in NumPy: neighbours, the choice of a mapping, transferred instances, against plain loops."""
+"""The lines of Algorithm 1 in NumPy: against plain loops, and COMBREL against them."""
 
 import math
 
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
+from helpers.asking import bound, changed_pairs, show
 from helpers.equation_problems import as_sample, as_transitions, problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel import COMBREL, MappingSet
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer import equations
+from sb3_combrel.transfer.bandwidths import default_bandwidths
+from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths, TransferRules, Transitions
+from sb3_combrel.transfer.translation import Translator
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -105,3 +110,110 @@ def test_transferred_instances_reach_the_threshold_with_none_to_spare_or_there_a
         assert own + weights.sum() >= threshold - 1e-12 > own + weights[:-1].sum() - 2e-12
         order = weights if relevances is None else relevances[numbers]
         assert (np.diff(order) <= 0.0).all()
+
+
+MAPPINGS = MappingSet.all(2, 3, 2, 2, signs=True)
+GRID = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def combrel_and_its_sample(seed, **kwargs):
+    """COMBREL with every mapping, what it has observed, and the source."""
+    rng = np.random.default_rng(seed)
+    source, task = naive.random_source(rng, 60, 2, 2), naive.target_task(GRID, 2)
+    method = bound(COMBREL(source, MAPPINGS, min_compliance=0.0, **kwargs), task)
+    transitions = [naive.random_transition(rng, 3, 2) for _ in range(20)]
+    for transition in transitions:
+        show(method, transition)
+    return method, as_sample(transitions, 3), as_transitions(source), rng
+
+
+def mapping_of(method, candidate):
+    """A candidate as a mapping; the source action of other actions than its own does not matter."""
+    _, _, state_index, source_action = method.candidates.origins[candidate]
+    of_row = [None if k < 0 else int(k) for k in MAPPINGS.state_mappings[state_index]]
+    return InterTaskMapping(of_row, [source_action] * 2, MAPPINGS.state_signs[state_index])
+
+
+def mean_compliances(method, sample, source, near, action, guard):
+    """Lines 9-13 and 19 of Algorithm 1: mean compliance of every candidate of ``action`` with transitions ``near``."""
+    first, usual = method.candidates.arrays.first, default_bandwidths(method.candidates.instances)
+    sample_near = Transitions(*(column[near] for column in sample))
+    of_candidates = []
+    for candidate in range(first[action], first[action + 1]):
+        mapping = mapping_of(method, candidate)
+        n_compared = len(mapping.state) - mapping.state.count(None)
+        own = usual._replace(start=usual.start * n_compared / 2)
+        of_candidates.append(equations.sample_compliance(sample_near, source, mapping, own, guard))
+    return np.column_stack(of_candidates)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds, st.integers(1, 5), st.sampled_from([0.0, 0.1]))
+def test_combrel_selects_the_best_mapping_of_the_equations(seed, k, guard):
+    method, sample, source, rng = combrel_and_its_sample(seed, n_neighbors=k, min_evidence=guard)
+    states, actions, first = rng.random((6, 3)), np.tile(np.arange(2), 3), method.candidates.arrays.first
+    chosen, last = (each.copy() for each in method._selector.select(states, actions, np.zeros(6)))
+    changed_pairs(method)
+    on_grid = method.choices().reshape(2, -1)
+    asked = [(s, a, c if c < e else -1) for s, a, c, e in zip(states, actions, chosen, last, strict=True)]
+    asked += [(GRID[p], a, on_grid[a, p]) for a in (0, 1) for p in rng.choice(len(GRID), 3)]
+    for state, action, candidate in asked:
+        near = equations.nearest_transitions(state, action, sample, k)
+        compliances = mean_compliances(method, sample, source, near, action, guard)
+        best = equations.best_mapping(compliances)
+        if best is None or candidate < 0:
+            assert candidate < 0 and (best is None or compliances.mean(axis=0).max() < 1e-9)
+        else:
+            # Of mappings that comply equally well but for rounding either may be selected.
+            means = compliances.mean(axis=0)
+            assert means[candidate - first[action]] == pytest.approx(means[best], rel=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.floats(0.1, 0.6))
+def test_combrel_transfers_the_instances_of_the_equations(seed, breadth):
+    method, _, source, rng = combrel_and_its_sample(seed, breadth=breadth)
+    states, actions, own = rng.random((6, 3)), np.tile(np.arange(2), 3), rng.uniform(0.0, 1.2, 6)
+    found = method.transferred(states, actions, own)
+    chosen, last = method._selector.select(states, actions, own)
+    rules = TransferRules(breadth, method.task.exploration_threshold, method.task.min_weight, method.task.min_fraction)
+    for row, (state, action) in enumerate(zip(states, actions, strict=True)):
+        n = found.length[row]
+        if chosen[row] == last[row]:
+            assert n == 0
+            continue
+        virtual = equations.virtual_source(source, mapping_of(method, chosen[row]), action, state[None, :])
+        numbers, weights = equations.transferred_instances(state, own[row], virtual, rules)
+        assert n == len(numbers)
+        np.testing.assert_allclose(found.weight[row, :n], weights, rtol=1e-9)
+        np.testing.assert_allclose(found.effect[row, :n], virtual.effect[numbers], atol=1e-12)
+        assert found.reward[row, :n].tolist() == virtual.reward[numbers].tolist()
+        assert found.terminated[row, :n].tolist() == virtual.terminated[numbers].tolist()
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.floats(0.05, 0.6), st.floats(0.3, 3.0), st.booleans())
+def test_the_translator_transfers_the_instances_of_the_equations(seed, breadth, threshold, by_relevance):
+    rng = np.random.default_rng(seed)
+    source, task = naive.random_source(rng, 60, 2, 2), naive.target_task(rng.random((1, 3)), 2, threshold)
+    candidates = Candidates(source, MAPPINGS, task)
+    translator = Translator(candidates, task, breadth=breadth, transfer_terminals=True, by_relevance=by_relevance)
+    if by_relevance:
+        translator.relevance[:] = rng.random(translator.relevance.shape)
+    states, own = rng.random((20, 3)), rng.uniform(0.0, 1.2 * threshold, 20)
+    first = rng.integers(len(candidates), size=20)
+    found = translator(states, own, (first, first + 1))
+    rules, instances = TransferRules(breadth, threshold, task.min_weight, task.min_fraction), as_transitions(source)
+    places = naive.places_of(source, candidates.instances)
+    for row, candidate in enumerate(first):
+        _, action, state_index, source_action = candidates.origins[candidate]
+        of_row = [None if k < 0 else int(k) for k in MAPPINGS.state_mappings[state_index]]
+        mapping = InterTaskMapping(of_row, [source_action] * 2, MAPPINGS.state_signs[state_index])
+        virtual = equations.virtual_source(instances, mapping, action, states[row : row + 1])
+        relevances = translator.relevance[candidate, places[source.actions == source_action]] if by_relevance else None
+        numbers, weights = equations.transferred_instances(states[row], own[row], virtual, rules, relevances)
+        n = found.length[row]
+        assert n == len(numbers)
+        np.testing.assert_allclose(found.weight[row, :n], weights, rtol=1e-9)
+        np.testing.assert_allclose(found.effect[row, :n], virtual.effect[numbers], atol=1e-12)
+        assert found.reward[row, :n].tolist() == virtual.reward[numbers].tolist()

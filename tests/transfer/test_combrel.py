@@ -20,7 +20,7 @@ from helpers.asking import (
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.bandwidths import Bandwidths
+from sb3_combrel.transfer.equations import Bandwidths
 
 BANDWIDTHS = Bandwidths(0.05, 0.05, 1.0)
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

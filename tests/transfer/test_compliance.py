@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.bandwidths import Bandwidths, default_bandwidths, start_bandwidths
+from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.candidates import Candidates, stacked_instances, stacked_table
 from sb3_combrel.transfer.compliance import (
     ComplianceScratch,
@@ -18,6 +18,7 @@ from sb3_combrel.transfer.compliance import (
     task_compliance,
     transition_compliance,
 )
+from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.relevance import relevance
 
 seeds = st.integers(0, 2**32 - 1)
@@ -228,19 +229,11 @@ def relevances(source, source_action, mapping, action, transitions, bandwidths, 
     of_action = [t for t in transitions if t.action == action]
     values = np.full(int(instances.size.max()), np.nan)
     d = len(mapping.state)
-    relevance(
-        np.array([t.state for t in of_action]).reshape(-1, d),
-        np.array([t.next_state - t.state for t in of_action]).reshape(-1, d),
-        np.array([t.reward for t in of_action]),
-        instances,
-        source_action,
-        mapping.state_index,
-        mapping.state_sign,
-        bandwidths,
-        mu,
-        np.empty(len(of_action)),
-        values,
-    )
+    states = np.array([t.state for t in of_action]).reshape(-1, d)
+    effects = np.array([t.next_state - t.state for t in of_action]).reshape(-1, d)
+    target = states, effects, np.array([t.reward for t in of_action])
+    of_mapping = mapping.state_index, mapping.state_sign
+    relevance(target, instances, source_action, of_mapping, bandwidths, mu, np.empty(len(of_action)), values)
     return values[: instances.size[source_action]]
 
 
@@ -286,25 +279,26 @@ def test_distances_are_averaged_while_the_weights_stay_below_mu_of_their_sum(mu,
 
 
 @pytest.mark.parametrize("state", [(0, 0, None), (0, 1, 0), (0, 0, 1), (1, None, None), (0, 1, None)], ids=str)
-def test_mappings_of_more_variables_have_no_less_evidence(state):
-    """The sum of start kernels at states all over the target's space, against that of a mapping of each variable once."""
+@pytest.mark.parametrize("given", [0.02, None])
+def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_number(state, given):
     rng = np.random.default_rng(0)
-    source = naive.random_source(rng, 1000, 2, 2)
-    task = naive.target_task(np.zeros((1, 3)), 1)
-    candidates = Candidates(source, [InterTaskMapping([0, 1, None], [0]), InterTaskMapping(state, [0])], task)
-    starts = start_bandwidths(candidates, default_bandwidths(candidates.instances).start)
-    states, evidence = rng.random((200, 3)), []
-    for row in (0, len(starts) - 1):
-        index = candidates.table.variable[row]
-        of_source = candidates.instances.state[0, : candidates.instances.size[0]][:, index[index >= 0]]
-        squared = ((states[:, None, index >= 0] - of_source) ** 2).sum(axis=2)
-        evidence.append(np.exp(-squared / starts[row]).sum(axis=1))
-    usual, other = (np.median(each) for each in evidence)
-    n_mapped = len(state) - state.count(None)
-    assert 0.6 * usual < other < (2.0 if len({*state} - {None}) == n_mapped else 5.0) * usual
-    assert np.sign(starts[-1] - starts[0]) == np.sign(n_mapped - 2) or state == (0, 0, None)
-    assert (evidence[1] < 0.1).mean() <= 0.02
-    assert starts[0] == default_bandwidths(candidates.instances).start
+    source, n_mapped = naive.random_source(rng, 100, 2, 2), len(state) - state.count(None)
+    candidates = Candidates(source, [InterTaskMapping(state, [0])], naive.target_task(np.zeros((1, 3)), 1))
+    usual = default_bandwidths(candidates.instances).start if given is None else given
+    [found] = start_bandwidths(candidates, usual)
+    for along in (0.01, 0.1):
+        two, all_mapped = (naive.distance([along] * n, [0.0] * n) for n in (2, n_mapped))
+        assert naive.phi(all_mapped, found) == pytest.approx(naive.phi(two, usual), rel=1e-12)
+    assert n_mapped != 2 or found == usual, "to the last bit"
+
+
+def test_start_bandwidths_are_those_of_each_source():
+    rng = np.random.default_rng(1)
+    sources, task = [naive.random_source(rng, 30, n, 2) for n in (1, 3)], naive.target_task(np.zeros((1, 3)), 1)
+    candidates = Candidates(sources, "all", task)
+    n_mapped, [first, second] = (candidates.table.variable >= 0).sum(axis=1), candidates.sets
+    expected = 0.3 * n_mapped / np.repeat([1.0, 3.0], [first.n_state_mappings, second.n_state_mappings])
+    np.testing.assert_allclose(start_bandwidths(candidates, 0.3), expected, rtol=1e-12)
 
 
 def test_min_evidence_is_the_sum_of_kernels_below_which_nothing_counts():

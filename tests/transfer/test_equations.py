@@ -23,25 +23,30 @@ some_bandwidths = st.builds(Bandwidths, start=st.floats(0.003, 0.5), outcome=st.
 some_mus = st.floats(0.02, 1.0)
 
 
-def compiled_tables(sample, source, mappings, bandwidths):
-    """Compiled compliance, shape (n_transitions, n_state_mappings, n_source_actions)."""
+def compiled_tables(sample, source, mappings, bandwidths, min_evidence=naive.LEAST_EVIDENCE, starts=None):
+    """
+    Compiled compliance, shape (n_transitions, n_state_mappings, n_source_actions).
+
+    :param starts: start bandwidth of each state mapping, or None for that of ``bandwidths``
+    """
+    starts = bandwidths.start if starts is None else starts
     instances, table = stacked_instances([source]), stacked_table([mappings])
     tables = np.full((len(sample.reward), len(table.variable), len(instances.size)), np.nan)
-    scratch = compiled_compliance.ComplianceScratch.for_mappings(table, instances)
+    scratch = compiled_compliance.ComplianceScratch.for_mappings(table, instances, starts, min_evidence)
     compiled_compliance.compliance_table(
         sample.state, sample.effect, sample.reward, instances, table, bandwidths, scratch, tables
     )
     return tables
 
 
-def compiled_table_of_one(sample, i, source, mappings, bandwidths):
-    """Compiled compliance of one transition, shape (n_state_mappings, n_source_actions)."""
+def compiled_table_of_one(sample, i, source, mappings, bandwidths, min_evidence=naive.LEAST_EVIDENCE):
+    """Compiled compliance of one transition, as COMBREL computes it, shape (n_state_mappings, n_source_actions)."""
     instances, table = stacked_instances([source]), stacked_table([mappings])
     found = np.full((len(table.variable), len(instances.size)), np.nan)
-    scratch = compiled_compliance.ComplianceScratch.for_mappings(table, instances)
-    compiled_compliance.transition_compliance(
-        sample.state[i], sample.effect[i], float(sample.reward[i]), instances, table, bandwidths, scratch, found
-    )
+    scratch = compiled_compliance.ComplianceScratch.for_mappings(table, instances, bandwidths.start, min_evidence)
+    plain = tuple(instances), tuple(table), tuple(bandwidths), tuple(scratch)
+    transition = sample.state[i], sample.effect[i], float(sample.reward[i])
+    compiled_compliance.transition_compliance_plain(*transition, *plain, found)
     return found
 
 
@@ -50,24 +55,14 @@ def compiled_relevances(sample, source, mapping, action, bandwidths, mu):
     instances, source_action = stacked_instances([source]), mapping.action[action]
     of_action = sample.with_action(action)
     found = np.full(int(instances.size.max()), np.nan)
-    compiled_relevance.relevance(
-        of_action.state,
-        of_action.effect,
-        of_action.reward,
-        instances,
-        source_action,
-        mapping.state_index,
-        mapping.state_sign,
-        bandwidths,
-        mu,
-        np.empty(len(of_action.reward)),
-        found,
-    )
+    target, scratch = (of_action.state, of_action.effect, of_action.reward), np.empty(len(of_action.reward))
+    of_mapping = mapping.state_index, mapping.state_sign
+    compiled_relevance.relevance(target, instances, source_action, of_mapping, bandwidths, mu, scratch, found)
     return found[naive.places_of(source, instances)[source.actions == source_action]]
 
 
 GUARD = naive.LEAST_EVIDENCE
-"""The evidence guard of the compiled code and of the naive version."""
+"""The evidence guard of the naive version, and COMBREL's by default."""
 
 
 def naive_average_distance(distances, weights, mu):
@@ -103,17 +98,33 @@ def test_compliance_is_that_of_plain_loops_with_and_without_a_guard(seed, sizes,
     np.testing.assert_allclose(found, guarded, rtol=1e-9, atol=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
-@given(seeds, sizes, some_bandwidths)
-def test_compiled_compliance_is_that_of_the_equations(seed, sizes, bandwidths):
+@settings(max_examples=40, deadline=None)
+@given(seeds, sizes, some_bandwidths, st.sampled_from([0.0, 0.01, GUARD, 1.0]))
+def test_compiled_compliance_is_that_of_the_equations(seed, sizes, bandwidths, guard):
     source, mapping, transitions = problem(seed, sizes, n_instances=40)
     sample, mappings = as_sample(transitions, sizes[1]), MappingSet.from_list([mapping])
-    expected = equations.sample_compliance(sample, as_transitions(source), mapping, bandwidths, GUARD)
-    tables = compiled_tables(sample, source, mappings, bandwidths)
+    expected = equations.sample_compliance(sample, as_transitions(source), mapping, bandwidths, guard)
+    tables = compiled_tables(sample, source, mappings, bandwidths, guard)
     found = tables[np.arange(len(transitions)), 0, np.array(mapping.action)[sample.action]]
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
-    last = compiled_table_of_one(sample, -1, source, mappings, bandwidths)[0, mapping.action[sample.action[-1]]]
+    last = compiled_table_of_one(sample, -1, source, mappings, bandwidths, guard)[0, mapping.action[sample.action[-1]]]
     assert last == pytest.approx(expected[-1], rel=1e-9, abs=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, some_bandwidths, st.integers(1, 3))
+def test_compiled_compliance_has_a_start_bandwidth_for_each_state_mapping(seed, bandwidths, n_source):
+    source, _, transitions = problem(seed, (n_source, 3, 2, 2), n_instances=40)
+    rng, instances = np.random.default_rng(seed), as_transitions(source)
+    sample, mappings = as_sample(transitions, 3), MappingSet.all(n_source, 3, 2, 2)
+    starts = rng.choice([bandwidths.start, 0.01, 0.2], mappings.n_state_mappings)
+    tables = compiled_tables(sample, source, mappings, bandwidths, starts=starts)
+    for number in rng.choice(len(mappings), 6):
+        mapping, row = mappings[int(number)], int(number) // mappings.n_action_mappings
+        own = bandwidths._replace(start=starts[row])
+        expected = equations.sample_compliance(sample, instances, mapping, own, GUARD)
+        found = tables[np.arange(len(transitions)), row, np.array(mapping.action)[sample.action]]
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 @settings(max_examples=15, deadline=None)
@@ -208,12 +219,12 @@ def test_average_distance_refuses_a_mu_that_is_no_fraction(mu):
         equations.average_distance(np.ones(2), np.full(2, 0.5), mu)
 
 
-@settings(max_examples=40, deadline=None)
-@given(seeds, sizes, some_bandwidths, st.integers(0, 20))
-def test_relevance_is_that_of_loops_and_of_compiled_code(seed, sizes, bandwidths, n_transitions):
-    """With mu below the largest weight, where it does not matter whether the transition that crosses mu is included."""
+@settings(max_examples=60, deadline=None)
+@given(seeds, sizes, some_bandwidths, st.integers(0, 20), some_mus)
+@example(0, (2, 2, 1, 1), Bandwidths(0.1, 0.1, 1.0), 12, 1.0)
+def test_relevance_is_that_of_loops_and_of_compiled_code(seed, sizes, bandwidths, n_transitions, mu):
     source, mapping, transitions = problem(seed, sizes, n_transitions=n_transitions)
-    sample, mu = as_sample(transitions, sizes[1]), 1.0 / (n_transitions + 1)
+    sample = as_sample(transitions, sizes[1])
     for action in range(sizes[3]):
         found = equations.source_relevances(as_transitions(source), mapping, action, sample, bandwidths, mu)
         numbers = np.flatnonzero(source.actions == mapping.action[action])

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL
-from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose, find_nearest
+from sb3_combrel.transfer import equations
+from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
 
 N_DRAWS = 4000
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -18,6 +19,7 @@ def random_cache(rng, n_transitions, n_candidates, least=0.4):
     cache = ComplianceCache.empty(n_candidates + 2, n_transitions)
     cache.compliance[:] = rng.random(cache.compliance.shape)
     cache.required[:] = least
+    cache.measured[:] = True
     return cache
 
 
@@ -27,7 +29,8 @@ def shares(near, cache, n_candidates, n_before=5):
     choice = np.full(2 * N_DRAWS, -7)
     first = np.array([0, n_before, n_before + n_candidates])
     actions = np.ones(N_DRAWS, dtype=np.int64)
-    choose(np.arange(N_DRAWS, 2 * N_DRAWS), actions, np.tile(near, (2 * N_DRAWS, 1)), cache, first, draws, choice)
+    rows, each_near = np.arange(N_DRAWS, 2 * N_DRAWS), np.tile(near, (2 * N_DRAWS, 1))
+    choose_plain(rows, actions, each_near, tuple(cache), first, draws, choice)
     assert (choice[:N_DRAWS] == -7).all()
     chosen = np.where(choice[N_DRAWS:] < 0, n_candidates, choice[N_DRAWS:] - n_before)
     return np.bincount(chosen, minlength=n_candidates + 1) / N_DRAWS
@@ -56,20 +59,32 @@ def test_at_a_sample_state_the_choice_is_the_same_as_on_the_grid(seed, drawn):
     draws = rng.random(n_actions) if drawn else np.empty(0)
     limit = 0.3**2
     near, distance = np.full((n_actions, len(POINTS), 3), -1), np.full((n_actions, len(POINTS), 3), limit)
-    due = np.zeros((n_actions, len(POINTS)), dtype=bool)
+    due, by_variable = np.zeros((n_actions, len(POINTS)), dtype=bool), np.ascontiguousarray(POINTS.T)
     for i, action in enumerate(actions):
-        add_to_sample(i, states[i], POINTS, near[action], distance[action], due[action])
+        add_to_sample(i, states[i], by_variable, near[action], distance[action], due[action], np.empty(len(POINTS)))
     np.testing.assert_array_equal(due, near[:, :, 0] >= 0)
     on_grid, each = np.full(n_actions * len(POINTS), -1), np.repeat(np.arange(n_actions), len(POINTS))
     of_pairs = draws[each] if drawn else draws
-    choose(np.arange(len(on_grid)), each, near.reshape(-1, 3), cache, first, of_pairs, on_grid)
-    listed, n_listed = by_action(actions, n_actions)
-    near, distance, choice = np.empty((n_actions, 3), dtype=np.int64), np.empty((n_actions, 3)), np.full(n_actions, -1)
+    choose_plain(np.arange(len(on_grid)), each, near.reshape(-1, 3), tuple(cache), first, of_pairs, on_grid)
+    recorded = states, *by_action(actions, n_actions)
     for p, state in enumerate(POINTS):
         asked = np.tile(state, (n_actions, 1)), np.arange(n_actions), np.zeros(n_actions)
-        find_nearest(*asked, 1.0, states, listed, n_listed, limit, near, distance)
-        choose(np.arange(n_actions), np.arange(n_actions), near, cache, first, draws, choice)
-        np.testing.assert_array_equal(choice, on_grid.reshape(n_actions, -1)[:, p])
+        found = room_for(n_actions)
+        assert select_plain(asked, recorded, (1.0, limit), tuple(cache), first, draws, found)
+        np.testing.assert_array_equal(found[0], near[:, p])
+        np.testing.assert_array_equal(candidates_of(found), on_grid.reshape(n_actions, -1)[:, p])
+
+
+def room_for(n, k=3):
+    """Arrays that receive what is found at exact states: nearest transitions, distances, ranges of candidates."""
+    return np.empty((n, k), dtype=np.int64), np.empty((n, k)), np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+
+
+def candidates_of(found):
+    """The candidate selected for each state, -1 for none."""
+    _, _, first, last = found
+    assert np.isin(last - first, [0, 1]).all()
+    return np.where(first < last, first, -1)
 
 
 def by_action(actions, n_actions):
@@ -82,14 +97,42 @@ def by_action(actions, n_actions):
 
 
 def test_an_action_that_needs_nothing_has_no_neighbors():
-    near, distance = np.empty((2, 3), dtype=np.int64), np.empty((2, 3))
-    own_weight, asked = np.array([0.9, 1.0]), np.arange(2)
-    listed = by_action(np.array([0, 1, 1]), 2)
-    find_nearest(np.zeros((2, 2)), asked, own_weight, 1.0, np.zeros((3, 2)), *listed, 1.0, near, distance)
-    assert near.tolist() == [[0, -1, -1], [-1, -1, -1]]
-    choice, cache = np.full(2, 7), random_cache(np.random.default_rng(0), 3, 2, least=0.0)
-    choose(np.arange(2), asked, near, cache, np.array([0, 2, 4]), np.empty(0), choice)
-    assert choice[0] in (0, 1) and choice[1] == -1
+    query = np.zeros((2, 2)), np.arange(2), np.array([0.9, 1.0])
+    recorded = np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2)
+    found, cache = room_for(2), random_cache(np.random.default_rng(0), 3, 2, least=0.0)
+    assert select_plain(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found)
+    assert found[0].tolist() == [[0, -1, -1], [-1, -1, -1]]
+    first, second = candidates_of(found)
+    assert first in (0, 1) and second == -1
+
+
+def test_nothing_is_selected_before_all_neighbors_have_been_measured():
+    query, recorded = (np.zeros((2, 2)), np.arange(2), np.zeros(2)), (np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2))
+    found, cache = room_for(2), random_cache(np.random.default_rng(0), 3, 2, least=0.0)
+    found[2][:], found[3][:] = 7, 7
+    for i, complete in ((2, False), (0, True)):
+        cache.measured[:] = [True, True, i != 2]
+        assert select_plain(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found) == complete
+        assert found[0].tolist() == [[0, -1, -1], [1, 2, -1]], "what is to be measured"
+        assert (found[2] == 7).all() != complete
+
+
+@settings(deadline=None, derandomize=True, max_examples=60)
+@given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from([0.0, 0.375, 0.625, 2.0]))
+def test_the_best_candidate_is_the_best_mapping_of_algorithm_1(seed, n_candidates, least):
+    rng = np.random.default_rng(seed)
+    cache, sample = random_cache(rng, 20, n_candidates, least), rng.random((20, 2))
+    actions, k = rng.integers(2, size=20), int(rng.integers(1, 6))
+    # Some equal, some 0: of equal ones the first is chosen, and a mapping without any evidence is not. Sums are exact.
+    cache.compliance[:] = np.round(8.0 * cache.compliance) / 8.0
+    transitions = equations.Transitions(sample, actions, np.zeros((20, 2)), np.zeros(20), np.zeros(20, dtype=bool))
+    query, first = (rng.random((8, 2)), np.tile(np.arange(2), 4), np.zeros(8)), np.array([0, n_candidates, 2 * n_candidates])
+    found, recorded = room_for(8, k), (sample, *by_action(actions, 2))
+    assert select_plain(query, recorded, (1.0, np.inf), tuple(cache), first, np.empty(0), found)
+    for state, action, chosen in zip(query[0], query[1], candidates_of(found), strict=True):
+        near = equations.nearest_transitions(state, action, transitions, k)
+        best = equations.best_mapping(cache.compliance[near, :n_candidates], least)
+        assert chosen == (-1 if best is None else first[action] + best)
 
 
 class TestMethod:

@@ -150,7 +150,7 @@ def test_a_source_must_bring_the_full_weight_when_the_model_has_lowered_its_thre
     monkeypatch.setattr(method, "transferred", checked)
     # Every episode is cut off before the goal, so the model lowers its threshold from the eleventh on.
     model = small(Walk(limit=3), transfer=make(), model_breadth=0.03, resolution=5).learn(60)
-    assert model.policy.statistics()["model/threshold"] < 0.9
+    assert model.agent.statistics()["model/threshold"] < 0.9
     assert model.policy.transfer.task.exploration_threshold == 1.0
     before = len(reached)
     model.learn(30, reset_num_timesteps=False)

@@ -13,17 +13,24 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
-from sb3_combrel.transfer.translation import CandidateMappings, SourceArrays, TransferRules, TranslationScratch, translate
+from sb3_combrel.transfer.translation import (
+    CandidateMappings,
+    SourceArrays,
+    TranslationArrays,
+    TranslationRules,
+    TranslationScratch,
+    translate_plain,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def translated(states, own, mappings, source, task, breadth, transfer_terminals=True, relevance=None, room=200):
-    """What ``translate`` gives each state from all of ``mappings``, for target action 0."""
+def translated(states, own, mappings, source, task, breadth, transfer_terminals=True, relevance=None):
+    """What ``translate_plain`` gives each state from all of ``mappings``, for target action 0."""
     listed = MappingSet.from_list(mappings)
     rows, actions = listed.candidates(0)
     instances = stacked_instances([source])
-    n, d = states.shape
+    (n, d), room = states.shape, 200
     found = TransferredInstances(
         np.full(n, -1, dtype=np.int64),
         np.full((n, room), np.nan),
@@ -31,20 +38,16 @@ def translated(states, own, mappings, source, task, breadth, transfer_terminals=
         np.full((n, room), np.nan),
         np.zeros((n, room), dtype=np.bool_),
     )
-    translate(
-        states,
-        own,
-        np.zeros(n, dtype=np.int64),
-        np.full(n, len(rows)),
+    threshold, fraction = task.exploration_threshold, task.min_fraction
+    arrays = TranslationArrays(
         SourceArrays.of_instances(instances),
         CandidateMappings(rows, actions, *stacked_table([listed])),
-        TransferRules(
-            task.exploration_threshold, breadth, task.min_weight, task.min_fraction, transfer_terminals, relevance is not None
-        ),
+        TranslationRules(threshold, breadth, task.min_weight, fraction, transfer_terminals, relevance is not None),
         np.empty((1, 0)) if relevance is None else relevance,
         TranslationScratch.empty(room, d, instances.block_low.shape[2]),
-        found,
     )
+    ranges = np.zeros(n, dtype=np.int64), np.full(n, len(rows))
+    translate_plain(states, own, ranges, arrays.plain(), tuple(found))
     drawn_from = []
     for row, action in zip(rows, actions, strict=True):
         of_row = [None if k < 0 else int(k) for k in listed.state_mappings[row]]

@@ -8,7 +8,7 @@ from helpers.walk import Walk, same_parameters, small, walk_source
 
 from sb3_combrel import COMBREL, FittedRMax
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.bandwidths import Bandwidths
+from sb3_combrel.transfer.equations import Bandwidths
 
 BANDWIDTHS = Bandwidths(0.05, 0.05, 1.0)
 POINTS = np.random.default_rng(7).random((30, 3))
@@ -125,4 +125,4 @@ def test_a_model_learns_with_it_is_saved_and_goes_on(tmp_path):
     assert loaded.policy.transfer.neighbors == "state_action"
     assert same_parameters(model, loaded)
     np.testing.assert_array_equal(loaded.policy.transfer.choices(), model.policy.transfer.choices())
-    assert loaded.learn(20, reset_num_timesteps=False).policy.model.n_instances == 80
+    assert loaded.learn(20, reset_num_timesteps=False).agent.model.n_instances == 80
