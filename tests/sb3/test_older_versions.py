@@ -23,7 +23,7 @@ def former(request):
         return DATA / f"model_of_version_0_1_0_{request.param}.zip", dict(arrays)
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::DeprecationWarning", "error::UserWarning")
 def test_a_file_of_version_0_1_0_loads_with_all_that_was_learned(former):
     path, expected = former
     parameters = FittedRMax.load(path).get_parameters()["policy"]
