@@ -58,7 +58,7 @@ def test_unknown_policies_are_refused():
         FittedRMax("NoSuchPolicy", Walk())
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::DeprecationWarning", "error::UserWarning", "error::RuntimeWarning")
 def test_the_walk_of_these_tests_is_a_proper_environment():
     check_env(Walk(), warn=False)
 
