@@ -19,6 +19,12 @@ WRONG_ENTRIES = [None, True, -1, 3, 2.5, 1e300, float("nan"), "text", [], [1, "a
 WRONG_STATES = [None, True, -1, 2**200, 0.5, "text", [], {}]
 
 
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    """A damaged file may name a folder for logs."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(scope="module", params=["none", "COMBREL"])
 def parts(request):
     """What is in the file of a model, by name."""
