@@ -82,8 +82,8 @@ test-oldest: $(VENV)-oldest.txt
 	NUMBA_CACHE_DIR=$(abspath $(VENV)-oldest/numba-cache) \
 		$(MAKE) test-fast VENV=$(VENV)-oldest CONSTRAINTS=$(VENV)-oldest.txt PYTHON=$(OLDEST_PYTHON)
 
-$(VENV)-oldest.txt: constraints.txt constraints-oldest.txt
-	{ grep -vE '^(llvmlite|numba|numpy)==' constraints.txt; cat constraints-oldest.txt; } > $@
+$(VENV)-oldest.txt: constraints.txt tests/constraints-oldest.txt
+	{ grep -vE '^(llvmlite|numba|numpy)==' constraints.txt; cat tests/constraints-oldest.txt; } > $@
 
 bench: $(VENV)/.installed-all
 	$(BIN)/python -m sb3_combrel.experiments.bench

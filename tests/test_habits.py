@@ -19,7 +19,7 @@ def pins_of(text):
 
 
 PINS = pins_of((ROOT / "constraints.txt").read_text())
-OLDEST = pins_of((ROOT / "constraints-oldest.txt").read_text())
+OLDEST = pins_of((ROOT / "tests/constraints-oldest.txt").read_text())
 
 
 def bounds_of(package):
