@@ -128,7 +128,7 @@ class Model(ABC):
         :param pairs: int64, at most ``MAX_PAIRS_AT_ONCE``
         """
         actions, points = np.divmod(pairs, self.grid.n_points)
-        predictions = self.predict(self.grid.points()[points], actions)
+        predictions = self.predict(self.grid.states_of(points), actions)
         self.own_weight[pairs] = predictions.weight
         self.known[pairs] |= predictions.weight >= self.exploration_threshold
         modelled = self.known[pairs].copy()

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, part
+from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
@@ -80,6 +80,14 @@ def predict_own_plain(instances, state, kernel, threshold, near, prediction):
     return predict_own(Instances(*instances), state, kernel, threshold, NearLists(*near), Prediction(*prediction))
 
 
+@inlined
+def enter_successor(prediction, action, n, p, effect):
+    """Write the ``n``-th successor of an action, of probability ``p``."""
+    prediction.probability[action, n] = p
+    for v in range(len(effect)):
+        prediction.effect[action, n, v] = effect[v]
+
+
 @part
 def predict_from_lists(instances, action, near, total, prediction):
     """Enter what the instances in ``near`` predict of an action, all instances weighing ``total``."""
@@ -90,9 +98,7 @@ def predict_from_lists(instances, action, near, total, prediction):
         p = near.weight[action, k] / total
         reward += p * instances.reward[action, i]
         if not instances.terminated[action, i]:
-            prediction.probability[action, n] = p
-            for v in range(instances.effect.shape[2]):
-                prediction.effect[action, n, v] = instances.effect[action, i, v]
+            enter_successor(prediction, action, n, p, instances.effect[action, i])
             n += 1
     prediction.reward[action] = reward
     prediction.length[action] = n
@@ -118,9 +124,7 @@ def join_transferred(instances, near, transferred, threshold, prediction):
             p = transferred.weight[action, j] / total
             reward += p * transferred.reward[action, j]
             if not transferred.terminated[action, j]:
-                prediction.probability[action, n] = p
-                for v in range(transferred.effect.shape[2]):
-                    prediction.effect[action, n, v] = transferred.effect[action, j, v]
+                enter_successor(prediction, action, n, p, transferred.effect[action, j])
                 n += 1
         prediction.reward[action] = reward
         prediction.length[action] = n

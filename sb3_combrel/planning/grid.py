@@ -97,8 +97,17 @@ class StateGrid:
 
     def points(self) -> np.ndarray:
         """All grid points, unit coordinates, shape (n_points, n_variables)."""
-        axes = [(np.arange(n) - self.margin) / cells for n, cells in zip(self.arrays.shape, self.arrays.cells, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.n_variables)
+        return self.states_of(np.arange(self.n_points))
+
+    def states_of(self, points: np.ndarray) -> np.ndarray:
+        """
+        Some grid points.
+
+        :param points: their numbers, int64, shape (n,)
+        :return: unit coordinates, shape (n, n_variables)
+        """
+        coordinates = np.stack(np.unravel_index(points, tuple(self.arrays.shape)), axis=-1)
+        return (coordinates - self.margin) / self.arrays.cells
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
         """Multilinear interpolation.
