@@ -10,10 +10,9 @@ import numpy as np
 
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory, small_cell
-from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
-from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.planning.corrections import MAX_VISITS, CorrectionArrays
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
@@ -47,7 +46,7 @@ class FittedRMaxAgent:
     :param task: state variables and actions
     :param transfer: a transfer method, bound here to the task; None for none
     :param rng: generator of all random numbers of learning
-    :param model_class: a subclass of :class:`~sb3_combrel.models.base.Model`
+    :param model_class: a subclass of :class:`~sb3_combrel.models.base.Model`; None: the one for ``settings.degree``
     :raises ValueError: if the settings do not fit the task, or the transfer method does not
     """
 
@@ -57,12 +56,12 @@ class FittedRMaxAgent:
         task: Task,
         transfer: Transfer | None = None,
         rng: np.random.Generator | None = None,
-        model_class: type[Model] = KernelAverage,
+        model_class: type[Model] | None = None,
     ):
         self.settings = settings
         self.task = task
         self.transfer = transfer
-        self.model_class = model_class
+        self.model_class = MODELS[settings.degree] if model_class is None else model_class
         self.rng = np.random.default_rng() if rng is None else rng
         self._prediction_rng = np.random.default_rng(self.rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
         d = task.n_variables

@@ -125,7 +125,7 @@ class FittedRMax(PersistentAlgorithm):
         transfer: Transfer | dict[str, Any] | str | None = None,
         model_breadth: float | None = DEFAULTS.model_breadth,
         min_fraction: float = DEFAULTS.min_fraction,
-        min_weight: float = DEFAULTS.min_weight,
+        min_weight: float | None = DEFAULTS.min_weight,
         exploration_threshold: float = DEFAULTS.exploration_threshold,
         resolution: int | Sequence[int] | None = DEFAULTS.resolution,
         max_value: float = DEFAULTS.max_value,
@@ -134,6 +134,9 @@ class FittedRMax(PersistentAlgorithm):
         max_backups: int | None = DEFAULTS.max_backups,
         max_instances: int | None = DEFAULTS.max_instances,
         bounds: tuple[Any, Any] | None = DEFAULTS.bounds,
+        degree: int = DEFAULTS.degree,
+        n_neighbors: int | None = DEFAULTS.n_neighbors,
+        outcome_breadth: float = DEFAULTS.outcome_breadth,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -168,6 +171,9 @@ class FittedRMax(PersistentAlgorithm):
         self.max_backups = max_backups
         self.max_instances = max_instances
         self.bounds = bounds
+        self.degree = degree
+        self.n_neighbors = n_neighbors
+        self.outcome_breadth = outcome_breadth
         self._warned_of_max_value = False
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:

@@ -21,7 +21,6 @@ from sb3_combrel.fitted_rmax.loop_detection import EpisodeMemory, memories
 from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
-from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
 
@@ -53,7 +52,7 @@ class FittedRMaxPolicy(BasePolicy):
     :param action_space: Discrete
     :param lr_schedule: not used; SB3 passes one to every policy
     :param transfer: a transfer method of the policy's own; or what a file has of one
-    :param model_class: the model of the dynamics
+    :param model_class: the model of the dynamics; None: the one for ``degree``
     :param state_names: names of the state variables, for display
     :param action_names: names of the actions, for display
     :param rng: generator of all random numbers of learning
@@ -67,15 +66,15 @@ class FittedRMaxPolicy(BasePolicy):
         lr_schedule: Schedule | None = None,
         *,
         transfer: Transfer | dict[str, Any] | None = None,
-        model_class: type[Model] = KernelAverage,
+        model_class: type[Model] | None = None,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         rng: np.random.Generator | None = None,
         **settings: Any,
     ):
         super().__init__(observation_space, action_space, normalize_images=False)
-        if not (isinstance(model_class, type) and issubclass(model_class, Model)):
-            raise ValueError(f"model_class must be a subclass of Model, got {model_class!r}")
+        if model_class is not None and not (isinstance(model_class, type) and issubclass(model_class, Model)):
+            raise ValueError(f"model_class must be a subclass of Model or None, got {model_class!r}")
         given = FittedRMaxSettings(**settings)
         self.scaling = StateScaling.from_space(observation_space, given.bounds)
         names = (() if given_names is None else given_names for given_names in (state_names, action_names))
@@ -85,6 +84,7 @@ class FittedRMaxPolicy(BasePolicy):
         self.to_unit = ObservationScaler(self.scaling)
         self._first_action = int(action_space.start)
         self._settings = settings
+        self._model_class = model_class
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not there otherwise.
@@ -103,7 +103,7 @@ class FittedRMaxPolicy(BasePolicy):
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
         parameters = {**spaces_of_both, **self._settings, "transfer": describe_transfer(self.transfer)}
         # A class is pickled by its name, and imported by who reads it: only one of the user's own has to be.
-        return parameters if self.agent.model_class is KernelAverage else {**parameters, "model_class": self.agent.model_class}
+        return parameters if self._model_class is None else {**parameters, "model_class": self._model_class}
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)

@@ -7,14 +7,21 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
-from sb3_combrel.models.base import ModelSettings
+from sb3_combrel.models.base import Model, ModelSettings
+from sb3_combrel.models.kernel_average import KernelAverage
+from sb3_combrel.models.local_linear import LocalLinear
 
 # By default so many corners of grid cells are looked at in a step: a backup costs as much as a cell has corners.
 CORNERS_A_STEP = 400
-DEFAULT_BREADTHS = {1: 0.09, 2: 0.09, 3: 0.15}
-DEFAULT_BREADTH_OF_MORE = 0.2
+# By degree of the local model and number of state variables, the last one for more.
+DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.1, 0.1, 0.25, 0.4, 0.4, 0.5)}
+DEFAULT_NEIGHBORS = (16, 16, 24, 40, 40, 60)
+DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
+MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
 # More than any step has time for; at an episode's end there are 400 times as many, which must fit into an int64.
 MAX_BACKUPS = 10**12
+# A fit to thousands of instances is no local one.
+MAX_NEIGHBORS = 10_000
 
 
 @dataclass(frozen=True)
@@ -25,9 +32,12 @@ class FittedRMaxSettings:
     :raises ValueError: if one is out of its range
     """
 
+    degree: int = 0
     model_breadth: float | None = None
+    n_neighbors: int | None = None
+    outcome_breadth: float = 0.1
     min_fraction: float = 0.1
-    min_weight: float = 0.01
+    min_weight: float | None = None
     exploration_threshold: float = 1.0
     resolution: int | Sequence[int] | None = None
     max_value: float = 0.0
@@ -38,10 +48,15 @@ class FittedRMaxSettings:
     bounds: tuple[Any, Any] | None = None
 
     def __post_init__(self) -> None:
+        if self.degree not in (0, 1) or isinstance(self.degree, bool):
+            raise ValueError(f"degree must be 0 (kernel average) or 1 (local linear), got {self.degree!r}")
         if self.model_breadth is not None:
             check_positive("model_breadth", self.model_breadth)
+        check_count("n_neighbors", self.n_neighbors, min=2, max=MAX_NEIGHBORS, none_allowed=True)
+        check_positive("outcome_breadth", self.outcome_breadth)
         check_positive("min_fraction", self.min_fraction, max=1.0)
-        check_positive("min_weight", self.min_weight, max=0.99)
+        if self.min_weight is not None:
+            check_positive("min_weight", self.min_weight, max=0.99)
         check_positive("exploration_threshold", self.exploration_threshold)
         check_positive("gamma", self.gamma, max=1.0)
         check_positive("planning_tolerance", self.planning_tolerance)
@@ -58,7 +73,15 @@ class FittedRMaxSettings:
         """The kernel breadth for so many state variables."""
         if self.model_breadth is not None:
             return float(self.model_breadth)
-        return DEFAULT_BREADTHS.get(n_variables, DEFAULT_BREADTH_OF_MORE)
+        return _by_number(DEFAULT_BREADTHS[self.degree], n_variables)
+
+    def neighbors_for(self, n_variables: int) -> int:
+        """The instances of a local linear fit with so many state variables."""
+        return int(_by_number(DEFAULT_NEIGHBORS, n_variables)) if self.n_neighbors is None else int(self.n_neighbors)
+
+    def min_weight_by_degree(self) -> float:
+        """The weight below which instances do not count."""
+        return DEFAULT_MIN_WEIGHTS[self.degree] if self.min_weight is None else float(self.min_weight)
 
     def backups_for(self, n_variables: int) -> int:
         """The backups of a step with so many state variables."""
@@ -77,8 +100,14 @@ class FittedRMaxSettings:
         """What a model of a task with so many state variables needs of them."""
         return ModelSettings(
             model_breadth=self.breadth_for(n_variables),
-            min_weight=float(self.min_weight),
+            min_weight=self.min_weight_by_degree(),
             min_fraction=float(self.min_fraction),
             exploration_threshold=float(self.exploration_threshold),
             max_instances=self.max_instances,
+            n_neighbors=self.neighbors_for(n_variables),
+            outcome_breadth=float(self.outcome_breadth),
         )
+
+
+def _by_number(defaults: Sequence[float], n_variables: int) -> float:
+    return float(defaults[min(n_variables, len(defaults)) - 1])

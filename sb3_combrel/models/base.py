@@ -27,6 +27,8 @@ class ModelSettings:
     :param min_fraction: fraction of the weight of nearer instances that an instance must have
     :param exploration_threshold: weight of instances that makes a state-action pair known
     :param max_instances: of one action; None for no limit
+    :param n_neighbors: of a local linear model: nearest instances that a fit is made to
+    :param outcome_breadth: of a local linear model: breadth of the kernel for rewards and ends
     """
 
     model_breadth: float
@@ -34,6 +36,8 @@ class ModelSettings:
     min_fraction: float
     exploration_threshold: float
     max_instances: int | None = None
+    n_neighbors: int = 40
+    outcome_breadth: float = 0.1
 
 
 class Predictions(NamedTuple):

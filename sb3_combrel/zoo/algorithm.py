@@ -74,7 +74,7 @@ class ZooFittedRMax(FittedRMax):
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         n_actions = int(self.action_space.n)
         breadth = self.settings.breadth_for(n_variables)
-        suited, *_ = fitting_grid(n_variables, n_actions, None, breadth, self.min_weight).resolution
+        suited, *_ = fitting_grid(n_variables, n_actions, None, breadth, self.settings.min_weight_by_degree()).resolution
         if wanted == "coarser":
             return max(1, suited - 1)
         n_pairs = (2 ** (suited + 1) + 1) ** n_variables * n_actions

@@ -1,0 +1,234 @@
+"""The local linear model: effects by weighted linear regression on the instances near a state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.linear_regression import n_products
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.linear_fits import FitScratch, Kernel, LinearFits, enter_plain, leave, recount_pairs, update_rows_plain
+from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
+from sb3_combrel.planning.mdp import FiniteMDP
+from sb3_combrel.planning.q_values import Prediction
+
+# As of the kernel average: own weight must have changed by this fraction of the threshold before the row of a pair that has
+# transferred instances is updated within an episode.
+MIN_CHANGE = 0.5
+
+_enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
+_update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
+_join_transferred = EntryPoint(join_transferred_plain)
+
+
+class LocalLinear(Model):
+    """
+    Local linear regression, one model for each action, incremental (Atkeson, Moore & Schaal 1997).
+
+    An instance at distance d (unit coordinates) weighs exp(-d^2 / breadth^2); these weights decide what is known, as in
+    the kernel average. The effect at a state is fitted, as a linear function of the state, to its ``n_neighbors`` nearest
+    instances with a kernel that is narrower where they lie closer: as broad as makes the last of them weigh 0.05. The bias
+    of a kernel average is of the order of the breadth, that of a linear fit of the order of its square, so a broad kernel,
+    which needs few instances, predicts well. Predicted effects stay within the range of the effects seen. Rewards and ends,
+    which jump from one state to the next, are kernel averages with a narrower kernel. One successor a pair: the mean.
+
+    On the grid, the sums of each pair's regression are kept: an instance is added to those of all pairs that it reaches, and
+    the regression is solved again only where the instances since the last time contradict it. When a pair has half as many
+    again as ``n_neighbors`` its kernel narrows, and the sums are computed anew. With ``max_instances``, the nearest instance
+    of the same action is replaced.
+
+    Parameters: see :class:`~sb3_combrel.models.base.Model`.
+    """
+
+    def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
+        super().__init__(mdp, settings, transfer)
+        grid = self.grid
+        d, n_points, n_pairs, n_near = grid.n_variables, grid.n_points, len(self.known), settings.n_neighbors
+        breadth = float(settings.model_breadth)
+        self._kernel = Kernel(
+            scale=-1.0 / breadth**2,
+            reach=-np.log(settings.min_weight) * breadth**2,
+            outcome_scale=-1.0 / min(breadth, float(settings.outcome_breadth)) ** 2,
+            n_neighbors=n_near,
+        )
+        self._plain_kernel = tuple(self._kernel)
+        self._set_fits(
+            LinearFits(
+                sums=np.zeros((n_pairs, n_products(d))),
+                outcome=np.zeros((n_pairs, 3)),
+                fit=np.zeros((n_pairs, d + d * d)),
+                row=np.zeros((n_pairs, d + 2)),
+                unexplained=np.zeros(n_pairs),
+                reach=np.full(n_pairs, self._kernel.reach),
+                scale=np.full(n_pairs, self._kernel.scale),
+                count=np.zeros(n_pairs, dtype=np.int32),
+                limit=np.full(n_pairs, n_near + n_near // 2, dtype=np.int32),
+                total=self.own_weight,
+                last_total=np.zeros(n_pairs),
+                known=self.known,
+                target=np.empty((self.n_actions, self.instances.capacity, d)),
+                prior=np.zeros((n_pairs, d)),
+                effect_range=np.stack([np.full((self.n_actions, d), np.inf), np.full((self.n_actions, d), -np.inf)]),
+            )
+        )
+        self._scratch = FitScratch(
+            at=np.empty(d),
+            products=np.empty((2, n_products(d))),
+            factor=np.empty((d, d)),
+            nearest=np.empty(n_near),
+            along=np.empty((d, int(grid.arrays.shape.max()))),
+            range=np.empty((3, d), dtype=np.int64),
+            point=np.empty(n_points, dtype=np.int64),
+            distance=np.empty(n_points),
+        )
+        self._plain_scratch = tuple(self._scratch)
+        self._near = NearestLists(
+            item=np.empty((self.n_actions, n_near), dtype=np.int32),
+            distance=np.empty((self.n_actions, n_near)),
+            length=np.zeros(self.n_actions, dtype=np.int64),
+            products=np.empty((2, n_products(d))),
+            factor=np.empty((d, d)),
+            fit=np.empty(d + d * d),
+        )
+        self._plain_near = tuple(self._near)
+        self._prior_here = np.zeros((self.n_actions, d))
+        self._make_prediction(1)
+        self._nothing = TransferredInstances.empty(1, d)
+
+    # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
+
+    def _set_fits(self, fits: LinearFits) -> None:
+        self.fits, self._plain_fits = fits, tuple(fits)
+
+    def _make_prediction(self, room: int) -> None:
+        self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
+        self._plain_prediction = tuple(self._prediction)
+
+    @property
+    def instances(self) -> Instances:
+        """The instances, by action."""
+        return self._instances
+
+    @instances.setter
+    def instances(self, instances: Instances) -> None:
+        self._instances, self._plain_instances = instances, tuple(instances)
+
+    def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
+        """
+        Add one transition (see :meth:`Model.add`).
+
+        :return: the pairs whose predictions have moved, but with a transfer method only known ones and those whose weight
+            has changed enough; the others may wait (see :meth:`outdated`)
+        """
+        slot, emptied = self._slot_for(state, action)
+        threshold = self.exploration_threshold
+        thresholds = threshold, 0.0 if self.transfer is None else MIN_CHANGE * threshold
+        n_changed = _enter.call(
+            self._plain_instances,
+            self._plain_fits,
+            self.grid.plain,
+            self._plain_kernel,
+            thresholds,
+            (action, slot, state, next_state, reward, terminated),
+            self._plain_scratch,
+        )
+        changed = self._scratch.point[:n_changed] + action * self.grid.n_points
+        return changed if len(emptied) == 0 else np.union1d(emptied, changed)
+
+    def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
+        """Where a new instance goes, and the pairs that have none left once another has made room."""
+        instances = self._instances
+        size = int(instances.size[action])
+        if self.settings.max_instances is not None and size >= self.settings.max_instances:
+            slot = int(((instances.state[action, :size] - state) ** 2).sum(axis=1).argmin())
+            n = _leave.call(instances, self.fits, self.grid.arrays, self._kernel, action, slot, self._scratch)
+            return slot, self._scratch.point[:n] + action * self.grid.n_points
+        if size == instances.capacity:
+            self.instances = instances.with_room(action)
+            target = np.empty((self.n_actions, self.instances.capacity, self.grid.n_variables))
+            target[:, : instances.capacity] = self.fits.target
+            self._set_fits(self.fits._replace(target=target))
+        return size, NO_PAIRS
+
+    def outdated(self) -> np.ndarray:
+        return np.flatnonzero(~self.fits.known & (self.fits.total != self.fits.last_total))
+
+    def update_rows(self, pairs: np.ndarray) -> None:
+        mdp = self.mdp
+        transferred = tuple(self._transferred_to(pairs))
+        done = 0
+        while done < len(pairs):
+            query, scratch = (pairs, done), mdp.plain_scratch
+            done = _update_rows.call(
+                self._plain_fits, mdp.plain, self.grid.plain, mdp.gamma, query, transferred, scratch, self._plain_scratch
+            )
+            if done < len(pairs):
+                mdp.make_room()
+
+    def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
+        """Transferred instances for pairs; known ones need none."""
+        if self.transfer is None or self.known[pairs].all():
+            if len(self._nothing.length) < len(pairs):
+                self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
+            return self._nothing
+        actions, points = np.divmod(pairs, self.grid.n_points)
+        # Of a known pair the full threshold, so that no method has work with it; it may have been lowered.
+        full = self.settings.exploration_threshold
+        own_weight = np.where(self.known[pairs], np.maximum(full, self.own_weight[pairs]), self.own_weight[pairs])
+        given = self.transfer.transferred_to_sample(points, actions, own_weight)
+        self._check(given, own_weight)
+        return given
+
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
+        rows = []
+        for state, action in zip(states, actions, strict=True):
+            self._predict_own(np.ascontiguousarray(state, dtype=np.float64))
+            rows.append([array[action].copy() for array in self._prediction])
+        _, weight, reward, length, probability, effect = map(np.array, zip(*rows, strict=True))
+        used = np.arange(probability.shape[1]) < length[:, None]
+        return Predictions(weight, reward, np.where(used, probability, 0.0), np.where(used[:, :, None], effect, 0.0))
+
+    def _predict_own(self, state: np.ndarray) -> float:
+        """Fill the prediction from the own instances; the least weight that an action has."""
+        of_model = self.fits.target, self.fits.effect_range, self._prior_here
+        near, prediction = self._plain_near, self._plain_prediction
+        threshold = self.exploration_threshold
+        return float(
+            _predict_own.call(self._plain_instances, of_model, state, self._plain_kernel, threshold, near, prediction)
+        )
+
+    def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
+        if self._predict_own(state) >= self.exploration_threshold or self.transfer is None:
+            return self._prediction, None
+        actions = np.arange(self.n_actions)
+        states = np.repeat(state[None], self.n_actions, axis=0)
+        given = self.transfer.transferred(states, actions, self._prediction.weight)
+        self._check(given, self._prediction.weight)
+        room = 1 + given.weight.shape[1]
+        if room > self._prediction.probability.shape[1]:
+            self._make_prediction(room)
+            self._predict_own(state)
+        _join_transferred.call(tuple(given), self.exploration_threshold, self._plain_prediction)
+        return self._prediction, given
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        return {**super().get_state(), "reach": self.fits.reach.copy()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Compute sums and fits from the instances; pairs that were known stay known."""
+        instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1])
+        self.instances = instances
+        fits = self.fits
+        fits.reach[:] = state["reach"]
+        fits.known[:] = state["known"] > 0.5
+        target = np.ascontiguousarray(instances.effect)
+        self._set_fits(fits._replace(target=target))
+        for action, size in enumerate(instances.size.tolist()):
+            if size:
+                fits.effect_range[0, action] = instances.effect[action, :size].min(axis=0)
+                fits.effect_range[1, action] = instances.effect[action, :size].max(axis=0)
+        _recount.call(self.instances, self.fits, self.grid.arrays, self._kernel, self.exploration_threshold, self._scratch)
+        fits.total[:] = state["total"]
+        self.update_all_rows()
