@@ -11,6 +11,7 @@ import gymnasium as gym
 from gymnasium.wrappers import DiscretizeAction
 
 from sb3_combrel.experiments import ball_striking, mountain_car
+from sb3_combrel.experiments.point_robot import make_point_robot
 from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.experiments.suite_measures import (
     Measure,
@@ -123,6 +124,9 @@ ACROBOT: dict[str, Any] = {
     "bounds": ([-1.0, -1.0, -1.0, -1.0, -7.0, -12.0], [1.0, 1.0, 1.0, 1.0, 7.0, 12.0]),
 }
 
+#: A twentieth of the robot's step. Without any it visits the points of a lattice only, which is a case of its own.
+SLIGHT_NOISE = 0.003
+
 CAR_2D = Source("mountain_car_2d", mountain_car.learn_source)
 TORSO = Source("icub_torso", ball_striking.learn_source)
 
@@ -184,6 +188,15 @@ _ALL = (
         for suffix, noisy in (("", ""), ("-noisy", "Noisy"))
     ),
     Task("MountainCar6D", _car_6d, n_episodes=8, measures=(_FIRST_8,), headline=_FIRST_8.name, source=CAR_2D),
+    *(
+        Task(f"PointRobot{suffix}", partial(make_point_robot, n_variables, noise, start), n_steps=5000)
+        for suffix, n_variables, noise, start in (
+            ("2D", 2, SLIGHT_NOISE, "fixed"),
+            ("3D", 3, SLIGHT_NOISE, "fixed"),
+            ("3D-exact", 3, 0.0, "fixed"),
+            ("3D-random", 3, SLIGHT_NOISE, "random"),
+        )
+    ),
 )
 TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 
