@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
+TESTS = ("welch", "mann-whitney")
 
 
 class Estimate(NamedTuple):
@@ -89,3 +91,46 @@ def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarr
     """
     episodes = episodes_to_reach(steps, threshold, window)
     return np.array([each[: int(n)].sum() if np.isfinite(n) else np.inf for each, n in zip(steps, episodes, strict=True)])
+
+
+def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "welch") -> float:
+    """
+    Compute the two-sided p-value that two samples have the same mean, or the same distribution.
+
+    :param first: one sample, shape (n,); inf is allowed
+    :param second: the other
+    :param test: ``"welch"``, Welch's t-test, or ``"mann-whitney"``, the test by Mann and Whitney, which is also used where
+        a value is infinite and means do not exist
+    :return: NaN with fewer than two values in one sample, or a NaN in them; 1 if all values are equal
+    :raises ValueError: if the test is unknown
+    """
+    if test not in TESTS:
+        raise ValueError(f"test must be one of {', '.join(TESTS)}, got {test!r}")
+    first, second = (np.asarray(sample, dtype=np.float64) for sample in (first, second))
+    together = np.concatenate([first, second])
+    if min(len(first), len(second)) < 2 or np.isnan(together).any():
+        return np.nan
+    if (together == together[0]).all():
+        return 1.0
+    no_spread = (first == first[0]).all() and (second == second[0]).all()
+    if test == "mann-whitney" or no_spread or not np.isfinite(together).all():
+        return float(stats.mannwhitneyu(first, second).pvalue)
+    with warnings.catch_warnings():
+        # Of loss of precision, where the values of a sample are nearly equal.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return float(stats.ttest_ind(first, second, equal_var=False).pvalue)
+
+
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """
+    Correct p-values for their number by Holm's method (Holm, "A simple sequentially rejective multiple test procedure", 1979).
+
+    :param p_values: shape (n,); NaN stays NaN and does not count
+    """
+    p_values = np.asarray(p_values, dtype=np.float64)
+    corrected = np.full(p_values.shape, np.nan)
+    tested = np.flatnonzero(~np.isnan(p_values))
+    order = tested[np.argsort(p_values[tested])]
+    factors = np.arange(len(order), 0, -1)
+    corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
+    return corrected

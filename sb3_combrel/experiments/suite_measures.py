@@ -1,0 +1,157 @@
+"""What is measured of the episodes of a run: steps, returns, failures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.experiments.statistics import steps_to_reach
+
+#: So many episodes at the end of learning are what the frozen policy is compared with.
+LAST = 10
+#: So many episodes, at least, must stay below a limit for a task to count as learnt for good.
+SHORTEST_TAIL = 5
+#: The frozen policy is as good as the learning agent if its mean return is lower by at most this fraction.
+TOLERATED_LOSS = 0.05
+
+
+class Episodes(NamedTuple):
+    """
+    Episodes that have ended, one entry each.
+
+    :param steps: environment steps, shape (n_episodes,)
+    :param returns: undiscounted sums of rewards, shape (n_episodes,)
+    :param terminated: bool, whether a terminal state ended it; False for a time limit, shape (n_episodes,)
+    """
+
+    steps: np.ndarray
+    returns: np.ndarray
+    terminated: np.ndarray
+
+    @classmethod
+    def from_rows(cls, rows: list[tuple[int, float, bool]]) -> Episodes:
+        """Make them from (steps, return, terminated) of each episode."""
+        steps, returns, terminated = zip(*rows, strict=True) if rows else ((), (), ())
+        return cls(np.array(steps, dtype=np.int64), np.array(returns, dtype=np.float64), np.array(terminated, dtype=bool))
+
+    def last(self, n: int) -> Episodes:
+        """The last ``n`` of them, or all if there are fewer."""
+        start = max(len(self.steps) - n, 0)
+        return Episodes(*(column[start:] for column in self))
+
+
+class Measure(NamedTuple):
+    """
+    A number that describes the learning of a task.
+
+    :param name: its column in tables
+    :param of: from the episodes of learning to the number; NaN if there were too few, inf if a limit was never reached
+    :param higher_is_better: whether more of it is better
+    """
+
+    name: str
+    of: Callable[[Episodes], float]
+    higher_is_better: bool = False
+
+
+def steps_in(first: int, last: int) -> Measure:
+    """
+    Measure the steps of episodes ``first`` to ``last``, counted from 1, together.
+
+    :param first: number of the first episode
+    :param last: number of the last episode
+    """
+    return Measure(f"steps_{first}_to_{last}", lambda episodes: _of_range(episodes, first, last, np.sum))
+
+
+def mean_steps_in(first: int, last: int) -> Measure:
+    """Measure the mean steps of episodes ``first`` to ``last``, counted from 1."""
+    return Measure(f"mean_steps_{first}_to_{last}", lambda episodes: _of_range(episodes, first, last, np.mean))
+
+
+def steps_until_always(limit: int) -> Measure:
+    """
+    Measure after how many steps of learning every further episode has at most ``limit`` steps; inf if that is never so.
+
+    At least :data:`SHORTEST_TAIL` episodes must be left: a single short one at the end would prove nothing.
+
+    :param limit: steps of an episode
+    """
+    return Measure(f"steps_until_always_{limit}", lambda episodes: settled_after(episodes.steps, limit))
+
+
+def steps_until_median(limit: int, window: int = 5) -> Measure:
+    """
+    Measure after how many steps of learning the median of ``window`` episodes is at most ``limit``; inf if it never is.
+
+    :param limit: steps of an episode
+    :param window: number of episodes
+    """
+
+    def steps(episodes: Episodes) -> float:
+        return float(steps_to_reach(episodes.steps[None], limit, window)[0])
+
+    return Measure(f"steps_until_median_{limit}", steps)
+
+
+def settled_after(steps: np.ndarray, limit: int, shortest_tail: int = SHORTEST_TAIL) -> float:
+    """
+    Count the steps up to the end of the last episode that has more than ``limit`` of them.
+
+    :param steps: steps of each episode, shape (n_episodes,)
+    :param limit: steps of an episode
+    :param shortest_tail: inf if fewer episodes than this follow
+    """
+    too_long = np.flatnonzero(steps > limit)
+    n_before = int(too_long[-1]) + 1 if len(too_long) else 0
+    return float(steps[:n_before].sum()) if len(steps) - n_before >= shortest_tail else np.inf
+
+
+def failures(episodes: Episodes, failure_return: float | None) -> np.ndarray:
+    """
+    Tell which episodes have failed.
+
+    :param episodes: the episodes
+    :param failure_return: those have whose return is at most this; None: those that a time limit ended
+    :return: bool, shape (n_episodes,)
+    """
+    return ~episodes.terminated if failure_return is None else episodes.returns <= failure_return
+
+
+def summary_of_learning(episodes: Episodes, failure_return: float | None) -> dict[str, float]:
+    """Return what is recorded of the last ten episodes of learning; NaN if there was none."""
+    last = episodes.last(LAST)
+    if not len(last.steps):
+        return {"last10_return": np.nan, "last10_failed": np.nan}
+    return {
+        "last10_return": float(last.returns.mean()),
+        "last10_failed": float(failures(last, failure_return).mean()),
+    }
+
+
+def summary_of_evaluation(episodes: Episodes, failure_return: float | None, last10_return: float) -> dict[str, float]:
+    """
+    Return what is recorded of evaluation episodes.
+
+    ``as_good`` is 1 if the mean return is at most 5% below that of the last episodes of learning and no episode failed.
+
+    :param episodes: the evaluation episodes, at least one
+    :param failure_return: see :func:`failures`
+    :param last10_return: mean return of the last episodes of learning
+    """
+    mean, n_failures = float(episodes.returns.mean()), int(failures(episodes, failure_return).sum())
+    as_good = n_failures == 0 and mean >= last10_return - TOLERATED_LOSS * abs(last10_return)
+    return {
+        "mean": mean,
+        "worst": float(episodes.returns.min()),
+        "failures": n_failures,
+        "as_good": float(as_good),
+    }
+
+
+def _of_range(episodes: Episodes, first: int, last: int, statistic: Callable[[np.ndarray], float]) -> float:
+    if len(episodes.steps) < last:
+        return np.nan
+    return float(statistic(episodes.steps[first - 1 : last]))

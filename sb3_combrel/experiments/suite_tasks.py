@@ -1,0 +1,216 @@
+"""The tasks of the suite: environment, budget, measures, and what the learner is told of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.wrappers import DiscretizeAction
+
+from sb3_combrel.experiments import ball_striking, mountain_car
+from sb3_combrel.experiments.point_robot import make_point_robot
+from sb3_combrel.experiments.runs import make_task
+from sb3_combrel.experiments.suite_measures import (
+    Measure,
+    mean_steps_in,
+    steps_in,
+    steps_until_always,
+    steps_until_median,
+)
+from sb3_combrel.sources.source_instances import SourceInstances
+
+
+class NoisyActions(gym.ActionWrapper):
+    """
+    Replaces an action, now and then, by one drawn uniformly from all actions, with the environment's own generator.
+
+    :param env: an environment with Discrete actions
+    :param probability: of a replacement, in [0, 1]
+    :raises ValueError: if the probability is out of its range
+    """
+
+    def __init__(self, env: gym.Env, probability: float = 0.1):
+        super().__init__(env)
+        if not 0.0 <= probability <= 1.0:
+            raise ValueError(f"probability must be in [0, 1], got {probability!r}")
+        self.probability = probability
+
+    def action(self, action: Any) -> Any:
+        """Return the action, or another one in its place."""
+        assert isinstance(self.action_space, gym.spaces.Discrete)
+        if self.np_random.random() >= self.probability:
+            return action
+        return int(self.action_space.start + self.np_random.integers(self.action_space.n))
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    A source task of transfer.
+
+    :param name: name of its file
+    :param learn: learns it and returns its instances
+    """
+
+    name: str
+    learn: Callable[[], SourceInstances]
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    A task to learn, and how learning it is measured. Exactly one of ``n_steps`` and ``n_episodes`` is given.
+
+    :param name: in tables and on the command line
+    :param make: makes the environment; its seed is that of the run
+    :param learner: arguments of :class:`~sb3_combrel.FittedRMax` that describe the task: ``gamma``, ``max_value``, ``bounds``
+    :param n_steps: steps to learn
+    :param n_episodes: episodes to learn
+    :param measures: of the episodes of learning
+    :param headline: the column that stands for the task in the overview, a measure or one of the evaluation
+    :param failure_return: an episode with at most this return is a failure; None: one that a time limit ends
+    :param source: source task for transfer
+    :raises ValueError: if both or none of ``n_steps`` and ``n_episodes`` are given
+    """
+
+    name: str
+    make: Callable[[], gym.Env]
+    learner: Mapping[str, Any] = field(default_factory=dict)
+    n_steps: int | None = None
+    n_episodes: int | None = None
+    measures: tuple[Measure, ...] = ()
+    headline: str = "greedy_mean"
+    failure_return: float | None = None
+    source: Source | None = None
+
+    def __post_init__(self) -> None:
+        if (self.n_steps is None) == (self.n_episodes is None):
+            raise ValueError(
+                f"{self.name}: either n_steps or n_episodes must be given, got {self.n_steps!r} and {self.n_episodes!r}"
+            )
+
+
+def make_pendulum() -> gym.Env:
+    """Make the pendulum with five torques: Gymnasium's ``DiscretizeAction`` takes the centres of five intervals."""
+    return DiscretizeAction(make_task("Pendulum-v1", disable_env_checker=True), bins=5)
+
+
+def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
+    """
+    Make an environment in which every tenth action is a random one.
+
+    :param env_id: id of an environment with Discrete actions
+    :param kwargs: arguments of ``gymnasium.make``
+    """
+    return NoisyActions(make_task(env_id, **kwargs))
+
+
+#: Steps after which an episode of combrel's Mountain Cars is cut off.
+CAP = 2000
+#: A hit by the first command returns 99.
+STRIKE: dict[str, Any] = {"max_value": 100.0}
+#: As in zoo_configs/fitted_rmax.yml. The velocities of the pole and the cart have no bounds of their own.
+CART_POLE: dict[str, Any] = {
+    "gamma": 0.99,
+    "max_value": 100.0,
+    "bounds": ([-4.8, -3.0, -0.23, -3.2], [4.8, 3.0, 0.23, 3.2]),
+}
+#: As in zoo_configs/fitted_rmax.yml: the bounds of the velocities leave out what the swing-up does not reach.
+ACROBOT: dict[str, Any] = {
+    "gamma": 0.99,
+    "bounds": ([-1.0, -1.0, -1.0, -1.0, -7.0, -12.0], [1.0, 1.0, 1.0, 1.0, 7.0, 12.0]),
+}
+
+#: A twentieth of the robot's step. Without any it visits the points of a lattice only, which is a case of its own.
+SLIGHT_NOISE = 0.003
+
+CAR_2D = Source("mountain_car_2d", mountain_car.learn_source)
+TORSO = Source("icub_torso", ball_striking.learn_source)
+
+_car_2d = partial(make_task, mountain_car.SOURCE_ID, max_episode_steps=CAP)
+_car_4d = partial(make_task, mountain_car.TARGET_ID, max_episode_steps=CAP)
+_car_6d = partial(make_task, "combrel/MountainCar6D-v0", max_episode_steps=CAP)
+_gym_car = partial(make_task, "MountainCar-v0", disable_env_checker=True)
+_acrobot = partial(make_task, "Acrobot-v1", disable_env_checker=True)
+_cart_pole = partial(make_task, "CartPole-v1", disable_env_checker=True)
+_noisy_car_2d = partial(make_noisy, mountain_car.SOURCE_ID, max_episode_steps=CAP)
+_noisy_gym_car = partial(make_noisy, "MountainCar-v0", disable_env_checker=True)
+
+_TWELVE = steps_in(1, 12)
+_LAST_OF_60 = mean_steps_in(41, 60)
+_LAST_OF_50 = mean_steps_in(41, 50)
+_FIRST_8 = mean_steps_in(1, 8)
+_TORSO_SETTLED = steps_until_always(27)
+_NEAR_50 = steps_until_median(50)
+# 475 is Gymnasium's own threshold.
+_FALLEN = 474.0
+# A pendulum that never swings up has about -1000 or less.
+_NOT_UP = -800.0
+
+_ALL = (
+    Task("MountainCar4D", _car_4d, n_episodes=12, measures=(_TWELVE,), headline=_TWELVE.name, source=CAR_2D),
+    Task(
+        "MountainCar4D-60", _car_4d, n_episodes=60, measures=(_TWELVE, _LAST_OF_60), headline=_LAST_OF_60.name, source=CAR_2D
+    ),
+    Task("MountainCar2D", _car_2d, n_episodes=50, measures=(_LAST_OF_50,), headline=_LAST_OF_50.name),
+    Task("MountainCar2D-noisy", _noisy_car_2d, n_episodes=50, measures=(_LAST_OF_50,), headline=_LAST_OF_50.name),
+    Task("MountainCar-v0", _gym_car, n_steps=1500),
+    Task("MountainCar-v0-noisy", _noisy_gym_car, n_steps=3000),
+    Task("Acrobot-v1", _acrobot, ACROBOT, n_steps=6000),
+    Task("Acrobot-v1-15000", _acrobot, ACROBOT, n_steps=15_000),
+    Task("CartPole-v1", _cart_pole, CART_POLE, n_steps=3000, failure_return=_FALLEN),
+    Task("Pendulum-v1", make_pendulum, {"gamma": 0.97}, n_steps=1000, failure_return=_NOT_UP),
+    *(
+        Task(
+            f"ICubTorso{suffix}",
+            partial(make_task, f"combrel/ICubTorsoStrike{noisy}-v0"),
+            STRIKE,
+            n_steps=4000,
+            measures=(_TORSO_SETTLED, _NEAR_50),
+            headline=headline,
+        )
+        # With noise now and then an episode needs more than 27 commands, however good the policy.
+        for suffix, noisy, headline in (("", "", _TORSO_SETTLED.name), ("-noisy", "Noisy", _NEAR_50.name))
+    ),
+    *(
+        Task(
+            f"ICubArm{suffix}",
+            partial(make_task, f"combrel/ICubArmStrike{noisy}-v0"),
+            STRIKE,
+            n_steps=10_000,
+            measures=(_NEAR_50,),
+            headline=_NEAR_50.name,
+            source=TORSO,
+        )
+        for suffix, noisy in (("", ""), ("-noisy", "Noisy"))
+    ),
+    Task("MountainCar6D", _car_6d, n_episodes=8, measures=(_FIRST_8,), headline=_FIRST_8.name, source=CAR_2D),
+    *(
+        Task(f"PointRobot{suffix}", partial(make_point_robot, n_variables, noise, start), n_steps=5000)
+        for suffix, n_variables, noise, start in (
+            ("2D", 2, SLIGHT_NOISE, "fixed"),
+            ("3D", 3, SLIGHT_NOISE, "fixed"),
+            ("3D-exact", 3, 0.0, "fixed"),
+            ("3D-random", 3, SLIGHT_NOISE, "random"),
+        )
+    ),
+)
+TASKS: dict[str, Task] = {task.name: task for task in _ALL}
+
+
+def tasks_of(names: list[str]) -> list[Task]:
+    """
+    Return the tasks of some names.
+
+    :param names: some of :data:`TASKS`, or "all" alone
+    :raises ValueError: if a name is unknown
+    """
+    if names == ["all"]:
+        return list(TASKS.values())
+    unknown = [name for name in names if name not in TASKS]
+    if unknown or not names:
+        raise ValueError(f"tasks must be 'all' or some of {', '.join(TASKS)}, got {names!r}")
+    return [TASKS[name] for name in dict.fromkeys(names)]

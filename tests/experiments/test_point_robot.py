@@ -1,0 +1,164 @@
+"""The point robot: an environment as Gymnasium wants it, walls that hold, and a way around them."""
+
+from collections import deque
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+
+from sb3_combrel.experiments.point_robot import (
+    MAX_EPISODE_STEPS,
+    STEP,
+    WALLS,
+    Box,
+    PointRobotEnv,
+    make_point_robot,
+    move,
+    slab,
+)
+
+
+@pytest.mark.parametrize("start", ["fixed", "random"])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("n_variables", [2, 3])
+def test_environment_checkers_accept_it(n_variables, noise, start):
+    check_env(PointRobotEnv(n_variables, noise, start), skip_render_check=True)
+    check_env_for_sb3(PointRobotEnv(n_variables, noise, start))
+
+
+def move_in_tiny_steps(position, displacement, walls, n=2000):
+    position = position.copy()
+    for axis, distance in enumerate(displacement):
+        for _ in range(n):
+            moved = position.copy()
+            moved[axis] += distance / n
+            inside = any((moved > wall.low).all() and (moved < wall.high).all() for wall in walls)
+            if inside or not 0.0 <= moved[axis] <= 1.0:
+                break
+            position = moved
+    return position
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_a_move_ends_at_the_first_wall_or_boundary_in_its_way(seed, n_variables):
+    rng = np.random.default_rng(seed)
+    position = rng.random(n_variables)
+    walls = WALLS[n_variables]
+    # A start in a wall is moved beside one, where something is to be seen.
+    if any(wall.contains(position) for wall in walls):
+        position[0] = rng.choice([0.29, 0.37, 0.63, 0.71])
+    displacement = rng.uniform(-0.5, 0.5, n_variables)
+    expected = move_in_tiny_steps(position, displacement, walls)
+    found = move(position, displacement, walls)
+    np.testing.assert_allclose(found, expected, atol=np.abs(displacement).max() / 2000 + 1e-9)
+    assert not any(wall.contains(found) for wall in walls)
+
+
+def test_a_wall_is_pressed_not_entered_and_can_be_left():
+    walls = [Box(np.array([0.3, -1.0]), np.array([0.36, 0.7]))]
+    at_wall = move(np.array([0.29, 0.5]), np.array([0.06, 0.0]), walls)
+    np.testing.assert_array_equal(at_wall, [0.3, 0.5])
+    np.testing.assert_array_equal(move(at_wall, np.array([0.06, 0.0]), walls), at_wall)
+    np.testing.assert_allclose(move(at_wall, np.array([0.0, 0.06]), walls), [0.3, 0.56])
+    np.testing.assert_allclose(move(np.array([0.29, 0.71]), np.array([0.06, 0.0]), walls), [0.35, 0.71])
+    np.testing.assert_array_equal(move(np.array([0.4, 0.5]), np.array([-0.06, 0.0]), walls), [0.36, 0.5])
+    # In the gap, the wall's end stops a move as well.
+    np.testing.assert_array_equal(move(np.array([0.33, 0.72]), np.array([0.0, -0.06]), walls), [0.33, 0.7])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_a_slab_is_all_of_a_layer_but_its_gap(seed, n_variables):
+    rng = np.random.default_rng(seed)
+    axis = int(rng.integers(n_variables))
+    gap = [(low, high) if rng.random() < 0.7 else (0.0, 1.0) for low, high in np.sort(rng.random((n_variables - 1, 2)))]
+    walls = slab(axis, 0.4, 0.5, gap)
+    others = [other for other in range(n_variables) if other != axis]
+    for position in rng.random((200, n_variables)):
+        position[axis] = rng.choice([position[axis], 0.45])
+        in_gap = all(low <= position[other] <= high for other, (low, high) in zip(others, gap, strict=True))
+        expected = 0.4 < position[axis] < 0.5 and not in_gap
+        assert any(wall.contains(position) for wall in walls) == expected
+
+
+def shortest_way(env):
+    """Steps of the shortest way to the goal, by breadth-first search; the exact robot visits the points of a lattice."""
+    position = env.reset(seed=0)[0].astype(float)
+    seen, queue = {tuple(position.round(4))}, deque([(position, 0)])
+    while queue:
+        position, n = queue.popleft()
+        if (position >= env.goal.low).all():
+            return n
+        for axis in range(len(position)):
+            for sign in (-STEP, STEP):
+                moved = move(position, sign * np.eye(len(position))[axis], env.walls)
+                if tuple(moved.round(4)) not in seen:
+                    seen.add(tuple(moved.round(4)))
+                    queue.append((moved, n + 1))
+    return np.inf
+
+
+@pytest.mark.parametrize("n_variables", [2, 3])
+def test_the_walls_force_a_detour_but_leave_a_way(n_variables):
+    env = PointRobotEnv(n_variables)
+    around = shortest_way(env)
+    env.walls = ()
+    straight = shortest_way(env)
+    # Up to the first gap and down to the second takes at least 0.4 more, there and back.
+    assert straight + 2 * 0.4 / STEP - 2 <= around <= MAX_EPISODE_STEPS / 4
+
+
+def test_starts_rewards_and_ends():
+    fixed = make_point_robot(3)
+    first, _ = fixed.reset(seed=0)
+    second, _ = fixed.reset(seed=1)
+    np.testing.assert_array_equal(first, second)
+    env = PointRobotEnv(2, start="random")
+    starts = np.array([env.reset(seed=0 if n == 0 else None)[0] for n in range(300)])
+    assert len(np.unique(starts, axis=0)) == 300
+    assert not any(wall.contains(start) for wall in env.walls for start in starts)
+    assert not (starts >= env.goal.low.astype(np.float32)).all(axis=1).any()
+    # Down, into the corner, 400 times; then the same without walls, up, to the goal.
+    outcomes = [fixed.step(0)[1:4] for _ in range(MAX_EPISODE_STEPS)]
+    assert outcomes == [(-1.0, False, False)] * (MAX_EPISODE_STEPS - 1) + [(-1.0, False, True)]
+    env = PointRobotEnv(2)
+    env.walls = ()
+    env.reset(seed=0)
+    outcomes = [env.step(action) for action in [1] * 13 + [3] * 13]
+    assert [terminated for _, _, terminated, _, _ in outcomes] == [False] * 25 + [True]
+    assert outcomes[-1][4] == {"is_success": True}
+    np.testing.assert_allclose(outcomes[-1][0], [0.88, 0.88], atol=1e-6)
+
+
+def test_noise_is_the_seeds_and_of_the_size_that_was_asked_for():
+    def walk(seed):
+        env = PointRobotEnv(3, noise=0.01)
+        positions = [env.reset(seed=seed)[0]]
+        positions += [env.step(action)[0] for action in [1, 0] * 200]
+        return np.diff(positions, axis=0)
+
+    np.testing.assert_array_equal(walk(3), walk(3))
+    moves = walk(3)
+    assert (moves != walk(4)).any()
+    free = moves[:, 0] - STEP * np.tile([1, -1], 200)
+    assert np.std(free[np.abs(free) < 0.05]) == pytest.approx(0.01, rel=0.15)
+
+
+@pytest.mark.parametrize("argument", [dict(n_variables=4), dict(noise=-0.1), dict(noise=np.nan), dict(start="middle")])
+def test_bad_input_is_refused(argument):
+    with pytest.raises(ValueError, match=next(iter(argument))):
+        PointRobotEnv(**argument)
+
+
+def test_bad_actions_and_steps_before_reset_are_refused():
+    env = PointRobotEnv(2)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(0)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be in"):
+        env.step(4)

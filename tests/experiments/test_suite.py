@@ -1,0 +1,345 @@
+"""The suite: runs that go on where they stopped, measures of hand-made episodes, tables and tests."""
+
+import csv
+import json
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy import stats
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_combrel.experiments import suite, suite_runs
+from sb3_combrel.experiments.point_robot import make_point_robot
+from sb3_combrel.experiments.runs import make_task
+from sb3_combrel.experiments.statistics import holm, p_value_of_difference
+from sb3_combrel.experiments.suite_measures import (
+    Episodes,
+    failures,
+    mean_steps_in,
+    steps_in,
+    steps_until_always,
+    steps_until_median,
+    summary_of_evaluation,
+    summary_of_learning,
+)
+from sb3_combrel.experiments.suite_report import cells_of, columns_of, format_number, overview_table, task_table
+from sb3_combrel.experiments.suite_runs import SuiteRun, Variant, play
+from sb3_combrel.experiments.suite_tasks import TASKS, NoisyActions, Task, tasks_of
+from sb3_combrel.experiments.suite_transfers import TRANSFERS, make_transfer
+
+SMALL = Task("small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(steps_in(1, 3),), headline="steps_1_to_3")
+SHORT = Task("short", partial(make_point_robot, 2), n_steps=500)
+VARIANTS = [Variant("default"), Variant("narrow", {"model_breadth": 0.05})]
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def run(folder, tasks=(SMALL, SHORT), variants=VARIANTS, seeds=(5, 6), **arguments):
+    console = Console(record=True, width=200)
+    suite.run_suite(folder, tasks, variants, seeds, evaluation_episodes=2, console=console, **arguments)
+    return console.export_text()
+
+
+def test_a_suite_is_written_run_by_run_and_resumed(tmp_path, monkeypatch):
+    run(tmp_path, seeds=(5,))
+    first = rows_of(tmp_path / "runs.csv")
+    assert [(row["task"], row["variant"], row["seed"]) for row in first] == [
+        (task, variant, "5") for task in ("short", "small") for variant in ("default", "narrow")
+    ]
+    done = []
+    monkeypatch.setattr(suite, "carry_out", lambda run: (done.append((run.name, run.seed)), suite_runs.carry_out(run))[1])
+    shown = run(tmp_path)
+    assert "4 of 8 runs were complete already." in shown
+    assert len(done) == 4 and {seed for _, seed in done} == {6}
+    rows, episodes = rows_of(tmp_path / "runs.csv"), rows_of(tmp_path / "episodes.csv")
+    assert len(rows) == 8
+    assert [row for row in rows if row["seed"] == "5"] == first
+    for row in rows:
+        own = [episode for episode in episodes if episode["run"] == row["run"]]
+        assert [int(episode["episode"]) for episode in own] == list(range(1, int(row["episodes"]) + 1))
+        steps = np.array([int(episode["steps"]) for episode in own])
+        if row["task"] == "small":
+            assert len(own) == 3
+            assert steps.sum() == float(row["steps_1_to_3"]) == int(row["steps"])
+        else:
+            assert steps.sum() <= int(row["steps"]) == 500 and row["steps_1_to_3"] == ""
+        assert [float(episode["return"]) for episode in own] == (-steps).tolist()
+        assert all(int(episode["terminated"]) + int(episode["truncated"]) == 1 for episode in own)
+        assert float(row["ms_per_step"]) > 0.0
+        assert json.loads(row["settings"])["learner"] == ({"model_breadth": 0.05} if row["variant"] == "narrow" else {})
+    tables = (tmp_path / "tables.md").read_text()
+    samples = [float(row["steps_1_to_3"]) for row in rows if row["task"] == "small" and row["variant"] == "narrow"]
+    mean, error = (format_number(number) for number in (np.mean(samples), stats.sem(samples)))
+    assert f"| steps_1_to_3 | narrow | 2 | {mean} ± {error} |" in tables
+
+
+def test_runs_do_not_depend_on_order_or_process(tmp_path):
+    run(tmp_path / "alone", tasks=[SHORT], variants=VARIANTS[1:], seeds=(6,))
+    run(tmp_path / "among_others")
+    keys = ("steps", "episodes", "last10_return", "greedy_mean", "greedy_worst", "stateless_mean")
+    (alone,) = rows_of(tmp_path / "alone" / "runs.csv")
+    (other,) = (
+        row
+        for row in rows_of(tmp_path / "among_others" / "runs.csv")
+        if (row["task"], row["variant"], row["seed"]) == ("short", "narrow", "6")
+    )
+    assert [alone[key] for key in keys] == [other[key] for key in keys]
+
+
+@pytest.mark.integration
+def test_the_command_line_in_two_processes(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "sys.argv",
+        (
+            "suite --tasks PointRobot2D --variants default coarse:resolution=4 --seeds 0-1 --first-seed 7 --jobs 2 "
+            f"--evaluation-episodes 1 --output {tmp_path}"
+        ).split(),
+    )
+    suite.main()
+    rows = rows_of(tmp_path / "runs.csv")
+    assert [(row["variant"], row["seed"]) for row in rows] == [
+        ("coarse", "7"),
+        ("coarse", "8"),
+        ("default", "7"),
+        ("default", "8"),
+    ]
+    assert all(row["steps"] == "5000" for row in rows)
+
+
+def test_results_of_other_settings_are_not_mixed_in(tmp_path):
+    run(tmp_path, tasks=[SHORT], variants=[Variant("a", {"resolution": 4})], seeds=(0,))
+    with pytest.raises(ValueError, match=r"other settings \(learner was .*4.* and is .*5"):
+        run(tmp_path, tasks=[SHORT], variants=[Variant("a", {"resolution": 5})], seeds=(0,))
+
+
+def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
+    from sb3_combrel import SourceInstances
+    from sb3_combrel.experiments.suite_tasks import Source
+
+    calls = []
+
+    def learn():
+        calls.append(1)
+        return SourceInstances.record(None, make_point_robot(2), n_instances=100, seed=0)
+
+    task = Task("robot", partial(make_point_robot, 3), n_steps=150, source=Source("robot_2d", learn))
+    run(tmp_path, tasks=[task], variants=[Variant("combrel", {"gamma": 0.99}, "COMBREL")])
+    assert len(calls) == 1
+    assert len(rows_of(tmp_path / "runs.csv")) == 2
+    for name in TRANSFERS:
+        assert make_transfer(name, task, tmp_path / "sources" / "robot_2d.npz") is not None
+    with pytest.raises(ValueError, match="no source task"):
+        run(tmp_path, tasks=[SHORT], variants=[Variant("combrel", {}, "COMBREL")])
+    with pytest.raises(ValueError, match="transfer must be one of"):
+        run(tmp_path, tasks=[task], variants=[Variant("other", {}, "OTHER")])
+
+
+def test_variants_are_read_from_text():
+    assert suite.variant_of("default") == Variant("default", {}, None)
+    assert suite.variant_of("b0.3:model_breadth=0.3,resolution=3") == Variant("b0.3", {"model_breadth": 0.3, "resolution": 3})
+    assert suite.variant_of("t:transfer=COMBREL,max_instances=null") == Variant("t", {"max_instances": None}, "COMBREL")
+    text = '{"name": "fine", "resolution": [3, 4], "bounds": [[0, 0], [1, 1]]}'
+    assert suite.variant_of(text) == Variant("fine", {"resolution": [3, 4], "bounds": [[0, 0], [1, 1]]})
+
+
+@pytest.mark.parametrize("text", ["fast", "a:resolution", "a:no_such=3", "a_b:resolution=3", '{"resolution": 3}', "", "{"])
+def test_bad_variants_are_refused(text):
+    with pytest.raises(ValueError):
+        suite.variant_of(text)
+
+
+def test_seeds_are_read_from_text():
+    assert suite.seeds_of("0-3") == [0, 1, 2, 3]
+    assert suite.seeds_of("4, 0-1,1") == [4, 0, 1]
+    assert suite.seeds_of("0-2", 1000) == [1000, 1001, 1002]
+    for text in ("", "3-1", "a", "1--2", "-1"):
+        with pytest.raises(ValueError, match="seeds"):
+            suite.seeds_of(text)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        dict(jobs=0),
+        dict(variants=[]),
+        dict(variants=[Variant("a"), Variant("a", {"resolution": 3})]),
+        dict(reference="other"),
+        dict(test="t"),
+    ],
+)
+def test_bad_input_is_refused(tmp_path, change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        run(tmp_path / "results", **change)
+    assert not (tmp_path / "results").exists()
+
+
+def test_unknown_tasks_are_refused():
+    assert tasks_of(["all"]) == list(TASKS.values())
+    assert tasks_of(["CartPole-v1", "CartPole-v1"]) == [TASKS["CartPole-v1"]]
+    for names in (["CartPole"], []):
+        with pytest.raises(ValueError, match="tasks must be"):
+            tasks_of(names)
+    with pytest.raises(ValueError, match="n_steps"):
+        Task("both", make_point_robot, n_steps=3, n_episodes=3)
+    with pytest.raises(ValueError, match="n_steps"):
+        Task("none", make_point_robot)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_can_be_learnt_and_has_its_headline(name, tmp_path):
+    task = TASKS[name]
+    assert task.headline in columns_of(task)
+    try:
+        env = task.make()
+    except gym.error.UnregisteredEnv:
+        pytest.skip("its environment is not in this checkout")
+    assert isinstance(env.action_space, gym.spaces.Discrete)
+    wrapper = env
+    while not isinstance(wrapper, gym.wrappers.TimeLimit):
+        wrapper = wrapper.env
+    model = SuiteRun(tmp_path, task, Variant("default"), 0, 1).make_model(env)
+    assert model.gamma == task.learner.get("gamma", 1.0)
+    env.close()
+
+
+def test_measures_of_hand_made_episodes():
+    steps = [100, 40, 30, 60, 20, 25, 27, 26, 20]
+    episodes = Episodes.from_rows([(n, -float(n), True) for n in steps])
+    assert steps_in(1, 3).of(episodes) == 170
+    assert mean_steps_in(4, 5).of(episodes) == 40
+    assert np.isnan(steps_in(1, 10).of(episodes))
+    assert steps_until_always(27).of(episodes) == 230
+    assert steps_until_always(59).of(episodes) == 230
+    assert steps_until_always(60).of(episodes) == 100
+    assert steps_until_always(100).of(episodes) == 0
+    assert steps_until_always(26).of(episodes) == np.inf, "only two episodes follow the one of 27 steps"
+    assert steps_until_always(10).of(episodes) == np.inf
+    # The medians of five: 40, 30, 27, 26, 25.
+    assert steps_until_median(30).of(episodes) == sum(steps[:6])
+    assert steps_until_median(24).of(episodes) == np.inf
+    none = Episodes.from_rows([])
+    assert steps_until_always(27).of(none) == np.inf and steps_until_median(27).of(none) == np.inf
+
+
+def test_failures_and_summaries_of_hand_made_episodes():
+    episodes = Episodes.from_rows([(400, -400.0, False), *[(50, -50.0, True)] * 8, (400, 499.0, False), (60, -60.0, True)])
+    np.testing.assert_array_equal(failures(episodes, None), [True, *[False] * 8, True, False])
+    np.testing.assert_array_equal(failures(episodes, -60.0), [True, *[False] * 9, True])
+    # The first of the eleven episodes is not among the last ten.
+    assert summary_of_learning(episodes, None) == {"last10_return": (8 * -50 + 499 - 60) / 10, "last10_failed": 0.1}
+    assert np.isnan(summary_of_learning(Episodes.from_rows([]), None)["last10_return"])
+    played = Episodes.from_rows([(100, -100.0, True), (110, -110.0, True)])
+    summary = summary_of_evaluation(played, None, -100.0)
+    assert summary == {"mean": -105.0, "worst": -110.0, "failures": 0, "as_good": 1.0}
+    assert summary_of_evaluation(played, None, -99.0)["as_good"] == 0.0
+    assert summary_of_evaluation(played, -110.0, -100.0)["as_good"] == 0.0, "one has failed"
+    assert summary_of_evaluation(played, None, np.nan)["as_good"] == 0.0, "there is nothing to compare with"
+
+
+class Counting:
+    """A policy that moves along the first axis and whose state counts the calls of an episode."""
+
+    def __init__(self):
+        self.calls = []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert deterministic
+        self.calls.append((state, None if episode_start is None else bool(episode_start[0])))
+        count = 0 if state is None or episode_start[0] else state[0]
+        return np.int64(1), (count + 1,)
+
+
+def test_the_state_of_predict_is_handed_on_or_dropped():
+    env = gym.wrappers.TimeLimit(make_point_robot(2), 3)
+    model = Counting()
+    episodes = play(model, env, 2, 0, keeps_state=True)
+    assert model.calls == [(None, True), ((1,), False), ((2,), False), ((3,), True), ((1,), False), ((2,), False)]
+    np.testing.assert_array_equal(episodes.steps, [3, 3])
+    np.testing.assert_array_equal(episodes.returns, [-3.0, -3.0])
+    assert not episodes.terminated.any()
+    model = Counting()
+    play(model, env, 2, 0, keeps_state=False)
+    assert model.calls == [(None, None)] * 6
+
+
+def test_recorded_episodes_are_those_of_the_monitor(tmp_path):
+    env = Monitor(make_task("MountainCar-v0"), str(tmp_path / "log"))
+    recorder = suite_runs.EpisodeRecorder(4)
+    model = suite_runs.FittedRMax(env, seed=0).learn(10**6, recorder, log_interval=None)
+    env.close()
+    assert model.num_timesteps == recorder.episodes.steps.sum()
+    assert recorder.episodes.steps.tolist() == env.get_episode_lengths()
+    assert recorder.episodes.returns.tolist() == env.get_episode_rewards()
+    np.testing.assert_array_equal(recorder.episodes.terminated, recorder.episodes.steps < 200)
+
+
+def test_noisy_actions_are_drawn_by_the_environments_seed():
+    env = NoisyActions(make_task("MountainCar-v0"), 0.3)
+
+    def taken(seed):
+        env.reset(seed=seed)
+        return [env.action(2) for _ in range(3000)]
+
+    assert taken(0) == taken(0) != taken(1)
+    # A third of the replacements draws the action itself.
+    assert np.mean(np.array(taken(0)) != 2) == pytest.approx(0.2, abs=0.03)
+    assert set(taken(0)) == {0, 1, 2}
+    with pytest.raises(ValueError, match="probability"):
+        NoisyActions(env, 1.5)
+
+
+def test_holms_correction_is_the_sequential_test():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        p_values = rng.random(rng.integers(1, 8)) ** 3
+        corrected = holm(p_values)
+        # Holm's own words: compare the smallest with alpha / n, the next with alpha / (n - 1), stop at the first that fails.
+        for alpha in (0.01, 0.05, 0.3):
+            rejected = np.zeros(len(p_values), dtype=bool)
+            for rank, index in enumerate(np.argsort(p_values)):
+                if p_values[index] > alpha / (len(p_values) - rank):
+                    break
+                rejected[index] = True
+            np.testing.assert_array_equal(corrected <= alpha, rejected)
+    np.testing.assert_allclose(holm(np.array([np.nan, 0.01, 0.04])), [np.nan, 0.02, 0.04])
+    assert holm(np.array([])).shape == (0,)
+
+
+def test_p_values_are_scipys_and_defined_where_means_are_not():
+    first, second = np.array([1.0, 2.0, 4.0, 3.0]), np.array([5.0, 2.5, 6.0])
+    assert p_value_of_difference(first, second) == stats.ttest_ind(first, second, equal_var=False).pvalue
+    assert p_value_of_difference(first, second, "mann-whitney") == stats.mannwhitneyu(first, second).pvalue
+    never = np.array([np.inf, 5.0, 6.0])
+    assert p_value_of_difference(first, never) == stats.mannwhitneyu(first, never).pvalue
+    assert p_value_of_difference(np.ones(3), np.ones(4)) == 1.0
+    assert 0.0 < p_value_of_difference(np.ones(3), np.zeros(3)) <= 0.1, "three against three: 2 of 20 orders"
+    assert np.isnan(p_value_of_difference(first[:1], second)) and np.isnan(p_value_of_difference(first * np.nan, second))
+    with pytest.raises(ValueError, match="test"):
+        p_value_of_difference(first, second, "student")
+
+
+def test_tables_of_hand_made_runs():
+    def row(variant, seed, steps, mean):
+        return {"task": "small", "variant": variant, "seed": seed, "steps_1_to_3": steps, "greedy_mean": mean}
+
+    steps = {"a": [100.0, 104.0, 102.0], "b": [50.0, 54.0, 52.0], "c": [103.0, 98.0, np.inf]}
+    rows = [row(name, seed, n, -n) for name, own in steps.items() for seed, n in enumerate(own)]
+    cells = cells_of(rows, [SMALL], list(steps), "a", "welch")
+    raw = [
+        stats.ttest_ind(steps["a"], steps["b"], equal_var=False).pvalue,
+        stats.mannwhitneyu(steps["a"], steps["c"]).pvalue,
+    ]
+    found = [cells["small", "steps_1_to_3", name].p_value for name in ("b", "c")]
+    np.testing.assert_allclose(found, holm(np.array(raw)))
+    table = {(line[0], line[1]): line[2:] for line in task_table(cells, SMALL, list(steps), "p against a").rows}
+    assert table["steps_1_to_3", "a"] == ("3", "102.0 ± 1.15", "102.0", "104.0", "")
+    assert table["steps_1_to_3", "c"][:4] == ("3", "2 of 3 reached it", "103.0", "never")
+    assert table["greedy_mean", "b"][:4] == ("3", "-52.0 ± 1.15", "-52.0", "-54.0")
+    overview = overview_table(cells, [SMALL], list(steps)).rows
+    assert overview == [("small", "steps_1_to_3", "102.0 ± 1.15", "52.0 ± 1.15 *", "2 of 3 reached it")]
