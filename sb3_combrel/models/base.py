@@ -37,7 +37,7 @@ class ModelSettings:
     exploration_threshold: float
     max_instances: int | None = None
     n_neighbors: int = 40
-    outcome_breadth: float = 0.1
+    outcome_breadth: float = 0.05
 
 
 class Predictions(NamedTuple):
@@ -170,6 +170,16 @@ class Model(ABC):
         """
         self.exploration_threshold = threshold
         newly_known = np.flatnonzero(~self.known & (self.own_weight >= threshold))
+        self.known[newly_known] = True
+        return newly_known
+
+    def accept(self, pairs: np.ndarray) -> np.ndarray:
+        """
+        Let pairs count as known from what instances they have.
+
+        :return: those that become known by that, whose rows are to be updated
+        """
+        newly_known = pairs[~self.known[pairs] & (self.own_weight[pairs] > 0.0)]
         self.known[newly_known] = True
         return newly_known
 

@@ -19,6 +19,9 @@ PER_BREADTH = -np.log(LAST_WEIGHT)
 # No narrower than this fraction of ``model_breadth``: all instances may be at the very same state.
 NARROWEST = 0.02
 RIDGE = 0.01
+# What the linear fit leaves unexplained of the instances nearest to a state, as at a wall, is added to its prediction, as if
+# there were so much weight of instances besides that it explains.
+EXPLAINED_WEIGHT = 0.5
 # A pair is fitted again once what new instances leave unexplained may move its prediction by this much, and its row is
 # written again when the prediction has moved by half of it; in parts of the range of the action's effects.
 MAX_UNEXPLAINED = 0.05
@@ -28,10 +31,12 @@ class LinearFits(NamedTuple):
     """The local linear fit of each pair of the grid (pair ``action * n_points + point``).
 
     :param sums: float64, shape (n_pairs, n_products): see ``common.linear_regression``
-    :param outcome: float64, shape (n_pairs, 3): sums of narrower weights, of these times reward, and times termination
+    :param outcome: float64, shape (n_pairs, 3 + 2 * n_variables): sums of narrower weights, and of these times reward,
+        termination, state and effect
     :param fit: float64, shape (n_pairs, n_variables + n_variables ** 2): intercept and slopes
     :param row: float64, shape (n_pairs, n_variables + 2): effect, reward and probability of termination in the pair's row
-    :param unexplained: float64, shape (n_pairs,): by how much instances that came after the fit may change its prediction
+    :param unexplained: float64, shape (n_pairs,): by how much instances that came after the fit may change its prediction;
+        inf without a fit
     :param reach: float64, shape (n_pairs,): squared distance up to which instances count
     :param scale: float64, shape (n_pairs,): -1 / breadth ** 2 of the pair's kernel
     :param count: int32, shape (n_pairs,): instances that count
@@ -69,7 +74,7 @@ class FitScratch(NamedTuple):
     :param factor: float64, shape (n_variables, n_variables)
     :param nearest: float64, shape (n_neighbors,): squared distances
     :param along: float64, shape (n_variables, largest axis of the grid): squared distances along one variable
-    :param range: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
+    :param span: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
     :param point: int64, shape (n_points,): points within reach; ``distance``: float64, same shape: squared distances
     """
 
@@ -78,7 +83,7 @@ class FitScratch(NamedTuple):
     factor: np.ndarray
     nearest: np.ndarray
     along: np.ndarray
-    range: np.ndarray
+    span: np.ndarray
     point: np.ndarray
     distance: np.ndarray
 
@@ -113,7 +118,7 @@ def points_within(state, reach, widest, grid, scratch):
     :param reach: float64, shape (n_points,): squared distances; none is above ``widest``
     :return: how many; they are in ``scratch.point`` and ``scratch.distance``
     """
-    first, last, at = scratch.range[0], scratch.range[1], scratch.range[2]
+    first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]
     d = len(state)
     radius = np.sqrt(widest) * (1 + 1e-12)
     for k in range(d):
@@ -169,7 +174,25 @@ def count_instance(fits, pair, distance, products, reward, terminated, kernel, s
     outcome[1] += near * reward
     if terminated:
         outcome[2] += near
+    d = (len(outcome) - 3) // 2
+    effects = 1 + d + d * (d + 1) // 2
+    for k in range(d):
+        outcome[3 + k] += near * products[1 + k]
+        outcome[3 + d + k] += near * products[effects + k]
     return weight / sums[0], near / outcome[0]
+
+
+@inlined
+def unexplained_effect(fit, outcome, k):
+    """The part of effect ``k`` that a linear fit leaves unexplained of the instances nearest to a state.
+
+    :param outcome: as in :class:`LinearFits`
+    """
+    d = (len(outcome) - 3) // 2
+    effect = outcome[3 + d + k] - fit[k] * outcome[0]
+    for j in range(d):
+        effect -= fit[d + j * d + k] * outcome[3 + j]
+    return effect / (outcome[0] + EXPLAINED_WEIGHT)
 
 
 @inlined
@@ -288,7 +311,8 @@ def prediction_moved(fits, pair, action, at):
 @inlined
 def mean_effect(fits, pair, action, at, k):
     """Effect ``k`` that a pair's fit predicts at its point, within the range of the effects seen."""
-    effect = fits.prior[pair, k] + fitted_effect(fits.fit[pair], at, k)
+    fit = fits.fit[pair]
+    effect = fits.prior[pair, k] + fitted_effect(fit, at, k) + unexplained_effect(fit, fits.outcome[pair], k)
     return min(max(effect, fits.effect_range[0, action, k]), fits.effect_range[1, action, k])
 
 
@@ -348,6 +372,7 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
                 continue
         else:
             fits.total[pair] += np.exp(distance * kernel.scale)
+            fits.unexplained[pair] = np.inf
             if fits.total[pair] >= threshold:
                 fits.known[pair] = True
                 narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch)
@@ -433,7 +458,7 @@ def update_rows(fits, mdp, grid, gamma, pairs, transferred, scratch, fit_scratch
             reward = 0.0
             n_touched = np.int64(0)
             if own > 0.0:
-                if not fits.known[pair]:
+                if fits.unexplained[pair] == np.inf:
                     refit(fits, pair, pair // n_points, grid, fit_scratch)
                 row = fits.row[pair]
                 reward = own / total * row[d]

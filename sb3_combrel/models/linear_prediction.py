@@ -9,7 +9,7 @@ from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import measure_gaps, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.linear_fits import RIDGE, Kernel, narrowed
+from sb3_combrel.models.linear_fits import RIDGE, Kernel, narrowed, unexplained_effect
 from sb3_combrel.planning.q_values import Prediction
 
 
@@ -20,7 +20,7 @@ class NearestLists(NamedTuple):
     :param distance: float64, same shape: their squared distances
     :param length: int64, shape (n_actions,)
     :param products: float64, shape (2, n_products): sums, and of one instance
-    :param factor: float64, shape (n_variables, n_variables); ``fit``: as in ``LinearFits``
+    :param factor: float64, shape (n_variables, n_variables); ``fit`` and ``outcome``: as in ``LinearFits``, of one pair
     """
 
     item: np.ndarray
@@ -29,6 +29,7 @@ class NearestLists(NamedTuple):
     products: np.ndarray
     factor: np.ndarray
     fit: np.ndarray
+    outcome: np.ndarray
 
 
 @inlined
@@ -100,8 +101,10 @@ def fit_nearest(instances, target, action, state, kernel, near):
     length = near.length[action]
     nearest, last = near.distance[action, 0], near.distance[action, length - 1]
     scale = narrowed(last, kernel) if length == kernel.n_neighbors else kernel.scale
-    sums, products = near.products[0], near.products[1]
+    sums, products, outcome = near.products[0], near.products[1], near.outcome
     sums[:] = 0.0
+    outcome[:] = 0.0
+    d = len(state)
     total = 0.0
     outcomes = 0.0
     reward = 0.0
@@ -118,16 +121,23 @@ def fit_nearest(instances, target, action, state, kernel, near):
         reward += weight * instances.reward[action, i]
         if instances.terminated[action, i]:
             end += weight
+        for v in range(d):
+            outcome[3 + v] += weight * instances.state[action, i, v]
+            outcome[3 + d + v] += weight * target[action, i, v]
+    closeness = np.exp(nearest * kernel.outcome_scale)
+    outcome[0] = outcomes * closeness
+    for v in range(2 * d):
+        outcome[3 + v] *= closeness
     solve_regression(sums, -RIDGE / scale, near.factor, near.fit)
     return total, reward / outcomes, end / outcomes
 
 
 @inlined
-def enter_mean(prediction, action, p, fit, state, prior, effect_range):
+def enter_mean(prediction, action, p, near, state, prior, effect_range):
     """Write the successor of an action, the mean of what is predicted, within the range of the effects seen."""
     prediction.probability[action, 0] = p
     for v in range(len(state)):
-        effect = prior[action, v] + fitted_effect(fit, state, v)
+        effect = prior[action, v] + fitted_effect(near.fit, state, v) + unexplained_effect(near.fit, near.outcome, v)
         prediction.effect[action, 0, v] = min(max(effect, effect_range[0, action, v]), effect_range[1, action, v])
 
 
@@ -155,7 +165,7 @@ def predict_own(instances, of_model, state, kernel, threshold, near, prediction)
             total, reward, end = fit_nearest(instances, target, action, state, kernel, near)
             prediction.reward[action] = reward
             if end < 1.0:
-                enter_mean(prediction, action, 1.0 - end, near.fit, state, prior, effect_range)
+                enter_mean(prediction, action, 1.0 - end, near, state, prior, effect_range)
                 prediction.length[action] = 1
         prediction.weight[action] = total
         prediction.modelled[action] = total >= threshold

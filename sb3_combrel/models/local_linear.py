@@ -18,6 +18,11 @@ from sb3_combrel.planning.q_values import Prediction
 # transferred instances is updated within an episode.
 MIN_CHANGE = 0.5
 
+# Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
+# values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
+# would make the states beside them look good for ever.
+ON_GRID = 0.5
+
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
 _join_transferred = EntryPoint(join_transferred_plain)
@@ -57,10 +62,10 @@ class LocalLinear(Model):
         self._set_fits(
             LinearFits(
                 sums=np.zeros((n_pairs, n_products(d))),
-                outcome=np.zeros((n_pairs, 3)),
+                outcome=np.zeros((n_pairs, 3 + 2 * d)),
                 fit=np.zeros((n_pairs, d + d * d)),
                 row=np.zeros((n_pairs, d + 2)),
-                unexplained=np.zeros(n_pairs),
+                unexplained=np.full(n_pairs, np.inf),
                 reach=np.full(n_pairs, self._kernel.reach),
                 scale=np.full(n_pairs, self._kernel.scale),
                 count=np.zeros(n_pairs, dtype=np.int32),
@@ -79,7 +84,7 @@ class LocalLinear(Model):
             factor=np.empty((d, d)),
             nearest=np.empty(n_near),
             along=np.empty((d, int(grid.arrays.shape.max()))),
-            range=np.empty((3, d), dtype=np.int64),
+            span=np.empty((3, d), dtype=np.int64),
             point=np.empty(n_points, dtype=np.int64),
             distance=np.empty(n_points),
         )
@@ -91,6 +96,7 @@ class LocalLinear(Model):
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             fit=np.empty(d + d * d),
+            outcome=np.empty(3 + 2 * d),
         )
         self._plain_near = tuple(self._near)
         self._prior_here = np.zeros((self.n_actions, d))
@@ -124,7 +130,7 @@ class LocalLinear(Model):
         """
         slot, emptied = self._slot_for(state, action)
         threshold = self.exploration_threshold
-        thresholds = threshold, 0.0 if self.transfer is None else MIN_CHANGE * threshold
+        thresholds = ON_GRID * threshold, 0.0 if self.transfer is None else MIN_CHANGE * threshold
         n_changed = _enter.call(
             self._plain_instances,
             self._plain_fits,
@@ -229,6 +235,8 @@ class LocalLinear(Model):
             if size:
                 fits.effect_range[0, action] = instances.effect[action, :size].min(axis=0)
                 fits.effect_range[1, action] = instances.effect[action, :size].max(axis=0)
-        _recount.call(self.instances, self.fits, self.grid.arrays, self._kernel, self.exploration_threshold, self._scratch)
+        _recount.call(
+            self.instances, self.fits, self.grid.arrays, self._kernel, ON_GRID * self.exploration_threshold, self._scratch
+        )
         fits.total[:] = state["total"]
         self.update_all_rows()
