@@ -273,6 +273,8 @@ class FittedRMaxAgent:
     def _update_and_plan(self, max_backups: int, around: np.ndarray) -> None:
         """Update the rows of the pairs that changed, and plan; longer where transfer changed many pairs at once."""
         changed = NO_PAIRS if self.transfer is None else self._changed_by(self.transfer)
+        if self.transfer is not None and self.transfer.use == "prior":
+            changed = self.model.renew_prior()
         passes = 0
         if len(changed):
             self._outdated.append(changed)

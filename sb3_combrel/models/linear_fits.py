@@ -22,6 +22,10 @@ RIDGE = 0.01
 # What the linear fit leaves unexplained of the instances nearest to a state, as at a wall, is added to its prediction, as if
 # there were so much weight of instances besides that it explains.
 EXPLAINED_WEIGHT = 0.5
+# A prior's prediction counts as so much weight of instances that agree with it, and for rewards and ends as so much weight of
+# the narrower kernel.
+PRIOR_WEIGHT = 0.5
+PRIOR_OUTCOME_WEIGHT = 0.1
 # A pair is fitted again once what new instances leave unexplained may move its prediction by this much, and its row is
 # written again when the prediction has moved by half of it; in parts of the range of the action's effects.
 MAX_UNEXPLAINED = 0.05
@@ -39,14 +43,17 @@ class LinearFits(NamedTuple):
         inf without a fit
     :param reach: float64, shape (n_pairs,): squared distance up to which instances count
     :param scale: float64, shape (n_pairs,): -1 / breadth ** 2 of the pair's kernel
-    :param count: int32, shape (n_pairs,): instances that count
+    :param n_counted: int32, shape (n_pairs,): instances that count
     :param limit: int32, shape (n_pairs,): more than this, and the kernel narrows
     :param total: float64, shape (n_pairs,): sum of the weights (of breadth ``model_breadth``) of all that counted
     :param last_total: float64, shape (n_pairs,): what ``total`` was when the pair's row was updated
     :param known: bool, shape (n_pairs,)
+    :param claimed: bool, shape (n_pairs,): the prior suffices for a model
     :param target: float64, shape (n_actions, capacity, n_variables): effect of each instance less the prior's
-    :param prior: float64, shape (n_pairs, n_variables): effect that the prior predicts; 0 without one
-    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
+    :param prior: float64, shape (n_pairs, n_variables + 2): effect, reward and probability of termination that the prior
+        predicts; 0 without one
+    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen or is predicted
+        by the prior
     """
 
     sums: np.ndarray
@@ -56,11 +63,12 @@ class LinearFits(NamedTuple):
     unexplained: np.ndarray
     reach: np.ndarray
     scale: np.ndarray
-    count: np.ndarray
+    n_counted: np.ndarray
     limit: np.ndarray
     total: np.ndarray
     last_total: np.ndarray
     known: np.ndarray
+    claimed: np.ndarray
     target: np.ndarray
     prior: np.ndarray
     effect_range: np.ndarray
@@ -243,7 +251,7 @@ def recount(instances, fits, pair, action, kernel, scratch):
             count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
             total += np.exp(distance * kernel.scale)
             count += 1
-    fits.count[pair] = count
+    fits.n_counted[pair] = count
     # Many instances at one state: to look for narrower kernels again and again would be in vain.
     n = kernel.n_neighbors
     fits.limit[pair] = max(n + n // 2, 2 * count if count > n + n // 4 else 0)
@@ -294,8 +302,7 @@ def prediction_moved(fits, pair, action, at):
     d = len(at)
     row, outcome = fits.row[pair], fits.outcome[pair]
     tolerance = 0.5 * MAX_UNEXPLAINED
-    reward = outcome[1] / outcome[0]
-    end = outcome[2] / outcome[0]
+    reward, end = mean_outcome(outcome, fits.prior[pair], fits.claimed[pair])
     moved = abs(reward - row[d]) > tolerance * abs(reward) or abs(end - row[d + 1]) > tolerance
     for k in range(d):
         spread = fits.effect_range[1, action, k] - fits.effect_range[0, action, k]
@@ -309,10 +316,22 @@ def prediction_moved(fits, pair, action, at):
 
 
 @inlined
+def mean_outcome(outcome, prior, claimed):
+    """Reward and probability of termination from the narrower sums, and from the prior if it claims to know them."""
+    d = len(prior) - 2
+    weight = PRIOR_OUTCOME_WEIGHT if claimed else 0.0
+    total = outcome[0] + weight
+    return (outcome[1] + weight * prior[d]) / total, (outcome[2] + weight * prior[d + 1]) / total
+
+
+@inlined
 def mean_effect(fits, pair, action, at, k):
     """Effect ``k`` that a pair's fit predicts at its point, within the range of the effects seen."""
     fit = fits.fit[pair]
-    effect = fits.prior[pair, k] + fitted_effect(fit, at, k) + unexplained_effect(fit, fits.outcome[pair], k)
+    effect = fitted_effect(fit, at, k) + unexplained_effect(fit, fits.outcome[pair], k)
+    if fits.claimed[pair]:
+        effect *= fits.sums[pair, 0] / (fits.sums[pair, 0] + PRIOR_WEIGHT)
+    effect += fits.prior[pair, k]
     return min(max(effect, fits.effect_range[0, action, k]), fits.effect_range[1, action, k])
 
 
@@ -328,16 +347,17 @@ def refit(fits, pair, action, grid, scratch):
 @inner
 def narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch):
     """:func:`refit` with a narrower kernel if too many instances count."""
-    if fits.count[pair] > fits.limit[pair]:
+    if fits.n_counted[pair] > fits.limit[pair]:
         unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
         narrow(instances, fits, pair, action, kernel, scratch)
     return refit(fits, pair, action, grid, scratch)
 
 
 @part
-def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
+def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
     """Write an instance to its slot, and count it for all pairs that it reaches.
 
+    :param prior: float64, shape (n_variables,): effect that the prior predicts of it
     :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
         row is to be updated, 0: never)
     :param transition: (action, slot, state, next_state, reward, terminated)
@@ -351,7 +371,7 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
     state = instances.state[action, slot]
     for k in range(len(state)):
         effect = instances.effect[action, slot, k]
-        fits.target[action, slot, k] = effect
+        fits.target[action, slot, k] = effect - prior[k]
         fits.effect_range[0, action, k] = min(fits.effect_range[0, action, k], effect)
         fits.effect_range[1, action, k] = max(fits.effect_range[1, action, k], effect)
     products = scratch.products[0]
@@ -363,20 +383,22 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
         pair = first_pair + point
         distance = scratch.distance[f]
         shares = count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
-        fits.count[pair] += 1
-        if fits.known[pair]:
-            fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, shares)
-            if fits.unexplained[pair] <= MAX_UNEXPLAINED and fits.count[pair] <= fits.limit[pair]:
-                continue
-            if not narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch):
-                continue
-        else:
+        fits.n_counted[pair] += 1
+        if not fits.known[pair]:
             fits.total[pair] += np.exp(distance * kernel.scale)
-            fits.unexplained[pair] = np.inf
             if fits.total[pair] >= threshold:
                 fits.known[pair] = True
-                narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch)
-            elif min_change == 0.0 or abs(fits.total[pair] - fits.last_total[pair]) < min_change:
+                fits.unexplained[pair] = np.inf
+        if fits.known[pair] or fits.claimed[pair]:
+            fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, shares)
+            if fits.unexplained[pair] <= MAX_UNEXPLAINED and fits.n_counted[pair] <= fits.limit[pair]:
+                continue
+            first = fits.unexplained[pair] == np.inf
+            if not narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch) and not first:
+                continue
+        else:
+            fits.unexplained[pair] = np.inf
+            if min_change == 0.0 or abs(fits.total[pair] - fits.last_total[pair]) < min_change:
                 continue
         scratch.point[changed] = point
         changed += 1
@@ -384,10 +406,10 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
 
 
 @compiled
-def enter_plain(instances, fits, grid, kernel, thresholds, transition, scratch):
+def enter_plain(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
     """:func:`enter` for callers from Python, with plain tuples."""
     instances, fits, grid = Instances(*instances), LinearFits(*fits), GridArrays(*grid)
-    return enter(instances, fits, grid, Kernel(*kernel), thresholds, transition, FitScratch(*scratch))
+    return enter(instances, fits, grid, Kernel(*kernel), thresholds, transition, prior, FitScratch(*scratch))
 
 
 @compiled
@@ -407,8 +429,8 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     for f in range(n_found):
         pair = first_pair + scratch.point[f]
         count_instance(fits, pair, scratch.distance[f], products, reward, terminated, kernel, -1.0)
-        fits.count[pair] -= 1
-        if fits.count[pair] <= 0:
+        fits.n_counted[pair] -= 1
+        if fits.n_counted[pair] <= 0:
             fits.sums[pair, :] = 0.0
             fits.outcome[pair, :] = 0.0
             fits.total[pair] = 0.0
@@ -420,7 +442,10 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
 
 @compiled
 def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
-    """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known."""
+    """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known.
+
+    :param threshold: weight that makes a pair known
+    """
     n_points = grid.shape[0] * grid.strides[0]
     for pair in range(len(fits.total)):
         action = pair // n_points
@@ -429,8 +454,15 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
         fits.total[pair] = total
         if total >= threshold:
             fits.known[pair] = True
-        if fits.count[pair] > 0:
+        if fits.n_counted[pair] > 0:
             refit(fits, pair, action, grid, scratch)
+
+
+@inlined
+def predict_from_prior(fits, pair):
+    """Put what the prior predicts into ``fits.row``: no instance counts for the pair."""
+    for k in range(fits.row.shape[1]):
+        fits.row[pair, k] = fits.prior[pair, k]
 
 
 @part
@@ -447,18 +479,21 @@ def update_rows(fits, mdp, grid, gamma, pairs, transferred, scratch, fit_scratch
     while done < len(pairs):
         pair = pairs[done]
         n_transferred = 0 if fits.known[pair] else transferred.length[done]
-        modelled = fits.known[pair] or n_transferred > 0
+        modelled = fits.known[pair] or fits.claimed[pair] or n_transferred > 0
         if modelled:
             point = pair % n_points
             coordinates_of(point, grid, scratch.at)
-            own = fits.total[pair] if fits.count[pair] > 0 else 0.0
+            own = fits.total[pair] if fits.n_counted[pair] > 0 else 0.0
+            if own == 0.0 and fits.claimed[pair]:
+                predict_from_prior(fits, pair)
+                own = 1.0
             total = own
             for j in range(n_transferred):
                 total += transferred.weight[done, j]
             reward = 0.0
             n_touched = np.int64(0)
             if own > 0.0:
-                if fits.unexplained[pair] == np.inf:
+                if fits.unexplained[pair] == np.inf and fits.n_counted[pair] > 0:
                     refit(fits, pair, pair // n_points, grid, fit_scratch)
                 row = fits.row[pair]
                 reward = own / total * row[d]

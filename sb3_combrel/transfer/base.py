@@ -61,6 +61,10 @@ class Transfer(ABC):
     task: TargetTask | None = None
     rng: np.random.Generator
 
+    #: How the model uses the source: "instances": as instances that join the target's own where these do not suffice; "prior":
+    #: as the mean that they are fitted to, see :meth:`prior`.
+    use: str = "instances"
+
     #: Arguments of the constructor under the names that they had before: a file may still have them.
     renamed_arguments: ClassVar[dict[str, str]] = {}
 
