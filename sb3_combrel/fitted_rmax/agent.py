@@ -240,6 +240,7 @@ class FittedRMaxAgent:
             if self.transfer is not None:
                 self.transfer.end_episode(truncated)
                 self._outdated.append(self.model.outdated())
+            self._outdated.append(self.model.end_episode())
             self._plan(AT_EPISODE_END * self.max_backups)
 
     def _lowered_threshold(self) -> float:

@@ -204,6 +204,14 @@ class Model(ABC):
         """
         return NO_PAIRS
 
+    def end_episode(self) -> np.ndarray:
+        """
+        Do what may wait until the end of an episode.
+
+        :return: the pairs whose rows are to be updated; by default none
+        """
+        return NO_PAIRS
+
     def outdated(self) -> np.ndarray:
         """The pairs that are not known and whose own weight has changed since their rows were updated; by default none."""
         return NO_PAIRS

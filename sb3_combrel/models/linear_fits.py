@@ -26,9 +26,12 @@ EXPLAINED_WEIGHT = 0.5
 # the narrower kernel.
 PRIOR_WEIGHT = 0.5
 PRIOR_OUTCOME_WEIGHT = 0.1
-# A pair is fitted again once what new instances leave unexplained may move its prediction by this much, and its row is
-# written again when the prediction has moved by half of it; in parts of the range of the action's effects.
-MAX_UNEXPLAINED = 0.05
+# Within an episode a pair is fitted again once what new instances leave unexplained may move its prediction by the first,
+# and its row is written again when the prediction has moved by the second; in parts of the size of the action's effects.
+MAX_UNEXPLAINED = 0.1
+TOLERANCE = 0.05
+# A variable that hardly ever changes is measured by this part of a cell.
+LEAST_SCALE = 0.02
 
 
 class LinearFits(NamedTuple):
@@ -52,8 +55,9 @@ class LinearFits(NamedTuple):
     :param target: float64, shape (n_actions, capacity, n_variables): effect of each instance less the prior's
     :param prior: float64, shape (n_pairs, n_variables + 2): effect, reward and probability of termination that the prior
         predicts; 0 without one
-    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen or is predicted
-        by the prior
+    :param effect_range: float64, shape (3, n_actions, n_variables): least and largest effect that was seen or is predicted
+        by the prior; and the sum of the sizes of those that were seen
+    :param effect_scale: float64, shape (n_actions, n_variables): what a difference of effects is measured by
     """
 
     sums: np.ndarray
@@ -72,6 +76,7 @@ class LinearFits(NamedTuple):
     target: np.ndarray
     prior: np.ndarray
     effect_range: np.ndarray
+    effect_scale: np.ndarray
 
 
 class FitScratch(NamedTuple):
@@ -214,9 +219,7 @@ def contradiction(fits, pair, instances, action, slot, shares):
     most = 0.0
     for k in range(d):
         apart = abs(fits.target[action, slot, k] - fitted_effect(fits.fit[pair], state, k))
-        spread = fits.effect_range[1, action, k] - fits.effect_range[0, action, k]
-        if apart > most * spread:
-            most = apart / spread if spread > 0.0 else 0.0
+        most = max(most, apart / fits.effect_scale[action, k])
     reward, end = fits.row[pair, d], fits.row[pair, d + 1]
     seen = instances.reward[action, slot]
     of_reward = abs(seen - reward) / max(1e-12, abs(seen) + abs(reward))
@@ -297,16 +300,15 @@ def narrow(instances, fits, pair, action, kernel, scratch):
 
 
 @inlined
-def prediction_moved(fits, pair, action, at):
-    """Put what the fit predicts into ``fits.row`` if that differs from before by more than a little; whether it does."""
+def prediction_moved(fits, pair, action, at, tolerance):
+    """Put what the fit predicts into ``fits.row`` if that differs from before by more than ``tolerance``; whether it does."""
     d = len(at)
     row, outcome = fits.row[pair], fits.outcome[pair]
-    tolerance = 0.5 * MAX_UNEXPLAINED
     reward, end = mean_outcome(outcome, fits.prior[pair], fits.claimed[pair])
     moved = abs(reward - row[d]) > tolerance * abs(reward) or abs(end - row[d + 1]) > tolerance
     for k in range(d):
-        spread = fits.effect_range[1, action, k] - fits.effect_range[0, action, k]
-        moved = moved or abs(mean_effect(fits, pair, action, at, k) - row[k]) > tolerance * spread
+        apart = abs(mean_effect(fits, pair, action, at, k) - row[k])
+        moved = moved or apart > tolerance * fits.effect_scale[action, k]
     if moved:
         for k in range(d):
             row[k] = mean_effect(fits, pair, action, at, k)
@@ -336,12 +338,12 @@ def mean_effect(fits, pair, action, at, k):
 
 
 @inner
-def refit(fits, pair, action, grid, scratch):
-    """Solve the regression of a pair; whether its row is to be updated."""
+def refit(fits, pair, action, grid, scratch, tolerance):
+    """Solve the regression of a pair; whether its row is to be updated (see :func:`prediction_moved`)."""
     unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
     solve_regression(fits.sums[pair], -RIDGE / fits.scale[pair], scratch.factor, fits.fit[pair])
     fits.unexplained[pair] = 0.0
-    return prediction_moved(fits, pair, action, scratch.at)
+    return prediction_moved(fits, pair, action, scratch.at, tolerance)
 
 
 @inner
@@ -350,7 +352,7 @@ def narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch):
     if fits.n_counted[pair] > fits.limit[pair]:
         unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
         narrow(instances, fits, pair, action, kernel, scratch)
-    return refit(fits, pair, action, grid, scratch)
+    return refit(fits, pair, action, grid, scratch, TOLERANCE)
 
 
 @part
@@ -374,6 +376,9 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
         fits.target[action, slot, k] = effect - prior[k]
         fits.effect_range[0, action, k] = min(fits.effect_range[0, action, k], effect)
         fits.effect_range[1, action, k] = max(fits.effect_range[1, action, k], effect)
+        fits.effect_range[2, action, k] += abs(effect)
+        mean_size = fits.effect_range[2, action, k] / instances.size[action]
+        fits.effect_scale[action, k] = max(2.0 * mean_size, LEAST_SCALE / grid.cells[k])
     products = scratch.products[0]
     products_of(state, fits.target[action, slot], products)
     n_found = points_within(state, fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch)
@@ -422,6 +427,8 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     first_pair = action * n_points
     state = instances.state[action, slot]
     reward, terminated = instances.reward[action, slot], instances.terminated[action, slot]
+    for k in range(len(state)):
+        fits.effect_range[2, action, k] -= abs(instances.effect[action, slot, k])
     products = scratch.products[0]
     products_of(state, fits.target[action, slot], products)
     n_found = points_within(state, fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch)
@@ -441,6 +448,23 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
 
 
 @compiled
+def refit_changed(fits, grid, scratch, changed):
+    """Fit all pairs again that have had instances since the last time; how many rows are to be updated.
+
+    :param changed: int64, shape (n_pairs,): receives these pairs
+    """
+    n_points = grid.shape[0] * grid.strides[0]
+    n = 0
+    for pair in range(len(fits.total)):
+        if fits.unexplained[pair] == 0.0 or not (fits.known[pair] or fits.claimed[pair]) or fits.n_counted[pair] == 0:
+            continue
+        if refit(fits, pair, pair // n_points, grid, scratch, 0.0):
+            changed[n] = pair
+            n += 1
+    return n
+
+
+@compiled
 def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
     """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known.
 
@@ -455,7 +479,7 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
         if total >= threshold:
             fits.known[pair] = True
         if fits.n_counted[pair] > 0:
-            refit(fits, pair, action, grid, scratch)
+            refit(fits, pair, action, grid, scratch, 0.0)
 
 
 @inlined
@@ -494,7 +518,7 @@ def update_rows(fits, mdp, grid, gamma, pairs, transferred, scratch, fit_scratch
             n_touched = np.int64(0)
             if own > 0.0:
                 if fits.unexplained[pair] == np.inf and fits.n_counted[pair] > 0:
-                    refit(fits, pair, pair // n_points, grid, fit_scratch)
+                    refit(fits, pair, pair // n_points, grid, fit_scratch, 0.0)
                 row = fits.row[pair]
                 reward = own / total * row[d]
                 if row[d + 1] < 1.0:

@@ -9,7 +9,17 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import n_products
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
-from sb3_combrel.models.linear_fits import FitScratch, Kernel, LinearFits, enter_plain, leave, recount_pairs, update_rows_plain
+from sb3_combrel.models.linear_fits import (
+    LEAST_SCALE,
+    FitScratch,
+    Kernel,
+    LinearFits,
+    enter_plain,
+    leave,
+    recount_pairs,
+    refit_changed,
+    update_rows_plain,
+)
 from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
@@ -25,6 +35,7 @@ ON_GRID = 0.5
 
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
+_refit_changed = EntryPoint(refit_changed)
 _join_transferred = EntryPoint(join_transferred_plain)
 
 
@@ -84,7 +95,8 @@ class LocalLinear(Model):
                 claimed=np.zeros(n_pairs, dtype=np.bool_),
                 target=np.empty((self.n_actions, self.instances.capacity, d)),
                 prior=np.zeros((n_pairs, d + 2)),
-                effect_range=np.stack([np.full((self.n_actions, d), np.inf), np.full((self.n_actions, d), -np.inf)]),
+                effect_range=np.zeros((3, self.n_actions, d)),
+                effect_scale=np.ones((self.n_actions, d)),
             )
         )
         self._scratch = FitScratch(
@@ -98,6 +110,7 @@ class LocalLinear(Model):
             distance=np.empty(n_points),
         )
         self._plain_scratch = tuple(self._scratch)
+        self._renew_targets()
         self._near = NearestLists(
             item=np.empty((self.n_actions, n_near), dtype=np.int32),
             distance=np.empty((self.n_actions, n_near)),
@@ -192,20 +205,29 @@ class LocalLinear(Model):
     def _renew_targets(self) -> None:
         """Compute what the prior leaves over of each instance's effect, and the range of effects."""
         fits, instances, d = self.fits, self.instances, self.grid.n_variables
-        fits.effect_range[0], fits.effect_range[1] = np.inf, -np.inf
+        fits.effect_range[0], fits.effect_range[1], fits.effect_range[2] = np.inf, -np.inf, 0.0
         for action, size in enumerate(instances.size.tolist()):
             effects = instances.effect[action, :size]
             fits.target[action, :size] = effects
-            if self._prior is not None:
-                prior, _ = self._prior_at(instances.state[action, :size], np.full(size, action))
-                fits.target[action, :size] -= prior[:, :d]
-                of_grid = fits.prior[action * self.grid.n_points : (action + 1) * self.grid.n_points, :d]
-                effects = np.vstack([effects, of_grid])
+            # One after the other, as they came.
+            fits.effect_range[2, action] = np.cumsum(np.abs(effects), axis=0)[-1] if size else 0.0
+            mean_size = fits.effect_range[2, action] / max(1, size)
+            fits.effect_scale[action] = np.maximum(2.0 * mean_size, LEAST_SCALE / self.grid.arrays.cells)
+            if self._prior is not None and size:
+                fits.target[action, :size] -= self._prior_at(instances.state[action, :size], np.full(size, action))[0][:, :d]
+            of_grid = fits.prior[action * self.grid.n_points : (action + 1) * self.grid.n_points, :d]
+            effects = effects if self._prior is None else np.vstack([effects, of_grid])
             if len(effects):
                 fits.effect_range[0, action], fits.effect_range[1, action] = effects.min(axis=0), effects.max(axis=0)
 
     def _threshold_on_grid(self) -> float:
         return ON_GRID * self.exploration_threshold
+
+    def end_episode(self) -> np.ndarray:
+        """Fit all pairs again that have had instances since the last time."""
+        changed = np.empty(len(self.known), dtype=np.int64)
+        n = _refit_changed.call(self.fits, self.grid.arrays, self._scratch, changed)
+        return changed[:n]
 
     def outdated(self) -> np.ndarray:
         return np.flatnonzero(~self.fits.known & (self.fits.total != self.fits.last_total))
