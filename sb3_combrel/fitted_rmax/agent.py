@@ -67,9 +67,11 @@ class FittedRMaxAgent:
         self._prediction_rng = np.random.default_rng(self.rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
         d = task.n_variables
         self.max_backups = settings.backups_for(d)
+        #: Which state variables are periodic.
+        self.periodic = settings.periodic_for(d)
         self.model_settings = settings.model_settings(d)
         breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
-        self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight)
+        self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight, self.periodic)
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfer is not None)
         warn_if_long(self.workload, self.grid)
         self.n_truncated = 0
@@ -96,6 +98,7 @@ class FittedRMaxAgent:
             min_fraction=self.model_settings.min_fraction,
             state_names=tuple(self.task.state_names),
             action_names=tuple(self.task.action_names),
+            periodic=self.periodic,
         )
         transfer.bind(target, self.rng)
         return target

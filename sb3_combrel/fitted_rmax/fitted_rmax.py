@@ -34,7 +34,7 @@ from sb3_combrel.fitted_rmax.arguments import (
 from sb3_combrel.fitted_rmax.persistence import PersistentAlgorithm
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
-from sb3_combrel.fitted_rmax.vec_envs import names_of, refuse_normalized_observations, true_outcomes
+from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 
@@ -97,6 +97,9 @@ class FittedRMax(PersistentAlgorithm):
     :param max_instances: of one action; beyond, the instance in the fewest lists of grid points is replaced. None: no limit.
     :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
         where those are infinite
+    :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
+        Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
+        says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.
     :param stats_window_size: window size for the rollout logging, in episodes
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation; ``dict(model_class=...)`` for another
@@ -134,6 +137,7 @@ class FittedRMax(PersistentAlgorithm):
         max_backups: int | None = DEFAULTS.max_backups,
         max_instances: int | None = DEFAULTS.max_instances,
         bounds: tuple[Any, Any] | None = DEFAULTS.bounds,
+        periodic: Sequence[bool] | None = DEFAULTS.periodic,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -168,6 +172,7 @@ class FittedRMax(PersistentAlgorithm):
         self.max_backups = max_backups
         self.max_instances = max_instances
         self.bounds = bounds
+        self.periodic = periodic
         self._warned_of_max_value = False
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
@@ -178,6 +183,8 @@ class FittedRMax(PersistentAlgorithm):
         self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             refuse_normalized_observations(self.env)
+        if self.periodic is None:
+            self.periodic = periodic_of(self.env)
         if self.seed is None:
             # A script that seeds numpy is then reproducible, as with the other algorithms.
             self._rng = np.random.default_rng(np.random.randint(2**31))
@@ -218,6 +225,7 @@ class FittedRMax(PersistentAlgorithm):
         check_policy_kwargs(self.policy_kwargs, self.policy_class, (*FittedRMaxSettings.names(), *PASSED_TO_POLICY))
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         self.settings.resolution_for(n_variables)
+        self.settings.periodic_for(n_variables)
 
     @property
     def settings(self) -> FittedRMaxSettings:

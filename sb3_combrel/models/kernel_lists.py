@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import Instances, put_instance
-from sb3_combrel.common.kernels import cut_by_fraction, insert_by_weight
+from sb3_combrel.common.kernels import cut_by_fraction, difference, insert_by_weight
 from sb3_combrel.common.list_store import ListStore, reserve
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.planning.grid import GridArrays
@@ -54,7 +54,8 @@ class ReachScratch(NamedTuple):
     """Work space for the grid points that an instance reaches.
 
     :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
-    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
+    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one; where
+        the latter exceed the last point of a periodic variable, they go on with the first
     :param point: int64, shape (n_points,): points within reach; ``weight``: float64, same shape: the instance's weight there
     """
 
@@ -87,30 +88,49 @@ def points_in_reach(state, kernel, grid, entry, scratch):
     d = len(state)
     reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
     for k in range(d):
-        first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin)))
-        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin)) + 1
-        last[k] = min(grid.shape[k], beyond)
-        if first[k] >= last[k]:
+        begin = int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin[k]))
+        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin[k])) + 1
+        n = grid.shape[k]
+        if not grid.periodic[k]:
+            begin = max(0, begin)
+            beyond = min(n, beyond)
+        elif beyond - begin >= n:
+            begin, beyond = 0, n
+        else:
+            # The first is a point of the grid; those beyond the last are the first ones again.
+            turns = begin // n
+            begin -= turns * n
+            beyond -= turns * n
+        if begin >= beyond:
             return 0
-        for j in range(first[k], last[k]):
-            apart = ((j - grid.margin) / grid.cells[k] - state[k]) / breadth
-            scratch.kernel[k, j] = np.exp(-apart * apart)
-        at[k] = first[k]
+        for j in range(begin, beyond):
+            point = j if j < n else j - n
+            apart = difference((point - grid.margin[k]) / grid.cells[k], state[k], grid.periodic[k]) / breadth
+            scratch.kernel[k, point] = np.exp(-apart * apart)
+        first[k] = begin
+        last[k] = beyond
+        at[k] = begin
     found = 0
     inner = d - 1
+    n_inner = grid.shape[inner]
     while True:
         outer_weight = 1.0
         base = 0
         for k in range(inner):
-            outer_weight *= scratch.kernel[k, at[k]]
-            base += at[k] * grid.strides[k]
+            point = at[k] if at[k] < grid.shape[k] else at[k] - grid.shape[k]
+            outer_weight *= scratch.kernel[k, point]
+            base += point * grid.strides[k]
         if outer_weight >= min_weight:
-            for j in range(first[inner], last[inner]):
-                w = outer_weight * scratch.kernel[inner, j]
-                if w >= entry[base + j] and w >= min_weight:
-                    scratch.point[found] = base + j
-                    scratch.weight[found] = w
-                    found += 1
+            # In one run up to the last point, and another one from the first where that is the next.
+            for turn in range(2):
+                begin = first[inner] if turn == 0 else 0
+                end = min(last[inner], n_inner) if turn == 0 else last[inner] - n_inner
+                for j in range(begin, end):
+                    w = outer_weight * scratch.kernel[inner, j]
+                    if w >= entry[base + j] and w >= min_weight:
+                        scratch.point[found] = base + j
+                        scratch.weight[found] = w
+                        found += 1
         k = inner - 1
         while k >= 0:
             at[k] += 1
