@@ -85,13 +85,14 @@ class Instances(NamedTuple):
         :param reward: shape (n,); ``terminated``: bool, same shape
         :param periodic: see :meth:`empty`; coordinates of periodic variables are wrapped to [0, 1]
         """
-        if np.any(periodic):
-            state = np.where(periodic, state - np.floor(state), state)
+        flags = flag_array(periodic, state.shape[1])
+        if flags.any():
+            state = np.where(flags, state - np.floor(state), state)
         counts = np.bincount(action, minlength=n_actions)
         capacity = 8 * BLOCK
         while capacity < counts.max():
             capacity *= 2
-        made = cls.empty(n_actions, state.shape[1], capacity, periodic)
+        made = cls.empty(n_actions, state.shape[1], capacity, flags)
         made.size[:] = counts
         for a, n in enumerate(counts):
             rows = np.flatnonzero(action == a)
@@ -104,9 +105,7 @@ class Instances(NamedTuple):
         return made
 
     @classmethod
-    def from_rows(
-        cls, n_actions: int, rows: np.ndarray, periodic: Sequence[bool] | np.ndarray | None = None
-    ) -> "Instances":
+    def from_rows(cls, n_actions: int, rows: np.ndarray, periodic: Sequence[bool] | np.ndarray | None = None) -> "Instances":
         """
         Build them from :meth:`rows`, in the same order for each action.
 

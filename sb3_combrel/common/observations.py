@@ -46,8 +46,10 @@ class ObservationScaler:
         flat = (-1, self.scaling.n_variables)
         if _scale_into_box.call(raw.reshape(flat), self._low, self._range, self._periodic, inside.reshape(flat)):
             excess = self.scaling.to_unit(raw) - inside
-            # What is not finite stays so.
-            self._check_outside(observations, np.where(self._periodic, 0.0 * excess, excess))
+            with np.errstate(invalid="ignore"):
+                # Whole periods are no excess; what is not finite stays so.
+                excess[..., self._periodic] *= 0.0
+            self._check_outside(observations, excess)
         return inside
 
     def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:

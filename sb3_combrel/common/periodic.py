@@ -19,15 +19,17 @@ def difference(a, b, periodic):
     return apart
 
 
-def differences(a: NDArray[np.float64], b: NDArray[np.float64], periodic: NDArray[np.bool_]) -> NDArray[np.float64]:
+def differences(a: NDArray[np.float64], b: NDArray[np.float64], periodic: NDArray[np.bool_] | None) -> NDArray[np.float64]:
     """
     Return :func:`difference` of arrays of states.
 
     :param a: unit coordinates, shape (..., n_variables); ``b``: the same
-    :param periodic: bool, shape (n_variables,)
+    :param periodic: bool, shape (n_variables,); None: none is periodic
     """
-    apart = np.asarray(a - b)
-    return np.where(periodic, apart - np.floor(apart + 0.5), apart) if np.any(periodic) else apart
+    apart: NDArray[np.float64] = np.asarray(a - b)
+    if periodic is None or not periodic.any():
+        return apart
+    return np.where(periodic, apart - np.floor(apart + 0.5), apart)
 
 
 def periodic_flags(periodic: object, n_variables: int) -> tuple[bool, ...]:

@@ -65,10 +65,10 @@ def in_neighbourhoods(instances: Instances, listed: np.ndarray) -> tuple[Instanc
         there = np.flatnonzero(of_action)
         n = len(there)
         slots[action, :n] = order = there[np.argsort(along_curve(instances.state[action, there]), kind="stable")]
-        columns = (instances.state, instances.effect, instances.reward, instances.terminated)
-        rows.append((np.full(n, action), *(column[action, order] for column in columns)))
-    given = map(np.concatenate, zip(*rows, strict=True))
-    return Instances.of_rows(len(instances.size), *given, periodic=instances.periodic), slots
+        kept = (instances.state, instances.effect, instances.reward, instances.terminated)
+        rows.append((np.full(n, action), *(column[action, order] for column in kept)))
+    actions, states, effects, rewards, ends = map(np.concatenate, zip(*rows, strict=True))
+    return Instances.of_rows(len(instances.size), actions, states, effects, rewards, ends, instances.periodic), slots
 
 
 @compiled
