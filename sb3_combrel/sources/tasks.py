@@ -40,7 +40,10 @@ def _attribute(env: VecEnv | gym.Env[Any, Any], name: str) -> Any:
     """Return an attribute of an environment or of one of its wrappers, None if there is none."""
     if isinstance(env, VecEnv):
         return env.get_attr(name, 0)[0] if env.has_attr(name) else None
-    return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
+    try:
+        return env.get_wrapper_attr(name)
+    except AttributeError:
+        return None
 
 
 def describe_origin(env: VecEnv | gym.Env[Any, Any], recorder: str, seed: int | None) -> dict[str, Any]:
