@@ -76,6 +76,8 @@ class FittedRMaxAgent:
         warn_if_long(self.workload, self.grid)
         self.n_truncated = 0
         self.n_backups = 0
+        #: How often an action without a model was chosen in learning.
+        self.n_optimistic_actions = 0
         # Measure the time of planning, which takes some itself.
         self.timed = False
         self.planning_seconds = 0.0
@@ -156,10 +158,12 @@ class FittedRMaxAgent:
             self.transfer.note_use(given)
         visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)
-        if best >= 0:
-            return best
-        ties = np.flatnonzero(self._q.q == self._q.q.max())
-        return int(ties[self.rng.integers(len(ties))])
+        if best < 0:
+            ties = np.flatnonzero(self._q.q == self._q.q.max())
+            best = int(ties[self.rng.integers(len(ties))])
+        if not prediction.modelled[best]:
+            self.n_optimistic_actions += 1
+        return best
 
     def _exploit(self, state: np.ndarray, memory: EpisodeMemory | None) -> int:
         mode = EXPLOIT if memory is None else memory.mode

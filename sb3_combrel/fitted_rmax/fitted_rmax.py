@@ -11,7 +11,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
@@ -24,6 +23,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import (
     DEFAULT_POLICY,
+    check_actions,
     check_policy_kwargs,
     check_seed,
     check_total_timesteps,
@@ -33,6 +33,7 @@ from sb3_combrel.fitted_rmax.arguments import (
 )
 from sb3_combrel.fitted_rmax.persistence import PersistentAlgorithm
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.fitted_rmax.progress import ProgressWatch
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.transfer.base import Transfer
@@ -203,6 +204,7 @@ class FittedRMax(PersistentAlgorithm):
         )
         self.policy = self.policy.to(self.device)
         self._episode_rewards: list[list[float]] = []
+        self._progress = ProgressWatch(self.max_value, self.gamma, self.planning_tolerance)
         if self.verbose >= 1:
             print(self.agent.workload)
 
@@ -217,8 +219,7 @@ class FittedRMax(PersistentAlgorithm):
 
     def _check_arguments(self) -> None:
         """Refuse what does not fit before anything is built."""
-        if not isinstance(self.action_space, spaces.Discrete):
-            raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
+        check_actions(self.action_space)
         check_seed(self.seed)
         check_count("stats_window_size", self._stats_window_size)
         check_type("tensorboard_log", self.tensorboard_log, (str, Path, type(None)), "the path of a folder or None")
@@ -340,6 +341,7 @@ class FittedRMax(PersistentAlgorithm):
         self._episode_rewards[env_index] = []
         if not self._warned_of_max_value and (terminated or min(rewards) >= 0.0):
             self._warned_of_max_value = warn_of_max_value(self.max_value, rewards, self.gamma)
+        self._progress.note(rewards, terminated, self.agent.n_optimistic_actions)
 
     def dump_logs(self) -> None:
         """Write log data."""
