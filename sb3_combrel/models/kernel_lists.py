@@ -54,8 +54,8 @@ class ReachScratch(NamedTuple):
     """Work space for the grid points that an instance reaches.
 
     :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
-    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one; where
-        the latter exceed the last point of a periodic variable, they go on with the first
+    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one; along a
+        periodic variable the last may come before the first
     :param point: int64, shape (n_points,): points within reach; ``weight``: float64, same shape: the instance's weight there
     """
 
@@ -97,7 +97,6 @@ def points_in_reach(state, kernel, grid, entry, scratch):
         elif beyond - begin >= n:
             begin, beyond = 0, n
         else:
-            # The first is a point of the grid; those beyond the last are the first ones again.
             turns = begin // n
             begin -= turns * n
             beyond -= turns * n
@@ -108,23 +107,22 @@ def points_in_reach(state, kernel, grid, entry, scratch):
             apart = difference((point - grid.margin[k]) / grid.cells[k], state[k], grid.periodic[k]) / breadth
             scratch.kernel[k, point] = np.exp(-apart * apart)
         first[k] = begin
-        last[k] = beyond
+        # Beyond the last point of a periodic variable come the first ones.
+        last[k] = beyond if beyond <= n else beyond - n
         at[k] = begin
     found = 0
     inner = d - 1
-    n_inner = grid.shape[inner]
+    n_runs = 1 if first[inner] < last[inner] else 2
     while True:
         outer_weight = 1.0
         base = 0
         for k in range(inner):
-            point = at[k] if at[k] < grid.shape[k] else at[k] - grid.shape[k]
-            outer_weight *= scratch.kernel[k, point]
-            base += point * grid.strides[k]
+            outer_weight *= scratch.kernel[k, at[k]]
+            base += at[k] * grid.strides[k]
         if outer_weight >= min_weight:
-            # In one run up to the last point, and another one from the first where that is the next.
-            for turn in range(2):
-                begin = first[inner] if turn == 0 else 0
-                end = min(last[inner], n_inner) if turn == 0 else last[inner] - n_inner
+            for run in range(n_runs):
+                begin = first[inner] if run == 0 else 0
+                end = grid.shape[inner] if run + 1 < n_runs else last[inner]
                 for j in range(begin, end):
                     w = outer_weight * scratch.kernel[inner, j]
                     if w >= entry[base + j] and w >= min_weight:
@@ -134,7 +132,9 @@ def points_in_reach(state, kernel, grid, entry, scratch):
         k = inner - 1
         while k >= 0:
             at[k] += 1
-            if at[k] < last[k]:
+            if at[k] != last[k]:
+                if at[k] == grid.shape[k]:
+                    at[k] = 0
                 break
             at[k] = first[k]
             k -= 1
