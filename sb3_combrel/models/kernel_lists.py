@@ -74,20 +74,15 @@ class Outcomes(NamedTuple):
 
 
 @part
-def points_in_reach(state, kernel, grid, entry, scratch):
-    """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
+def factors_in_reach(state, kernel, grid, scratch):
+    """Write the first and the last grid coordinate within reach to ``scratch.at``, and the kernel's factors between them.
 
-    The kernel is a product of one factor a variable, so the exponentials are few: one for each grid coordinate.
-
-    :param kernel: (breadth, min_weight, min_fraction)
-    :param entry: float64, shape (n_points,)
-    :return: how many; they and the weights are in ``scratch.point`` and ``scratch.weight``
+    :return: whether there are any along every variable
     """
     breadth, min_weight, _ = kernel
     first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
-    d = len(state)
     reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
-    for k in range(d):
+    for k in range(len(state)):
         begin = int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin[k]))
         beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin[k])) + 1
         n = grid.shape[k]
@@ -101,7 +96,7 @@ def points_in_reach(state, kernel, grid, entry, scratch):
             begin -= turns * n
             beyond -= turns * n
         if begin >= beyond:
-            return 0
+            return False
         for j in range(begin, beyond):
             point = j if j < n else j - n
             apart = difference((point - grid.margin[k]) / grid.cells[k], state[k], grid.periodic[k]) / breadth
@@ -110,8 +105,25 @@ def points_in_reach(state, kernel, grid, entry, scratch):
         # Beyond the last point of a periodic variable come the first ones.
         last[k] = beyond if beyond <= n else beyond - n
         at[k] = begin
+    return True
+
+
+@part
+def points_in_reach(state, kernel, grid, entry, scratch):
+    """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
+
+    The kernel is a product of one factor a variable, so the exponentials are few: one for each grid coordinate.
+
+    :param kernel: (breadth, min_weight, min_fraction)
+    :param entry: float64, shape (n_points,)
+    :return: how many; they and the weights are in ``scratch.point`` and ``scratch.weight``
+    """
+    _, min_weight, _ = kernel
+    first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
+    if not factors_in_reach(state, kernel, grid, scratch):
+        return 0
     found = 0
-    inner = d - 1
+    inner = len(state) - 1
     n_runs = 1 if first[inner] < last[inner] else 2
     while True:
         outer_weight = 1.0

@@ -101,6 +101,7 @@ class MappingTransfer(Transfer):
         self._choose_bandwidths()
         self._transitions = RecordedTransitions(task.n_variables)
         self._periodic = np.array(task.periodic)
+        self._wraps = bool(self._periodic.any())
         self._translator = Translator(
             self.candidates,
             task,
@@ -164,7 +165,7 @@ class MappingTransfer(Transfer):
         selector = self._selector
         selector.before_transition()
         if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
-            effect = differences(next_state, state, self._periodic)
+            effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
             selector.add_transition(self._transitions.add(state, action, reward, effect))
             n_used = selector.n_used()
             if self.relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):

@@ -106,6 +106,10 @@ def find_nearest(query, recorded, limits, near, distance):
     at, listed, n_listed, periodic = recorded
     threshold, limit = limits
     last = near.shape[1] - 1
+    # Asked once, not for every transition.
+    wraps = False
+    for v in range(len(periodic)):
+        wraps = wraps or periodic[v]
     for r in range(len(actions)):
         near[r] = -1
         distance[r] = limit
@@ -116,7 +120,9 @@ def find_nearest(query, recorded, limits, near, distance):
             i = listed[action, n]
             apart = 0.0
             for v in range(states.shape[1]):
-                along = difference(at[i, v], states[r, v], periodic[v])
+                along = at[i, v] - states[r, v]
+                if wraps:
+                    along = difference(along, 0.0, periodic[v])
                 apart += along * along
             if apart < distance[r, last]:
                 add_neighbor(i, apart, near[r], distance[r])

@@ -7,10 +7,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers.agents import assert_same_state, make_agent
+from helpers.dashboard import events
 from helpers.ring import PERIODIC, Ring, ring_transitions, shifted
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_combrel import FittedRMax
+from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+from sb3_combrel.callbacks import DashboardCallback
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.loop_detection import small_cell
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
@@ -183,6 +185,17 @@ def test_a_plane_through_the_end_of_a_periodic_variable_goes_through_its_beginni
     plane = plane_through(grid, scaling, ("a", "b", "c"), (1, 2), at=[0.99, 0.5, 0.5])
     assert plane.held == "a = 0"
     assert (grid.states_of(plane.points.ravel())[:, 0] == 0.0).all()
+
+
+@pytest.mark.parametrize("transfers", [False, True])
+def test_the_dashboard_shows_periodic_variables(transfers, tmp_path):
+    source = SourceInstances.record(None, TellingRing(), 200, seed=0)
+    transfer = COMBREL(source) if transfers else None
+    arguments = dict(seed=0, resolution=4, model_breadth=0.12, transfer=transfer, tensorboard_log=str(tmp_path))
+    FittedRMax(TellingRing(), **arguments).learn(300, DashboardCallback(picture_freq=150), log_interval=1)
+    found = events(tmp_path / "FittedRMax_1")
+    assert len(found.Images("value_and_policy/angle_speed")) == 2
+    assert ("source_action/angle_speed" in found.Tags()["images"]) == transfers
 
 
 def test_settings_know_the_default():
