@@ -11,7 +11,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
@@ -24,6 +23,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import (
     DEFAULT_POLICY,
+    check_actions,
     check_policy_kwargs,
     check_seed,
     check_total_timesteps,
@@ -33,8 +33,9 @@ from sb3_combrel.fitted_rmax.arguments import (
 )
 from sb3_combrel.fitted_rmax.persistence import PersistentAlgorithm
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.fitted_rmax.progress import ProgressWatch
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
-from sb3_combrel.fitted_rmax.vec_envs import names_of, refuse_normalized_observations, true_outcomes
+from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 
@@ -97,6 +98,9 @@ class FittedRMax(PersistentAlgorithm):
     :param max_instances: of one action; beyond, the instance in the fewest lists of grid points is replaced. None: no limit.
     :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
         where those are infinite
+    :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
+        Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
+        says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.
     :param stats_window_size: window size for the rollout logging, in episodes
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation; ``dict(model_class=...)`` for another
@@ -137,6 +141,7 @@ class FittedRMax(PersistentAlgorithm):
         degree: int = DEFAULTS.degree,
         n_neighbors: int | None = DEFAULTS.n_neighbors,
         outcome_breadth: float = DEFAULTS.outcome_breadth,
+        periodic: Sequence[bool] | None = DEFAULTS.periodic,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -174,6 +179,7 @@ class FittedRMax(PersistentAlgorithm):
         self.degree = degree
         self.n_neighbors = n_neighbors
         self.outcome_breadth = outcome_breadth
+        self.periodic = periodic
         self._warned_of_max_value = False
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
@@ -184,6 +190,8 @@ class FittedRMax(PersistentAlgorithm):
         self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             refuse_normalized_observations(self.env)
+        if self.periodic is None:
+            self.periodic = periodic_of(self.env)
         if self.seed is None:
             # A script that seeds numpy is then reproducible, as with the other algorithms.
             self._rng = np.random.default_rng(np.random.randint(2**31))
@@ -202,6 +210,7 @@ class FittedRMax(PersistentAlgorithm):
         )
         self.policy = self.policy.to(self.device)
         self._episode_rewards: list[list[float]] = []
+        self._progress = ProgressWatch(self.max_value, self.gamma, self.planning_tolerance)
         if self.verbose >= 1:
             print(self.agent.workload)
 
@@ -216,14 +225,14 @@ class FittedRMax(PersistentAlgorithm):
 
     def _check_arguments(self) -> None:
         """Refuse what does not fit before anything is built."""
-        if not isinstance(self.action_space, spaces.Discrete):
-            raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
+        check_actions(self.action_space)
         check_seed(self.seed)
         check_count("stats_window_size", self._stats_window_size)
         check_type("tensorboard_log", self.tensorboard_log, (str, Path, type(None)), "the path of a folder or None")
         check_policy_kwargs(self.policy_kwargs, self.policy_class, (*FittedRMaxSettings.names(), *PASSED_TO_POLICY))
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         self.settings.resolution_for(n_variables)
+        self.settings.periodic_for(n_variables)
 
     @property
     def settings(self) -> FittedRMaxSettings:
@@ -338,6 +347,7 @@ class FittedRMax(PersistentAlgorithm):
         self._episode_rewards[env_index] = []
         if not self._warned_of_max_value and (terminated or min(rewards) >= 0.0):
             self._warned_of_max_value = warn_of_max_value(self.max_value, rewards, self.gamma)
+        self._progress.note(rewards, terminated, self.agent.n_optimistic_actions)
 
     def dump_logs(self) -> None:
         """Write log data."""

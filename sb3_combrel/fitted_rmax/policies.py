@@ -80,8 +80,8 @@ class FittedRMaxPolicy(BasePolicy):
         names = (() if given_names is None else given_names for given_names in (state_names, action_names))
         task = Task(self.scaling, int(action_space.n), *names)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
-        #: Observations, raw units, to unit coordinates; what is outside the bounds is moved to the boundary.
-        self.to_unit = ObservationScaler(self.scaling)
+        #: Observations, raw units, to unit coordinates; what is outside the bounds is moved to the boundary, or wrapped.
+        self.to_unit = ObservationScaler(self.scaling, self.agent.periodic)
         self._first_action = int(action_space.start)
         self._settings = settings
         self._model_class = model_class

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
+from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.models.base import Model, ModelSettings
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.models.local_linear import LocalLinear
@@ -46,6 +47,7 @@ class FittedRMaxSettings:
     max_backups: int | None = None
     max_instances: int | None = 20_000
     bounds: tuple[Any, Any] | None = None
+    periodic: Sequence[bool] | None = None
 
     def __post_init__(self) -> None:
         if self.degree not in (0, 1) or isinstance(self.degree, bool):
@@ -95,6 +97,14 @@ class FittedRMaxSettings:
         """
         check_resolution(self.resolution, n_variables)
         return self.resolution
+
+    def periodic_for(self, n_variables: int) -> tuple[bool, ...]:
+        """
+        Which state variables are periodic, checked against their number.
+
+        :raises ValueError: if it is not None or one bool for each state variable
+        """
+        return periodic_flags(self.periodic, n_variables)
 
     def model_settings(self, n_variables: int) -> ModelSettings:
         """What a model of a task with so many state variables needs of them."""

@@ -68,7 +68,7 @@ def known_before(instances, action, state, kernel, threshold, total):
     farthest = np.log(least) / scale
     everything = 0.0
     for i in range(instances.size[action]):
-        distance = squared_distance(state, instances.state[action, i])
+        distance = squared_distance(state, instances.state[action, i], instances.periodic)
         if distance <= farthest:
             everything += np.exp(distance * scale)
     return everything >= threshold

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_positive
+from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
@@ -99,6 +100,8 @@ class MappingTransfer(Transfer):
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         self._choose_bandwidths()
         self._transitions = RecordedTransitions(task.n_variables)
+        self._periodic = np.array(task.periodic)
+        self._wraps = bool(self._periodic.any())
         self._translator = Translator(
             self.candidates,
             task,
@@ -162,7 +165,8 @@ class MappingTransfer(Transfer):
         selector = self._selector
         selector.before_transition()
         if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
-            selector.add_transition(self._transitions.add(state, action, reward, next_state - state))
+            effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
+            selector.add_transition(self._transitions.add(state, action, reward, effect))
             n_used = selector.n_used()
             if self.relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
                 self._renew_relevance(n_used)
@@ -189,7 +193,8 @@ class MappingTransfer(Transfer):
 
     def _renew_relevance(self, n_used: int) -> None:
         mu, values = float(self.relevance_fraction), self._translator.relevance
-        renew_relevance(self.candidates, self._transitions, n_used, self._bandwidths, self._starts, mu, values)
+        bandwidths = self._bandwidths, self._starts
+        renew_relevance(self.candidates, self._transitions, n_used, bandwidths, self._periodic, mu, values)
         self._n_of_relevance = n_used
 
     # --------------------------------------------------------------- describing
