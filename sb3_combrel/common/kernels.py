@@ -46,11 +46,25 @@ def cut_by_fraction(weights, start, length, min_fraction):
 
 
 @inlined
-def squared_distance(state, other, periodic):
-    """Of two states; ``periodic``: bool, shape (n_variables,)."""
+def any_periodic(periodic):
+    """Whether a variable is periodic, for :func:`squared_distance`: asked once for many distances."""
+    found = False
+    for k in range(len(periodic)):
+        found = found or periodic[k]
+    return found
+
+
+@inlined
+def squared_distance(state, other, periodic, wraps):
+    """Of two states.
+
+    :param periodic: bool, shape (n_variables,); ``wraps``: whether any is
+    """
     distance = 0.0
     for k in range(len(state)):
-        along = difference(state[k], other[k], periodic[k])
+        along = state[k] - other[k]
+        if wraps:
+            along = difference(along, 0.0, periodic[k])
         distance += along * along
     return distance
 
@@ -111,13 +125,14 @@ def near_instances(instances, action, state, kernel, indices, weights, n_before)
     length = np.int64(0)
     total = 0.0
     count = instances.size[action]
+    wraps = any_periodic(instances.periodic)
     instances.searches[0] += 1
     search = instances.searches[0]
     for b in range(n_before):
         before = np.int64(indices[b])
         if before < count:
             instances.seen[action, before] = search
-            w = np.exp(squared_distance(state, instances.state[action, before], instances.periodic) * scale)
+            w = np.exp(squared_distance(state, instances.state[action, before], instances.periodic, wraps) * scale)
             if w >= min_weight:
                 length, total = insert_by_weight(indices, weights, start, length, total, before, w, min_fraction)
     if length > 0:
@@ -129,7 +144,7 @@ def near_instances(instances, action, state, kernel, indices, weights, n_before)
         if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i], instances.periodic)
+            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
             if distance > farthest or instances.seen[action, i] == search:
                 continue
             w = np.exp(distance * scale)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner, part
-from sb3_combrel.common.periodic import difference
+from sb3_combrel.common.kernels import any_periodic, difference
 
 
 class ComplianceCache(NamedTuple):
@@ -107,9 +107,7 @@ def find_nearest(query, recorded, limits, near, distance):
     threshold, limit = limits
     last = near.shape[1] - 1
     # Asked once, not for every transition.
-    wraps = False
-    for v in range(len(periodic)):
-        wraps = wraps or periodic[v]
+    wraps = any_periodic(periodic)
     for r in range(len(actions)):
         near[r] = -1
         distance[r] = limit

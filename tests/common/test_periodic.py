@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sb3_combrel.common.compiled import compiled
 from sb3_combrel.common.instances import BLOCK, Instances, put_instance_at
-from sb3_combrel.common.kernels import difference, measure_gaps, squared_distance
+from sb3_combrel.common.kernels import any_periodic, difference, measure_gaps, squared_distance
 from sb3_combrel.common.observations import ObservationScaler
 from sb3_combrel.common.periodic import differences, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
@@ -26,7 +26,7 @@ def difference_of(a, b, periodic):
 
 @compiled
 def squared_distance_of(a, b, periodic):
-    return squared_distance(a, b, periodic)
+    return squared_distance(a, b, periodic, any_periodic(periodic))
 
 
 @compiled
