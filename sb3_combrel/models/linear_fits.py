@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, inner, part
 from sb3_combrel.common.instances import BLOCK, Instances, put_instance
-from sb3_combrel.common.kernels import measure_gaps, squared_distance
+from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near, difference
 from sb3_combrel.common.transferred import TransferredInstances
@@ -248,13 +248,14 @@ def recount(instances, fits, pair, action, kernel, scratch):
     reach = fits.reach[pair]
     n_blocks = measure_blocks(instances, action, scratch.at)
     products = scratch.products[1]
+    wraps = any_periodic(instances.periodic)
     count = np.int64(0)
     total = 0.0
     for block in range(n_blocks):
         if instances.gap[block] > reach * (1 + 1e-12):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
-            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic)
+            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
             if distance > reach:
                 continue
             bring_near(instances.state[action, i], scratch.at, instances.periodic, scratch.state)
@@ -284,12 +285,13 @@ def narrow(instances, fits, pair, action, kernel, scratch):
     reach = fits.reach[pair]
     n_blocks = measure_blocks(instances, action, scratch.at)
     nearest = scratch.nearest
+    wraps = any_periodic(instances.periodic)
     length = 0
     for block in range(n_blocks):
         if instances.gap[block] > reach * (1 + 1e-12):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
-            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic)
+            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
             if distance > reach:
                 continue
             k = length if length < kernel.n_neighbors else length - 1
@@ -380,10 +382,9 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
     first_pair = action * n_points
     put_instance(instances, transition)
     state = scratch.entering
-    goes_around = False
+    wraps = any_periodic(grid.periodic)
     for k in range(len(state)):
         state[k] = instances.state[action, slot, k]
-        goes_around = goes_around or grid.periodic[k]
     for k in range(len(state)):
         effect = instances.effect[action, slot, k]
         fits.target[action, slot, k] = effect - prior[k]
@@ -400,7 +401,7 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
         point = scratch.point[f]
         pair = first_pair + point
         distance = scratch.distance[f]
-        if goes_around:
+        if wraps:
             unit_coordinates_of(point, grid, scratch.at)
             bring_near(instances.state[action, slot], scratch.at, grid.periodic, state)
             products_of(state, fits.target[action, slot], products)

@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import BLOCK, Instances
-from sb3_combrel.common.kernels import measure_gaps, squared_distance
+from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.common.transferred import TransferredInstances
@@ -74,6 +74,7 @@ def nearest_instances(instances, action, state, farthest, items, distances, n_be
     """
     count = instances.size[action]
     room = len(items)
+    wraps = any_periodic(instances.periodic)
     instances.searches[0] += 1
     search = instances.searches[0]
     length = np.int64(0)
@@ -81,7 +82,7 @@ def nearest_instances(instances, action, state, farthest, items, distances, n_be
         before = np.int64(items[b])
         if before < count:
             instances.seen[action, before] = search
-            distance = squared_distance(state, instances.state[action, before], instances.periodic)
+            distance = squared_distance(state, instances.state[action, before], instances.periodic, wraps)
             if distance <= farthest:
                 length = insert_by_distance(items, distances, length, before, distance)
     if length == room:
@@ -92,7 +93,7 @@ def nearest_instances(instances, action, state, farthest, items, distances, n_be
         if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i], instances.periodic)
+            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
             if distance > farthest or instances.seen[action, i] == search:
                 continue
             length = insert_by_distance(items, distances, length, i, distance)
