@@ -186,6 +186,8 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         expected = self.agent.get_state()
+        # Files of version 0.1.0 do not have it.
+        state_dict.setdefault(prefix + "visits", th.as_tensor(expected["visits"] * 0.0))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):

@@ -29,8 +29,8 @@ PRIOR_WEIGHT = 0.5
 PRIOR_OUTCOME_WEIGHT = 0.1
 # Within an episode a pair is fitted again once what new instances leave unexplained may move its prediction by the first,
 # and its row is written again when the prediction has moved by the second; in parts of the size of the action's effects.
-MAX_UNEXPLAINED = 0.1
-TOLERANCE = 0.05
+MAX_UNEXPLAINED = 0.2
+TOLERANCE = 0.1
 # A variable that hardly ever changes is measured by this part of a cell.
 LEAST_SCALE = 0.02
 
