@@ -250,6 +250,14 @@ class FittedRMaxAgent:
             self._outdated.append(self.model.end_episode())
             self._plan(AT_EPISODE_END * self.max_backups)
 
+    def complete(self) -> None:
+        """Bring the model up to date with all transitions, as at an episode's end: what is then saved is what is predicted with."""
+        with self._lock:
+            pairs = self.model.end_episode()
+            if len(pairs):
+                self._outdated.append(pairs)
+                self._plan(0)
+
     def _lowered_threshold(self) -> float:
         """The threshold after so many episodes that ran into their time limit.
 

@@ -302,6 +302,7 @@ class FittedRMax(PersistentAlgorithm):
                     break
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
         finally:
+            self.agent.complete()
             callback.on_training_end()
         return self
 

@@ -232,7 +232,8 @@ def contradiction(fits, pair, instances, action, slot, state, shares):
     seen = instances.reward[action, slot]
     of_reward = abs(seen - reward) / max(1e-12, abs(seen) + abs(reward))
     of_end = abs((1.0 if instances.terminated[action, slot] else 0.0) - end)
-    return shares[0] * most + shares[1] * max(of_reward, of_end)
+    # Above 0 in any case: the fit is no longer that of all instances.
+    return max(1e-12, shares[0] * most + shares[1] * max(of_reward, of_end))
 
 
 @inner
@@ -265,9 +266,6 @@ def recount(instances, fits, pair, action, kernel, scratch):
             total += np.exp(distance * kernel.scale)
             count += 1
     fits.n_counted[pair] = count
-    # Many instances at one state: to look for narrower kernels again and again would be in vain.
-    n = kernel.n_neighbors
-    fits.limit[pair] = max(n + n // 2, 2 * count if count > n + n // 4 else 0)
     return total
 
 
@@ -308,6 +306,9 @@ def narrow(instances, fits, pair, action, kernel, scratch):
                 reach = nearest[length - 1]
     fits.reach[pair] = reach
     recount(instances, fits, pair, action, kernel, scratch)
+    # Many instances at one state: to look for narrower kernels again and again would be in vain.
+    n, n_counted = kernel.n_neighbors, fits.n_counted[pair]
+    fits.limit[pair] = max(n + n // 2, 2 * n_counted if n_counted > n + n // 4 else 0)
 
 
 @inlined
@@ -473,14 +474,24 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
 def refit_changed(fits, grid, scratch, changed):
     """Fit all pairs again that have had instances since the last time; how many rows are to be updated.
 
+    All rows are looked at: the range that effects are kept within may have grown.
+
     :param changed: int64, shape (n_pairs,): receives these pairs
     """
     n_points = grid.shape[0] * grid.strides[0]
     n = 0
     for pair in range(len(fits.total)):
-        if fits.unexplained[pair] == 0.0 or not (fits.known[pair] or fits.claimed[pair]) or fits.n_counted[pair] == 0:
+        # What has neither own nor the prior's model has a row, if any, from its last update with transferred instances.
+        modelled = fits.known[pair] or fits.claimed[pair]
+        if fits.n_counted[pair] == 0 or not (modelled or fits.unexplained[pair] < np.inf):
             continue
-        if refit(fits, pair, pair // n_points, grid, scratch, 0.0):
+        action = pair // n_points
+        if fits.unexplained[pair] > 0.0:
+            moved = refit(fits, pair, action, grid, scratch, 0.0)
+        else:
+            unit_coordinates_of(pair - action * n_points, grid, scratch.at)
+            moved = prediction_moved(fits, pair, action, scratch.at, 0.0)
+        if moved:
             changed[n] = pair
             n += 1
     return n
@@ -500,7 +511,8 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
         fits.total[pair] = total
         if total >= threshold:
             fits.known[pair] = True
-        if fits.n_counted[pair] > 0:
+        fits.unexplained[pair] = np.inf
+        if fits.n_counted[pair] > 0 and (fits.known[pair] or fits.claimed[pair]):
             refit(fits, pair, action, grid, scratch, 0.0)
 
 

@@ -300,14 +300,14 @@ class LocalLinear(Model):
         return self._prediction, given
 
     def get_state(self) -> dict[str, np.ndarray]:
-        return {**super().get_state(), "reach": self.fits.reach.copy()}
+        return {**super().get_state(), "reach": self.fits.reach.copy(), "limit": self.fits.limit.astype(np.float64)}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Compute sums and fits from the instances; pairs that were known stay known."""
         instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self.instances = instances
         fits = self.fits
-        fits.reach[:] = state["reach"]
+        fits.reach[:], fits.limit[:] = state["reach"], state["limit"]
         fits.known[:] = state["known"] > 0.5
         self._set_fits(fits._replace(target=np.empty_like(instances.effect)))
         if len(self.renew_prior()) == 0:

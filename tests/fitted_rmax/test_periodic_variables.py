@@ -36,21 +36,23 @@ def agent_after(transitions, cells=0, **settings):
     return agent
 
 
+@pytest.mark.parametrize("degree, rtol", [(0, 1e-7), (1, 1e-3)])
 @pytest.mark.parametrize("cells", [1, 5, 8, 15])
 @pytest.mark.parametrize("max_instances", [None, 30])
-def test_with_another_origin_the_same_is_learned(cells, max_instances):
+def test_with_another_origin_the_same_is_learned(cells, max_instances, degree, rtol):
+    """With degree 1 up to what may wait until the end of an episode, which rounding decides."""
     transitions = ring_transitions(0, 160)
-    one, other = (agent_after(transitions, moved, max_instances=max_instances) for moved in (0, cells))
+    one, other = (agent_after(transitions, moved, max_instances=max_instances, degree=degree) for moved in (0, cells))
     assert one.planner.n_queued == other.planner.n_queued == 0
     assert one.corrections.n_states[0] == other.corrections.n_states[0]
     states = np.random.default_rng(1).random((60, 2))
     q = np.array([one.q_values(state) for state in states])
     assert (q < 0.0).any(axis=1).mean() > 0.5, "most of it is known"
-    np.testing.assert_allclose([other.q_values(s) for s in shifted(states, cells, N_CELLS)], q, atol=1e-6)
+    np.testing.assert_allclose([other.q_values(s) for s in shifted(states, cells, N_CELLS)], q, atol=1e-6, rtol=rtol)
     for of_agent in (lambda a: a.planner.values, lambda a: a.planner.exploitation_values()):
         by_variable = of_agent(one).reshape(one.grid.arrays.shape)
         moved = of_agent(other).reshape(one.grid.arrays.shape)
-        np.testing.assert_allclose(moved, np.roll(by_variable, cells, axis=0), atol=1e-6)
+        np.testing.assert_allclose(moved, np.roll(by_variable, cells, axis=0), atol=1e-6, rtol=rtol)
 
 
 def test_without_the_flag_the_origin_matters():
