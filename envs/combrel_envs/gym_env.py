@@ -28,6 +28,12 @@ _SPECS: tuple[dict[str, Any], ...] = (
         "max_episode_steps": MAX_EPISODE_STEPS,
         "disable_env_checker": True,
     },
+    {
+        "id": "combrel/MountainCar6D-v0",
+        "entry_point": "combrel_envs.mountain_car_gym:MountainCar6DEnv",
+        "max_episode_steps": MAX_EPISODE_STEPS,
+        "disable_env_checker": True,
+    },
     *(
         {
             "id": f"combrel/ICub{part}Strike{variant}-v0",

@@ -1,8 +1,9 @@
 """Mountain Car as a dm_control domain: an underpowered car that must first drive away from its goal.
 
 ``climb_2d`` is the car in a valley between two hills (Singh and Sutton 1996), ``climb_4d`` the car on a surface with hills
-along two axes. One control step is one second of simulated time, so that the default time limit, 4000, is in steps too.
-The dynamics are those of :mod:`combrel_envs.mountain_car_dynamics`; MuJoCo stores the state and draws it.
+along two axes, ``climb_6d`` the car with a third axis. One control step is one second of simulated time, so that the default
+time limit, 4000, is in steps too. The dynamics are those of :mod:`combrel_envs.mountain_car_dynamics`; MuJoCo stores the state
+and draws it.
 """
 
 import collections
@@ -38,10 +39,11 @@ def climb_2d(
     time_limit: float = _DEFAULT_TIME_LIMIT,
     random: np.random.RandomState | int | None = None,
     start: str = "offset",
+    action_noise: float = 0.0,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> control.Environment:
     """Returns the Mountain Car task with state (x, v): climb the right hill."""
-    return _climb(1, time_limit, random, start, environment_kwargs)
+    return _climb(1, time_limit, random, start, action_noise, environment_kwargs)
 
 
 @SUITE.add("benchmarking")
@@ -49,10 +51,23 @@ def climb_4d(
     time_limit: float = _DEFAULT_TIME_LIMIT,
     random: np.random.RandomState | int | None = None,
     start: str = "offset",
+    action_noise: float = 0.0,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> control.Environment:
     """Returns the Mountain Car task with state (x, y, vx, vy): climb the hill in the north-east corner."""
-    return _climb(2, time_limit, random, start, environment_kwargs)
+    return _climb(2, time_limit, random, start, action_noise, environment_kwargs)
+
+
+@SUITE.add("benchmarking")
+def climb_6d(
+    time_limit: float = _DEFAULT_TIME_LIMIT,
+    random: np.random.RandomState | int | None = None,
+    start: str = "offset",
+    action_noise: float = 0.0,
+    environment_kwargs: dict[str, Any] | None = None,
+) -> control.Environment:
+    """Returns the Mountain Car task with state (x, y, z, vx, vy, vz): reach the upper end of all three axes together."""
+    return _climb(3, time_limit, random, start, action_noise, environment_kwargs)
 
 
 def _climb(
@@ -60,14 +75,15 @@ def _climb(
     time_limit: float,
     random: np.random.RandomState | int | None,
     start: str,
+    action_noise: float,
     environment_kwargs: dict[str, Any] | None,
 ) -> control.Environment:
-    task = Climb(start=start, random=random)
+    task = Climb(start=start, random=random, action_noise=action_noise)
     return control.Environment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
 
 
 def make_physics(n_axes: int) -> "Physics":
-    """Returns the `Physics` of a car on one axis (2D) or on two (4D)."""
+    """Returns the `Physics` of a car on one axis (2D), on two (4D) or on three (6D)."""
     return Physics.from_xml_string(*get_model_and_assets(n_axes))
 
 
@@ -76,7 +92,7 @@ class Physics(mujoco.Physics):
 
     @property
     def n_axes(self) -> int:
-        """Number of axes along which the car moves: 1 in 2D, 2 in 4D."""
+        """Number of axes along which the car moves: 1 in 2D, 2 in 4D, 3 in 6D."""
         return self.model.nq
 
     def car_position(self) -> np.ndarray:
@@ -111,10 +127,12 @@ class Physics(mujoco.Physics):
         self.forward()
 
     def forward(self) -> None:
-        """Moves the drawn car to the position of the state, and updates MuJoCo's derived quantities."""
-        position, rotation = scene.car_pose(tuple(self.data.qpos.tolist()), tuple(self.data.qvel.tolist()))
-        self.data.mocap_pos[0] = position
-        mujoco_bindings.mju_mat2Quat(self.data.mocap_quat[0], rotation.ravel())
+        """Moves the drawn cars, one a ground, to the position of the state, and updates MuJoCo's derived quantities."""
+        positions, velocities = tuple(self.data.qpos.tolist()), tuple(self.data.qvel.tolist())
+        for i, (body, axes) in enumerate(scene.GROUNDS[self.n_axes].items()):
+            position, rotation = scene.car_pose(positions[axes], velocities[axes])
+            self.data.mocap_pos[i] = position + self.model.body_pos[self.model.name2id(body, "body")]
+            mujoco_bindings.mju_mat2Quat(self.data.mocap_quat[i], rotation.ravel())
         super().forward()
 
     def render(self, *args: Any, **kwargs: Any) -> np.ndarray:
@@ -126,7 +144,7 @@ class Physics(mujoco.Physics):
 class Climb(base.Task):
     """A Mountain Car `Task`: reach the goal. The reward is -1 on every step, the last included."""
 
-    def __init__(self, start: str = "offset", random: np.random.RandomState | int | None = None):
+    def __init__(self, start: str = "offset", random: np.random.RandomState | int | None = None, action_noise: float = 0.0):
         """Initializes an instance of `Climb`.
 
         Args:
@@ -134,8 +152,10 @@ class Climb(base.Task):
             same on every axis), "fixed" (at rest at the bottom) or "random" (anywhere but at the goal, at any velocity).
           random: Optional, either a `numpy.random.RandomState` instance, an integer seed for creating a new `RandomState`,
             or None to select a seed automatically (default).
+          action_noise: Probability with which a random action, drawn from all, is executed instead of the one that was chosen.
         """
         self._start = dynamics.check_start(start)
+        self._action_noise = dynamics.check_action_noise(action_noise)
         super().__init__(random=random)
 
     def initialize_episode(self, physics: Physics) -> None:
@@ -148,8 +168,11 @@ class Climb(base.Task):
         return dm_env.specs.DiscreteArray(len(dynamics.PUSHES[physics.n_axes]), dtype=np.int64, name="action")
 
     def before_step(self, action: Any, physics: Physics) -> None:
-        """Sets the control to the push of the engine that the action stands for."""
-        physics.set_control(dynamics.push_of(action, physics.n_axes))
+        """Sets the control to the push of the engine that the action stands for, or to another by the noise."""
+        push = dynamics.push_of(action, physics.n_axes)
+        if self._action_noise:
+            push = dynamics.noisy_push(push, self._action_noise, self.random.uniform)
+        physics.set_control(push)
 
     def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
         """Returns the state: the car's position and velocity."""

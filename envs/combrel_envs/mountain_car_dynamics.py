@@ -1,15 +1,17 @@
 """The equations of Mountain Car, in plain Python floats.
 
 Both interfaces of the environment, dm_control's and Gymnasium's, step the car with :func:`step_car`: there is one set of
-equations. This module needs neither NumPy nor MuJoCo: for two to four scalars Python's floats are several times faster than
+equations. This module needs neither NumPy nor MuJoCo: for two to six scalars Python's floats are several times faster than
 arrays.
 
-A state is a pair ``(positions, velocities)`` of tuples with one float an axis: ``((x,), (v,))`` or ``((x, y), (vx, vy))``.
+A state is a pair ``(positions, velocities)`` of tuples with one float an axis: ``((x,), (v,))``, ``((x, y), (vx, vy))`` or
+``((x, y, z), (vx, vy, vz))``.
 """
 
 import math
 import operator
 from collections.abc import Callable
+from numbers import Real
 from typing import SupportsIndex
 
 MIN_POSITION = -1.2
@@ -24,16 +26,24 @@ MAX_EPISODE_STEPS = 4000
 
 STARTS = ("offset", "fixed", "random")
 
-#: For each number of axes: what each action adds to the velocities, in units of ``ENGINE``.
-PUSHES: dict[int, tuple[tuple[float, ...], ...]] = {
-    1: ((0.0,), (-1.0,), (1.0,)),
-    2: ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)),
-}
+
+def _pushes(n_axes: int) -> tuple[tuple[float, ...], ...]:
+    along_axes = (tuple(sign if i == axis else 0.0 for i in range(n_axes)) for axis in range(n_axes) for sign in (-1.0, 1.0))
+    return ((0.0,) * n_axes, *along_axes)
+
+
+#: For each number of axes: what each action adds to the velocities, in units of ``ENGINE``: nothing, or -1 or 1 on one axis.
+PUSHES: dict[int, tuple[tuple[float, ...], ...]] = {n_axes: _pushes(n_axes) for n_axes in (1, 2, 3)}
 ACTION_NAMES: dict[int, tuple[str, ...]] = {
     1: ("Neutral", "Left", "Right"),
     2: ("Neutral", "West", "East", "South", "North"),
+    3: ("Neutral", "West", "East", "South", "North", "Down", "Up"),
 }
-STATE_NAMES: dict[int, tuple[str, ...]] = {1: ("x", "v"), 2: ("x", "y", "vx", "vy")}
+STATE_NAMES: dict[int, tuple[str, ...]] = {
+    1: ("x", "v"),
+    2: ("x", "y", "vx", "vy"),
+    3: ("x", "y", "z", "vx", "vy", "vz"),
+}
 
 Axes = tuple[float, ...]
 State = tuple[Axes, Axes]
@@ -80,7 +90,7 @@ def push_of(action: SupportsIndex, n_axes: int) -> Axes:
     Look up the push of the engine that an action stands for.
 
     :param action: number of an action, any integer type
-    :param n_axes: number of axes, 1 or 2
+    :param n_axes: number of axes, 1, 2 or 3
     :return: what the engine does on each axis
     :raises ValueError: when there is no such action
     """
@@ -117,13 +127,41 @@ def check_start(start: str) -> str:
     return start
 
 
+def check_action_noise(action_noise: float) -> float:
+    """
+    Check a probability of random actions.
+
+    :param action_noise: the probability that a user gave
+    :return: the same probability
+    :raises ValueError: if it is not a number from 0 to 1
+    """
+    if not (isinstance(action_noise, Real) and not isinstance(action_noise, bool) and 0 <= action_noise <= 1):
+        raise ValueError(f"action_noise must be a probability, a number from 0 to 1, got {action_noise!r}")
+    return float(action_noise)
+
+
+def noisy_push(push: Axes, action_noise: float, uniform: Callable[[float, float], float]) -> Axes:
+    """
+    Draw what the engine does if its actions are noisy.
+
+    :param push: push of the action that was chosen
+    :param action_noise: probability with which a random action, drawn from all, is executed instead
+    :param uniform: draws a number between two bounds (the method of a NumPy generator)
+    :return: push of the action that is executed
+    """
+    if uniform(0.0, 1.0) >= action_noise:
+        return push
+    pushes = PUSHES[len(push)]
+    return pushes[int(uniform(0.0, len(pushes)))]
+
+
 def sample_start(start: str, n_axes: int, uniform: Callable[[float, float], float]) -> State:
     """
     Draw the state in which an episode begins.
 
     :param start: ``"offset"``: at rest at the bottom of the valley, moved by one offset, the same on every axis;
         ``"fixed"``: at rest exactly at the bottom; ``"random"``: anywhere but at the goal, at any velocity
-    :param n_axes: number of axes, 1 or 2
+    :param n_axes: number of axes, 1, 2 or 3
     :param uniform: draws a number between two bounds (the method of a NumPy generator)
     :return: the state
     """

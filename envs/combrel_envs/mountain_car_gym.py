@@ -15,13 +15,15 @@ if TYPE_CHECKING:
 
 class MountainCarEnv(RenderedEnv):
     """
-    Common base class of the 2D and the 4D car; see :class:`MountainCar2DEnv` and :class:`MountainCar4DEnv`.
+    Common base class of the 2D, 4D and 6D car; see :class:`MountainCar2DEnv`, :class:`MountainCar4DEnv` and
+    :class:`MountainCar6DEnv`.
 
     :param start: where an episode begins: ``"offset"``, ``"fixed"`` or ``"random"``
     :param render_mode: ``"rgb_array"`` or None
     :param width: width of a frame in pixels
     :param height: height of a frame in pixels
     :param camera: name of one of ``cameras``; the first of them if None
+    :param action_noise: probability with which a random action, drawn from all, is executed instead of the one that was chosen
     :raises ValueError: when an argument isn't one of these
     """
 
@@ -34,9 +36,11 @@ class MountainCarEnv(RenderedEnv):
         width: int = 640,
         height: int = 480,
         camera: str | None = None,
+        action_noise: float = 0.0,
     ) -> None:
         super().__init__(render_mode, width, height, camera)
         self._start = dynamics.check_start(start)
+        self._action_noise = dynamics.check_action_noise(action_noise)
         self._state: dynamics.State | None = None
         self._physics: Physics | None = None
         self._low, self._high = _bounds(self.n_axes)
@@ -80,7 +84,10 @@ class MountainCarEnv(RenderedEnv):
             wrapper), and a dictionary with ``is_success``
         :raises ValueError: when there is no such action
         """
-        state = dynamics.step_car(*self._running_state(), dynamics.push_of(action, self.n_axes))
+        push = dynamics.push_of(action, self.n_axes)
+        if self._action_noise:
+            push = dynamics.noisy_push(push, self._action_noise, self.np_random.uniform)
+        state = dynamics.step_car(*self._running_state(), push)
         self._state = state
         terminated = dynamics.at_goal(state[0])
         return self._observation(state), -1.0, terminated, False, {"is_success": terminated}
@@ -193,6 +200,8 @@ class MountainCar2DEnv(MountainCarEnv):
 
     - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
       goal, any velocity, uniformly).
+    - `action_noise`: probability with which a random action, drawn from all, is executed instead of the one that was chosen; 0
+      by default. The seed of `reset` decides it.
     - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
     - `width`, `height`: size of the pictures, 640 x 480 by default.
     - `camera`: `"side"` (the default) or `"close"`, which follows the car.
@@ -283,6 +292,8 @@ class MountainCar4DEnv(MountainCarEnv):
 
     - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
       goal, any velocities, uniformly).
+    - `action_noise`: probability with which a random action, drawn from all, is executed instead of the one that was chosen; 0
+      by default. The seed of `reset` decides it.
     - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
     - `width`, `height`: size of the pictures, 640 x 480 by default.
     - `camera`: `"perspective"` (the default), `"top"`, or `"close"`, which follows the car.
@@ -298,6 +309,102 @@ class MountainCar4DEnv(MountainCarEnv):
     n_axes = 2
     state_names = dynamics.STATE_NAMES[2]
     action_names = dynamics.ACTION_NAMES[2]
+    cameras = ("perspective", "top", "close")
+
+
+class MountainCar6DEnv(MountainCarEnv):
+    """
+    ## Description
+
+    A car stands at the bottom of a basin with hills along three axes, of height sin(3x) + sin(3y) + sin(3z). Its engine is
+    weaker than gravity and pushes along one axis at a time; the goal is the upper end of all three. The axes move
+    independently, each as in `combrel/MountainCar2D-v0`, but must be at the goal together: `combrel/MountainCar4D-v0` with one
+    axis more. Pictures show x and y as in 4D, and z as a second car on a strip in front of it.
+
+    ```python
+    import gymnasium
+    import combrel_envs
+
+    env = gymnasium.make("combrel/MountainCar6D-v0")
+    ```
+
+    ## Observation Space
+
+    A `Box` of float32 with shape (6,); `env.unwrapped.state` is the same in float64.
+
+    | Num | Observation              | Name | Min   | Max  |
+    |-----|--------------------------|------|-------|------|
+    | 0   | position, west to east   | x    | -1.2  | 0.6  |
+    | 1   | position, south to north | y    | -1.2  | 0.6  |
+    | 2   | position, down to up     | z    | -1.2  | 0.6  |
+    | 3   | velocity along x         | vx   | -0.07 | 0.07 |
+    | 4   | velocity along y         | vy   | -0.07 | 0.07 |
+    | 5   | velocity along z         | vz   | -0.07 | 0.07 |
+
+    ## Action Space
+
+    `Discrete(7)`.
+
+    | Num | Action  | Push along x | Push along y | Push along z |
+    |-----|---------|--------------|--------------|--------------|
+    | 0   | Neutral | 0            | 0            | 0            |
+    | 1   | West    | -1           | 0            | 0            |
+    | 2   | East    | +1           | 0            | 0            |
+    | 3   | South   | 0            | -1           | 0            |
+    | 4   | North   | 0            | +1           | 0            |
+    | 5   | Down    | 0            | 0            | -1           |
+    | 6   | Up      | 0            | 0            | +1           |
+
+    ## Transition Dynamics
+
+    For x, and in the same way for y and z; gravity acts on all three on every step:
+
+    vx' = vx + 0.001 push - 0.0025 cos(3x), clipped to [-0.07, 0.07]
+
+    x' = x + vx', clipped to [-1.2, 0.6]
+
+    At a wall a velocity that points into the wall becomes 0.
+
+    ## Rewards
+
+    -1 on every step, the last included.
+
+    ## Starting State
+
+    At rest at the bottom of the basin, x = y = z = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset
+    and is the same for x, y and z. The argument `start` changes this.
+
+    ## Episode End
+
+    - Termination: x >= 0.5, y >= 0.5 and z >= 0.5.
+    - Truncation: after 4000 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
+      this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
+      truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
+
+    `info["is_success"]` is True if the car is at the goal after the step. From the bottom the goal can be reached in 200
+    steps, which the tests replay; whether fewer are possible isn't known.
+
+    ## Arguments
+
+    - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
+      goal, any velocities, uniformly).
+    - `action_noise`: probability with which a random action, drawn from all, is executed instead of the one that was chosen; 0
+      by default. The seed of `reset` decides it.
+    - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
+    - `width`, `height`: size of the pictures, 640 x 480 by default.
+    - `camera`: `"perspective"` (the default), `"top"`, or `"close"`, which follows the car of x and y.
+
+    `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, y, z, vx, vy, vz]}`, to
+    begin in exactly that state.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    n_axes = 3
+    state_names = dynamics.STATE_NAMES[3]
+    action_names = dynamics.ACTION_NAMES[3]
     cameras = ("perspective", "top", "close")
 
 

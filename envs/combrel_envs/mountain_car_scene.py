@@ -1,7 +1,10 @@
 """The pictures of Mountain Car: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
 
 The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale of the picture (heights do not enter the
-dynamics). The meshes are computed from these formulas when a scene is built, so the picture agrees with the task.
+dynamics). In 6D there are two pieces of ground, each with a car: the surface of 4D for x and y, and in front of it the strip
+of 2D for z. The meshes are computed from these formulas when a scene is built, so the picture agrees with the task.
+
+Except in :func:`model_and_assets` and in ``GROUNDS``, ``n_axes`` is the number of axes of one piece of ground: 1 or 2.
 """
 
 import functools
@@ -14,6 +17,12 @@ from PIL import Image
 
 from combrel_envs import mountain_car_dynamics as dynamics
 
+#: For each task's number of axes: the bodies of the scene that carry a piece of ground, and the axes that each of them shows.
+GROUNDS: dict[int, dict[str, slice]] = {
+    1: {"world": slice(0, 1)},
+    2: {"world": slice(0, 2)},
+    3: {"world": slice(0, 2), "track": slice(2, 3)},
+}
 #: Height of the picture's hills for each number of axes. One third in 2D is the true scale: gravity along the slope of
 #: sin(3x) / 3 is proportional to cos(3x).
 HEIGHT_SCALE = {1: 1 / 3, 2: 0.2}
@@ -66,7 +75,7 @@ def model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
     """
     Build the scene.
 
-    :param n_axes: number of axes, 1 or 2
+    :param n_axes: the task's number of axes, 1, 2 or 3
     :return: the MJCF model and the files that it includes, as ``Physics.from_xml_string`` takes them
     """
     return (_ASSETS / f"mountain_car_{2 * n_axes}d.xml").read_bytes(), dict(_assets(n_axes))
@@ -74,24 +83,30 @@ def model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
 
 @functools.cache
 def _assets(n_axes: int) -> dict[str, bytes]:
-    return {
-        "mountain_car_common.xml": (_ASSETS / "mountain_car_common.xml").read_bytes(),
-        "ground.obj": _ground_mesh(n_axes),
-        "soil.obj": _soil_mesh(n_axes),
-        "ground.png": _png(_ground_texture(n_axes)),
-        "soil.png": _png(_soil_texture()),
-    }
+    vehicle = (_ASSETS / "mountain_car_vehicle.xml").read_bytes()
+    assets = {"mountain_car_common.xml": (_ASSETS / "mountain_car_common.xml").read_bytes(), "soil.png": _png(_soil_texture())}
+    for body, axes in GROUNDS[n_axes].items():
+        n_shown = axes.stop - axes.start
+        assets |= {
+            # MuJoCo includes no file twice: each car has a copy of it under a name of its own.
+            f"{body}_vehicle.xml": vehicle,
+            f"{body}_ground.obj": _ground_mesh(n_shown),
+            f"{body}_soil.obj": _soil_mesh(n_shown),
+            f"{body}_ground.png": _png(_ground_texture(n_shown)),
+        }
+    return assets
 
 
 def car_pose(positions: dynamics.Axes, velocities: dynamics.Axes) -> tuple[np.ndarray, np.ndarray]:
     """
-    Compute the pose in which the car is drawn: wheels on the ground, roof along the ground's normal.
+    Compute the pose in which a car is drawn on its ground: wheels on the ground, roof along the ground's normal.
 
     In 2D the nose points right, as the car can reverse; in 4D it points in the direction of motion (north-east at rest).
 
-    :param positions: position on each axis
-    :param velocities: velocity on each axis
-    :return: position, and rotation as a matrix whose columns are the car's nose, left side and roof
+    :param positions: position on each axis of this ground
+    :param velocities: velocity on each axis of this ground
+    :return: position relative to the body that carries the ground, and rotation as a matrix whose columns are the car's nose,
+        left side and roof
     """
     n_axes = len(positions)
     x, y = (positions[0], 0.0) if n_axes == 1 else positions

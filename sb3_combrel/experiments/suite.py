@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments.statistics import TESTS
-from sb3_combrel.experiments.suite_report import cells_of, format_number, overview_table, task_table
+from sb3_combrel.experiments.suite_report import cells_of, format_number, frozen_table, overview_table, task_table
 from sb3_combrel.experiments.suite_runs import SOURCES, SuiteRun, Variant, carry_out, records, write_csv
 from sb3_combrel.experiments.suite_tasks import TASKS, Task, tasks_of
 from sb3_combrel.experiments.suite_transfers import check_transfer
@@ -176,7 +176,8 @@ def _write_tables(
     rows = [record["row"] for record in records(runs[0].folder) if record["row"]["run"] in names]
     cells = cells_of(rows, tasks, variants, reference, test)
     overview = overview_table(cells, tasks, variants)
-    tables = [overview, *(task_table(cells, task, variants, f"p against {reference}") for task in tasks)]
+    frozen = frozen_table(cells, tasks, variants)
+    tables = [overview, frozen, *(task_table(cells, task, variants, f"p against {reference}") for task in tasks)]
     (runs[0].folder / TABLES).write_text("\n".join(table.as_markdown() for table in tables))
     console.print(overview.for_terminal())
 

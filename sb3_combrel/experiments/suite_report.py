@@ -9,8 +9,11 @@ import numpy as np
 
 from sb3_combrel.experiments.report import Table
 from sb3_combrel.experiments.statistics import holm, p_value_of_difference
+from sb3_combrel.experiments.suite_runs import WITH_STATE, WITHOUT_STATE
 from sb3_combrel.experiments.suite_tasks import Task
 
+#: Prefixes of the columns of evaluation, see :mod:`~sb3_combrel.experiments.suite_runs`.
+POLICIES = (WITH_STATE, WITHOUT_STATE)
 #: Columns of every task besides its own measures, with whether more is better.
 COMMON = {
     "ms_per_step": False,
@@ -18,10 +21,11 @@ COMMON = {
     "last10_failed": False,
     **{
         f"{policy}_{column}": better
-        for policy in ("greedy", "stateless")
+        for policy in POLICIES
         for column, better in (("mean", True), ("worst", True), ("failures", False), ("as_good", True))
     },
 }
+COLUMNS_OF_ALL = tuple(COMMON)
 #: Not tested: it depends on the machine.
 UNTESTED = ("ms_per_step",)
 
@@ -98,6 +102,28 @@ def overview_table(cells: dict[tuple[str, str, str], Cell], tasks: Sequence[Task
         rows.append((task.name, task.headline, *("" if cell is None else cell.mean() + _mark(cell) for cell in found)))
     title = "Mean over the seeds and its standard error (*: p < 0.05 against the reference, by Holm's correction)"
     return Table(title, ("task", "measure", *variants), rows)
+
+
+def frozen_table(cells: dict[tuple[str, str, str], Cell], tasks: Sequence[Task], variants: Sequence[str]) -> Table:
+    """Make a table with a row for each task and variant: how good the frozen policy is, compared with the learning agent."""
+    rows = []
+    for task in tasks:
+        for variant in variants:
+            if (task.name, COLUMNS_OF_ALL[0], variant) not in cells:
+                continue
+            own = {column: cells[task.name, column, variant] for column in COLUMNS_OF_ALL}
+            row = [task.name, variant, own["last10_return"].mean()]
+            for policy in POLICIES:
+                n_good, n_seeds = np.nansum(own[f"{policy}_as_good"].values), len(own[f"{policy}_as_good"].values)
+                row += [own[f"{policy}_mean"].mean(), own[f"{policy}_worst"].worst(), f"{n_good:.0f} of {n_seeds}"]
+            stuck = np.sum(own["last10_failed"].values == 1.0)
+            rows.append((*row, f"{stuck:.0f}", own["ms_per_step"].mean()))
+    header = ("task", "variant", "last 10 of learning", "greedy", "worst", "as good", "without state", "worst", "as good")
+    title = (
+        "Returns of the frozen policy; as good: no failure and at most 5% below the last 10 episodes of learning; "
+        "stuck: runs whose last 10 episodes of learning all failed"
+    )
+    return Table(title, (*header, "stuck", "ms a step"), rows)
 
 
 def task_table(cells: dict[tuple[str, str, str], Cell], task: Task, variants: Sequence[str], compared: str) -> Table:

@@ -18,6 +18,7 @@ from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import NOBODY, PlainValueFunction, Prediction, QValues
 from sb3_combrel.planning.sweeping import NOWHERE, Planner
+from sb3_combrel.planning.visits import Visits
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
 # Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
@@ -108,6 +109,7 @@ class FittedRMaxAgent:
             self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=self.settings.planning_tolerance
         )
         self._set_corrections(CorrectionArrays.empty(self.task.n_variables))
+        self.visits = Visits(self.task.n_variables, self.grid.n_points)
         self._outdated: list[np.ndarray] = []
 
     def _set_corrections(self, corrections: CorrectionArrays) -> None:
@@ -150,12 +152,22 @@ class FittedRMaxAgent:
         if given is not None:
             assert self.transfer is not None
             self.transfer.note_use(given)
+        else:
+            self._note_visit(state, prediction)
         visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)
         if best >= 0:
             return best
         ties = np.flatnonzero(self._q.q == self._q.q.max())
         return int(ties[self.rng.integers(len(ties))])
+
+    def _note_visit(self, state: np.ndarray, prediction: Prediction) -> None:
+        """Let grid points beside which all has been known often enough count as known (see ``planning.visits``)."""
+        threshold, n_optimistic = self.model.exploration_threshold, self.mdp.arrays.n_optimistic
+        points = self.visits.note(state, prediction.weight, threshold, n_optimistic, self.grid.plain)
+        if len(points):
+            pairs = (np.arange(self.task.n_actions)[:, None] * self.grid.n_points + points).reshape(-1)
+            self._outdated.append(self.model.accept(pairs))
 
     def _exploit(self, state: np.ndarray, memory: EpisodeMemory | None) -> int:
         mode = EXPLOIT if memory is None else memory.mode
@@ -228,6 +240,7 @@ class FittedRMaxAgent:
             if self.transfer is not None:
                 self.transfer.end_episode(truncated)
                 self._outdated.append(self.model.outdated())
+            self._outdated.append(self.model.end_episode())
             self._plan(AT_EPISODE_END * self.max_backups)
 
     def _lowered_threshold(self) -> float:
@@ -261,6 +274,8 @@ class FittedRMaxAgent:
     def _update_and_plan(self, max_backups: int, around: np.ndarray) -> None:
         """Update the rows of the pairs that changed, and plan; longer where transfer changed many pairs at once."""
         changed = NO_PAIRS if self.transfer is None else self._changed_by(self.transfer)
+        if self.transfer is not None and self.transfer.use == "prior":
+            changed = self.model.renew_prior()
         passes = 0
         if len(changed):
             self._outdated.append(changed)
@@ -311,6 +326,7 @@ class FittedRMaxAgent:
                 "lowest_value": np.array([self.planner.bounds[0]]),
                 "n_truncated": np.array([float(self.n_truncated)]),
                 "corrections": self.corrections.rows(),
+                "visits": self.visits.counts.astype(np.float64),
             }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
@@ -328,6 +344,7 @@ class FittedRMaxAgent:
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
             self.planner.restore(state["values"])
             self._set_corrections(CorrectionArrays.of_rows(state["corrections"]))
+            self.visits.counts[:] = state["visits"]
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

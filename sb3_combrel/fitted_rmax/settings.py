@@ -14,7 +14,7 @@ from sb3_combrel.models.local_linear import LocalLinear
 # By default so many corners of grid cells are looked at in a step: a backup costs as much as a cell has corners.
 CORNERS_A_STEP = 400
 # By degree of the local model and number of state variables, the last one for more.
-DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.1, 0.1, 0.25, 0.4, 0.4, 0.5)}
+DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
 DEFAULT_NEIGHBORS = (16, 16, 24, 40, 40, 60)
 DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
@@ -35,7 +35,7 @@ class FittedRMaxSettings:
     degree: int = 0
     model_breadth: float | None = None
     n_neighbors: int | None = None
-    outcome_breadth: float = 0.1
+    outcome_breadth: float = 0.05
     min_fraction: float = 0.1
     min_weight: float | None = None
     exploration_threshold: float = 1.0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from sb3_combrel.common.instances import Instances, put_instance_at
+from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances, check_transferred
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
@@ -37,7 +38,7 @@ class ModelSettings:
     exploration_threshold: float
     max_instances: int | None = None
     n_neighbors: int = 40
-    outcome_breadth: float = 0.1
+    outcome_breadth: float = 0.05
 
 
 class Predictions(NamedTuple):
@@ -58,11 +59,20 @@ class Predictions(NamedTuple):
 class InstanceTransfer(Protocol):
     """What a model knows of a transfer method (see ``sb3_combrel.transfer.base.Transfer``)."""
 
+    #: "instances" or "prior": which of the methods below are called.
+    use: str
+
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         """Transferred instances for states, unit coordinates, and actions."""
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         """The same for states of the finite sample, by number."""
+
+    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
+        """What the source predicts of states, unit coordinates, and actions."""
+
+    def prior_version(self) -> int:
+        """A number that grows when what ``prior`` returns may have changed."""
 
 
 class Model(ABC):
@@ -78,6 +88,9 @@ class Model(ABC):
     :param settings: see :class:`ModelSettings`
     :param transfer: where to get instances for pairs that are not known
     """
+
+    #: Whether a transfer method may give the mean that the target's own instances are fitted to (``use="prior"``).
+    takes_prior: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp = mdp
@@ -172,6 +185,32 @@ class Model(ABC):
         newly_known = np.flatnonzero(~self.known & (self.own_weight >= threshold))
         self.known[newly_known] = True
         return newly_known
+
+    def accept(self, pairs: np.ndarray) -> np.ndarray:
+        """
+        Let pairs count as known from what instances they have.
+
+        :return: those that become known by that, whose rows are to be updated
+        """
+        newly_known = pairs[~self.known[pairs] & (self.own_weight[pairs] > 0.0)]
+        self.known[newly_known] = True
+        return newly_known
+
+    def renew_prior(self) -> np.ndarray:
+        """
+        Ask the transfer method for its prior again if that may have changed.
+
+        :return: the pairs whose rows are to be updated; none unless ``takes_prior``
+        """
+        return NO_PAIRS
+
+    def end_episode(self) -> np.ndarray:
+        """
+        Do what may wait until the end of an episode.
+
+        :return: the pairs whose rows are to be updated; by default none
+        """
+        return NO_PAIRS
 
     def outdated(self) -> np.ndarray:
         """The pairs that are not known and whose own weight has changed since their rows were updated; by default none."""

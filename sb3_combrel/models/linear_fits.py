@@ -19,29 +19,45 @@ PER_BREADTH = -np.log(LAST_WEIGHT)
 # No narrower than this fraction of ``model_breadth``: all instances may be at the very same state.
 NARROWEST = 0.02
 RIDGE = 0.01
-# A pair is fitted again once what new instances leave unexplained may move its prediction by this much, and its row is
-# written again when the prediction has moved by half of it; in parts of the range of the action's effects.
-MAX_UNEXPLAINED = 0.05
+# What the linear fit leaves unexplained of the instances nearest to a state, as at a wall, is added to its prediction, as if
+# there were so much weight of instances besides that it explains.
+EXPLAINED_WEIGHT = 0.5
+# A prior's prediction counts as so much weight of instances that agree with it, and for rewards and ends as so much weight of
+# the narrower kernel.
+PRIOR_WEIGHT = 0.5
+PRIOR_OUTCOME_WEIGHT = 0.1
+# Within an episode a pair is fitted again once what new instances leave unexplained may move its prediction by the first,
+# and its row is written again when the prediction has moved by the second; in parts of the size of the action's effects.
+MAX_UNEXPLAINED = 0.1
+TOLERANCE = 0.05
+# A variable that hardly ever changes is measured by this part of a cell.
+LEAST_SCALE = 0.02
 
 
 class LinearFits(NamedTuple):
     """The local linear fit of each pair of the grid (pair ``action * n_points + point``).
 
     :param sums: float64, shape (n_pairs, n_products): see ``common.linear_regression``
-    :param outcome: float64, shape (n_pairs, 3): sums of narrower weights, of these times reward, and times termination
+    :param outcome: float64, shape (n_pairs, 3 + 2 * n_variables): sums of narrower weights, and of these times reward,
+        termination, state and effect
     :param fit: float64, shape (n_pairs, n_variables + n_variables ** 2): intercept and slopes
     :param row: float64, shape (n_pairs, n_variables + 2): effect, reward and probability of termination in the pair's row
-    :param unexplained: float64, shape (n_pairs,): by how much instances that came after the fit may change its prediction
+    :param unexplained: float64, shape (n_pairs,): by how much instances that came after the fit may change its prediction;
+        inf without a fit
     :param reach: float64, shape (n_pairs,): squared distance up to which instances count
     :param scale: float64, shape (n_pairs,): -1 / breadth ** 2 of the pair's kernel
-    :param count: int32, shape (n_pairs,): instances that count
+    :param n_counted: int32, shape (n_pairs,): instances that count
     :param limit: int32, shape (n_pairs,): more than this, and the kernel narrows
     :param total: float64, shape (n_pairs,): sum of the weights (of breadth ``model_breadth``) of all that counted
     :param last_total: float64, shape (n_pairs,): what ``total`` was when the pair's row was updated
     :param known: bool, shape (n_pairs,)
+    :param claimed: bool, shape (n_pairs,): the prior suffices for a model
     :param target: float64, shape (n_actions, capacity, n_variables): effect of each instance less the prior's
-    :param prior: float64, shape (n_pairs, n_variables): effect that the prior predicts; 0 without one
-    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
+    :param prior: float64, shape (n_pairs, n_variables + 2): effect, reward and probability of termination that the prior
+        predicts; 0 without one
+    :param effect_range: float64, shape (3, n_actions, n_variables): least and largest effect that was seen or is predicted
+        by the prior; and the sum of the sizes of those that were seen
+    :param effect_scale: float64, shape (n_actions, n_variables): what a difference of effects is measured by
     """
 
     sums: np.ndarray
@@ -51,14 +67,16 @@ class LinearFits(NamedTuple):
     unexplained: np.ndarray
     reach: np.ndarray
     scale: np.ndarray
-    count: np.ndarray
+    n_counted: np.ndarray
     limit: np.ndarray
     total: np.ndarray
     last_total: np.ndarray
     known: np.ndarray
+    claimed: np.ndarray
     target: np.ndarray
     prior: np.ndarray
     effect_range: np.ndarray
+    effect_scale: np.ndarray
 
 
 class FitScratch(NamedTuple):
@@ -69,7 +87,7 @@ class FitScratch(NamedTuple):
     :param factor: float64, shape (n_variables, n_variables)
     :param nearest: float64, shape (n_neighbors,): squared distances
     :param along: float64, shape (n_variables, largest axis of the grid): squared distances along one variable
-    :param range: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
+    :param span: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
     :param point: int64, shape (n_points,): points within reach; ``distance``: float64, same shape: squared distances
     """
 
@@ -78,7 +96,7 @@ class FitScratch(NamedTuple):
     factor: np.ndarray
     nearest: np.ndarray
     along: np.ndarray
-    range: np.ndarray
+    span: np.ndarray
     point: np.ndarray
     distance: np.ndarray
 
@@ -113,7 +131,7 @@ def points_within(state, reach, widest, grid, scratch):
     :param reach: float64, shape (n_points,): squared distances; none is above ``widest``
     :return: how many; they are in ``scratch.point`` and ``scratch.distance``
     """
-    first, last, at = scratch.range[0], scratch.range[1], scratch.range[2]
+    first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]
     d = len(state)
     radius = np.sqrt(widest) * (1 + 1e-12)
     for k in range(d):
@@ -169,7 +187,25 @@ def count_instance(fits, pair, distance, products, reward, terminated, kernel, s
     outcome[1] += near * reward
     if terminated:
         outcome[2] += near
+    d = (len(outcome) - 3) // 2
+    effects = 1 + d + d * (d + 1) // 2
+    for k in range(d):
+        outcome[3 + k] += near * products[1 + k]
+        outcome[3 + d + k] += near * products[effects + k]
     return weight / sums[0], near / outcome[0]
+
+
+@inlined
+def unexplained_effect(fit, outcome, k):
+    """The part of effect ``k`` that a linear fit leaves unexplained of the instances nearest to a state.
+
+    :param outcome: as in :class:`LinearFits`
+    """
+    d = (len(outcome) - 3) // 2
+    effect = outcome[3 + d + k] - fit[k] * outcome[0]
+    for j in range(d):
+        effect -= fit[d + j * d + k] * outcome[3 + j]
+    return effect / (outcome[0] + EXPLAINED_WEIGHT)
 
 
 @inlined
@@ -183,9 +219,7 @@ def contradiction(fits, pair, instances, action, slot, shares):
     most = 0.0
     for k in range(d):
         apart = abs(fits.target[action, slot, k] - fitted_effect(fits.fit[pair], state, k))
-        spread = fits.effect_range[1, action, k] - fits.effect_range[0, action, k]
-        if apart > most * spread:
-            most = apart / spread if spread > 0.0 else 0.0
+        most = max(most, apart / fits.effect_scale[action, k])
     reward, end = fits.row[pair, d], fits.row[pair, d + 1]
     seen = instances.reward[action, slot]
     of_reward = abs(seen - reward) / max(1e-12, abs(seen) + abs(reward))
@@ -220,7 +254,7 @@ def recount(instances, fits, pair, action, kernel, scratch):
             count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
             total += np.exp(distance * kernel.scale)
             count += 1
-    fits.count[pair] = count
+    fits.n_counted[pair] = count
     # Many instances at one state: to look for narrower kernels again and again would be in vain.
     n = kernel.n_neighbors
     fits.limit[pair] = max(n + n // 2, 2 * count if count > n + n // 4 else 0)
@@ -266,17 +300,15 @@ def narrow(instances, fits, pair, action, kernel, scratch):
 
 
 @inlined
-def prediction_moved(fits, pair, action, at):
-    """Put what the fit predicts into ``fits.row`` if that differs from before by more than a little; whether it does."""
+def prediction_moved(fits, pair, action, at, tolerance):
+    """Put what the fit predicts into ``fits.row`` if that differs from before by more than ``tolerance``; whether it does."""
     d = len(at)
     row, outcome = fits.row[pair], fits.outcome[pair]
-    tolerance = 0.5 * MAX_UNEXPLAINED
-    reward = outcome[1] / outcome[0]
-    end = outcome[2] / outcome[0]
+    reward, end = mean_outcome(outcome, fits.prior[pair], fits.claimed[pair])
     moved = abs(reward - row[d]) > tolerance * abs(reward) or abs(end - row[d + 1]) > tolerance
     for k in range(d):
-        spread = fits.effect_range[1, action, k] - fits.effect_range[0, action, k]
-        moved = moved or abs(mean_effect(fits, pair, action, at, k) - row[k]) > tolerance * spread
+        apart = abs(mean_effect(fits, pair, action, at, k) - row[k])
+        moved = moved or apart > tolerance * fits.effect_scale[action, k]
     if moved:
         for k in range(d):
             row[k] = mean_effect(fits, pair, action, at, k)
@@ -286,34 +318,48 @@ def prediction_moved(fits, pair, action, at):
 
 
 @inlined
+def mean_outcome(outcome, prior, claimed):
+    """Reward and probability of termination from the narrower sums, and from the prior if it claims to know them."""
+    d = len(prior) - 2
+    weight = PRIOR_OUTCOME_WEIGHT if claimed else 0.0
+    total = outcome[0] + weight
+    return (outcome[1] + weight * prior[d]) / total, (outcome[2] + weight * prior[d + 1]) / total
+
+
+@inlined
 def mean_effect(fits, pair, action, at, k):
     """Effect ``k`` that a pair's fit predicts at its point, within the range of the effects seen."""
-    effect = fits.prior[pair, k] + fitted_effect(fits.fit[pair], at, k)
+    fit = fits.fit[pair]
+    effect = fitted_effect(fit, at, k) + unexplained_effect(fit, fits.outcome[pair], k)
+    if fits.claimed[pair]:
+        effect *= fits.sums[pair, 0] / (fits.sums[pair, 0] + PRIOR_WEIGHT)
+    effect += fits.prior[pair, k]
     return min(max(effect, fits.effect_range[0, action, k]), fits.effect_range[1, action, k])
 
 
 @inner
-def refit(fits, pair, action, grid, scratch):
-    """Solve the regression of a pair; whether its row is to be updated."""
+def refit(fits, pair, action, grid, scratch, tolerance):
+    """Solve the regression of a pair; whether its row is to be updated (see :func:`prediction_moved`)."""
     unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
     solve_regression(fits.sums[pair], -RIDGE / fits.scale[pair], scratch.factor, fits.fit[pair])
     fits.unexplained[pair] = 0.0
-    return prediction_moved(fits, pair, action, scratch.at)
+    return prediction_moved(fits, pair, action, scratch.at, tolerance)
 
 
 @inner
 def narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch):
     """:func:`refit` with a narrower kernel if too many instances count."""
-    if fits.count[pair] > fits.limit[pair]:
+    if fits.n_counted[pair] > fits.limit[pair]:
         unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
         narrow(instances, fits, pair, action, kernel, scratch)
-    return refit(fits, pair, action, grid, scratch)
+    return refit(fits, pair, action, grid, scratch, TOLERANCE)
 
 
 @part
-def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
+def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
     """Write an instance to its slot, and count it for all pairs that it reaches.
 
+    :param prior: float64, shape (n_variables,): effect that the prior predicts of it
     :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
         row is to be updated, 0: never)
     :param transition: (action, slot, state, next_state, reward, terminated)
@@ -327,9 +373,12 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
     state = instances.state[action, slot]
     for k in range(len(state)):
         effect = instances.effect[action, slot, k]
-        fits.target[action, slot, k] = effect
+        fits.target[action, slot, k] = effect - prior[k]
         fits.effect_range[0, action, k] = min(fits.effect_range[0, action, k], effect)
         fits.effect_range[1, action, k] = max(fits.effect_range[1, action, k], effect)
+        fits.effect_range[2, action, k] += abs(effect)
+        mean_size = fits.effect_range[2, action, k] / instances.size[action]
+        fits.effect_scale[action, k] = max(2.0 * mean_size, LEAST_SCALE / grid.cells[k])
     products = scratch.products[0]
     products_of(state, fits.target[action, slot], products)
     n_found = points_within(state, fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch)
@@ -339,19 +388,22 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
         pair = first_pair + point
         distance = scratch.distance[f]
         shares = count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
-        fits.count[pair] += 1
-        if fits.known[pair]:
-            fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, shares)
-            if fits.unexplained[pair] <= MAX_UNEXPLAINED and fits.count[pair] <= fits.limit[pair]:
-                continue
-            if not narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch):
-                continue
-        else:
+        fits.n_counted[pair] += 1
+        if not fits.known[pair]:
             fits.total[pair] += np.exp(distance * kernel.scale)
             if fits.total[pair] >= threshold:
                 fits.known[pair] = True
-                narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch)
-            elif min_change == 0.0 or abs(fits.total[pair] - fits.last_total[pair]) < min_change:
+                fits.unexplained[pair] = np.inf
+        if fits.known[pair] or fits.claimed[pair]:
+            fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, shares)
+            if fits.unexplained[pair] <= MAX_UNEXPLAINED and fits.n_counted[pair] <= fits.limit[pair]:
+                continue
+            first = fits.unexplained[pair] == np.inf
+            if not narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch) and not first:
+                continue
+        else:
+            fits.unexplained[pair] = np.inf
+            if min_change == 0.0 or abs(fits.total[pair] - fits.last_total[pair]) < min_change:
                 continue
         scratch.point[changed] = point
         changed += 1
@@ -359,10 +411,10 @@ def enter(instances, fits, grid, kernel, thresholds, transition, scratch):
 
 
 @compiled
-def enter_plain(instances, fits, grid, kernel, thresholds, transition, scratch):
+def enter_plain(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
     """:func:`enter` for callers from Python, with plain tuples."""
     instances, fits, grid = Instances(*instances), LinearFits(*fits), GridArrays(*grid)
-    return enter(instances, fits, grid, Kernel(*kernel), thresholds, transition, FitScratch(*scratch))
+    return enter(instances, fits, grid, Kernel(*kernel), thresholds, transition, prior, FitScratch(*scratch))
 
 
 @compiled
@@ -375,6 +427,8 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     first_pair = action * n_points
     state = instances.state[action, slot]
     reward, terminated = instances.reward[action, slot], instances.terminated[action, slot]
+    for k in range(len(state)):
+        fits.effect_range[2, action, k] -= abs(instances.effect[action, slot, k])
     products = scratch.products[0]
     products_of(state, fits.target[action, slot], products)
     n_found = points_within(state, fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch)
@@ -382,8 +436,8 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     for f in range(n_found):
         pair = first_pair + scratch.point[f]
         count_instance(fits, pair, scratch.distance[f], products, reward, terminated, kernel, -1.0)
-        fits.count[pair] -= 1
-        if fits.count[pair] <= 0:
+        fits.n_counted[pair] -= 1
+        if fits.n_counted[pair] <= 0:
             fits.sums[pair, :] = 0.0
             fits.outcome[pair, :] = 0.0
             fits.total[pair] = 0.0
@@ -394,8 +448,28 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
 
 
 @compiled
+def refit_changed(fits, grid, scratch, changed):
+    """Fit all pairs again that have had instances since the last time; how many rows are to be updated.
+
+    :param changed: int64, shape (n_pairs,): receives these pairs
+    """
+    n_points = grid.shape[0] * grid.strides[0]
+    n = 0
+    for pair in range(len(fits.total)):
+        if fits.unexplained[pair] == 0.0 or not (fits.known[pair] or fits.claimed[pair]) or fits.n_counted[pair] == 0:
+            continue
+        if refit(fits, pair, pair // n_points, grid, scratch, 0.0):
+            changed[n] = pair
+            n += 1
+    return n
+
+
+@compiled
 def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
-    """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known."""
+    """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known.
+
+    :param threshold: weight that makes a pair known
+    """
     n_points = grid.shape[0] * grid.strides[0]
     for pair in range(len(fits.total)):
         action = pair // n_points
@@ -404,8 +478,15 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
         fits.total[pair] = total
         if total >= threshold:
             fits.known[pair] = True
-        if fits.count[pair] > 0:
-            refit(fits, pair, action, grid, scratch)
+        if fits.n_counted[pair] > 0:
+            refit(fits, pair, action, grid, scratch, 0.0)
+
+
+@inlined
+def predict_from_prior(fits, pair):
+    """Put what the prior predicts into ``fits.row``: no instance counts for the pair."""
+    for k in range(fits.row.shape[1]):
+        fits.row[pair, k] = fits.prior[pair, k]
 
 
 @part
@@ -422,19 +503,22 @@ def update_rows(fits, mdp, grid, gamma, pairs, transferred, scratch, fit_scratch
     while done < len(pairs):
         pair = pairs[done]
         n_transferred = 0 if fits.known[pair] else transferred.length[done]
-        modelled = fits.known[pair] or n_transferred > 0
+        modelled = fits.known[pair] or fits.claimed[pair] or n_transferred > 0
         if modelled:
             point = pair % n_points
             coordinates_of(point, grid, scratch.at)
-            own = fits.total[pair] if fits.count[pair] > 0 else 0.0
+            own = fits.total[pair] if fits.n_counted[pair] > 0 else 0.0
+            if own == 0.0 and fits.claimed[pair]:
+                predict_from_prior(fits, pair)
+                own = 1.0
             total = own
             for j in range(n_transferred):
                 total += transferred.weight[done, j]
             reward = 0.0
             n_touched = np.int64(0)
             if own > 0.0:
-                if not fits.known[pair]:
-                    refit(fits, pair, pair // n_points, grid, fit_scratch)
+                if fits.unexplained[pair] == np.inf and fits.n_counted[pair] > 0:
+                    refit(fits, pair, pair // n_points, grid, fit_scratch, 0.0)
                 row = fits.row[pair]
                 reward = own / total * row[d]
                 if row[d + 1] < 1.0:

@@ -9,7 +9,14 @@ from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import measure_gaps, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.linear_fits import RIDGE, Kernel, narrowed
+from sb3_combrel.models.linear_fits import (
+    PRIOR_WEIGHT,
+    RIDGE,
+    Kernel,
+    mean_outcome,
+    narrowed,
+    unexplained_effect,
+)
 from sb3_combrel.planning.q_values import Prediction
 
 
@@ -20,7 +27,7 @@ class NearestLists(NamedTuple):
     :param distance: float64, same shape: their squared distances
     :param length: int64, shape (n_actions,)
     :param products: float64, shape (2, n_products): sums, and of one instance
-    :param factor: float64, shape (n_variables, n_variables); ``fit``: as in ``LinearFits``
+    :param factor: float64, shape (n_variables, n_variables); ``fit`` and ``outcome``: as in ``LinearFits``, of one pair
     """
 
     item: np.ndarray
@@ -29,6 +36,7 @@ class NearestLists(NamedTuple):
     products: np.ndarray
     factor: np.ndarray
     fit: np.ndarray
+    outcome: np.ndarray
 
 
 @inlined
@@ -95,17 +103,16 @@ def fit_nearest(instances, target, action, state, kernel, near):
     """Fit the effect around ``state`` to the instances in ``near``; into ``near.fit``.
 
     :param target: as in ``LinearFits``
-    :return: sum of their weights (of breadth ``model_breadth``), reward, probability of termination
+    :return: sum of their weights (of breadth ``model_breadth``)
     """
     length = near.length[action]
     nearest, last = near.distance[action, 0], near.distance[action, length - 1]
     scale = narrowed(last, kernel) if length == kernel.n_neighbors else kernel.scale
-    sums, products = near.products[0], near.products[1]
+    sums, products, outcome = near.products[0], near.products[1], near.outcome
     sums[:] = 0.0
+    outcome[:] = 0.0
+    d = len(state)
     total = 0.0
-    outcomes = 0.0
-    reward = 0.0
-    end = 0.0
     for k in range(length):
         i = near.item[action, k]
         distance = near.distance[action, k]
@@ -114,34 +121,54 @@ def fit_nearest(instances, target, action, state, kernel, near):
         total += np.exp(distance * kernel.scale)
         # Seen from the nearest: far from all instances the weights would be too small for a quotient.
         weight = np.exp((distance - nearest) * kernel.outcome_scale)
-        outcomes += weight
-        reward += weight * instances.reward[action, i]
+        outcome[0] += weight
+        outcome[1] += weight * instances.reward[action, i]
         if instances.terminated[action, i]:
-            end += weight
+            outcome[2] += weight
+        for v in range(d):
+            outcome[3 + v] += weight * instances.state[action, i, v]
+            outcome[3 + d + v] += weight * target[action, i, v]
+    closeness = max(1e-200, np.exp(nearest * kernel.outcome_scale))
+    for k in range(len(outcome)):
+        outcome[k] *= closeness
     solve_regression(sums, -RIDGE / scale, near.factor, near.fit)
-    return total, reward / outcomes, end / outcomes
+    return total
 
 
 @inlined
-def enter_mean(prediction, action, p, fit, state, prior, effect_range):
-    """Write the successor of an action, the mean of what is predicted, within the range of the effects seen."""
-    prediction.probability[action, 0] = p
-    for v in range(len(state)):
-        effect = prior[action, v] + fitted_effect(fit, state, v)
+def enter_mean(prediction, action, near, state, prior, claimed, effect_range):
+    """Enter what is predicted of an action: reward, end, and the mean of its successors, within the range of effects.
+
+    :param prior: float64, shape (n_variables + 2,): effect, reward and end that the prior predicts
+    :param claimed: whether the prior suffices for a model
+    """
+    d = len(state)
+    if near.length[action] > 0:
+        reward, end = mean_outcome(near.outcome, prior, claimed)
+        share = near.products[0, 0] / (near.products[0, 0] + (PRIOR_WEIGHT if claimed else 0.0))
+    else:
+        reward, end, share = prior[d], prior[d + 1], 0.0
+    prediction.reward[action] = reward
+    prediction.length[action] = 1 if end < 1.0 else 0
+    prediction.probability[action, 0] = 1.0 - end
+    for v in range(d):
+        effect = prior[v]
+        if share > 0.0:
+            effect += share * (fitted_effect(near.fit, state, v) + unexplained_effect(near.fit, near.outcome, v))
         prediction.effect[action, 0, v] = min(max(effect, effect_range[0, action, v]), effect_range[1, action, v])
 
 
 @part
 def predict_own(instances, of_model, state, kernel, threshold, near, prediction):
-    """Predict every action at ``state`` from the instances nearest to it.
+    """Predict every action at ``state`` from the instances nearest to it, and from the prior.
 
-    :param of_model: (target, effect_range) as in ``LinearFits``, and the effects that the prior predicts at ``state``,
-        float64, shape (n_actions, n_variables)
+    :param of_model: (target, effect_range) as in ``LinearFits``; what the prior predicts at ``state``, float64, shape
+        (n_actions, n_variables + 2); and whether that suffices for a model, bool, shape (n_actions,)
     :param near: receives these instances; those of the last query make the search shorter
-    :param prediction: receives the prediction; an action of less weight than ``threshold`` has no model
+    :param prediction: receives the prediction; an action of less weight than ``threshold`` has no model without the prior
     :return: the least weight that an action has
     """
-    target, effect_range, prior = of_model
+    target, effect_range, prior, claimed = of_model
     least = np.inf
     for action in range(len(near.length)):
         item = near.item[action]
@@ -152,13 +179,11 @@ def predict_own(instances, of_model, state, kernel, threshold, near, prediction)
         prediction.reward[action] = 0.0
         prediction.length[action] = 0
         if n > 0:
-            total, reward, end = fit_nearest(instances, target, action, state, kernel, near)
-            prediction.reward[action] = reward
-            if end < 1.0:
-                enter_mean(prediction, action, 1.0 - end, near.fit, state, prior, effect_range)
-                prediction.length[action] = 1
+            total = fit_nearest(instances, target, action, state, kernel, near)
+        if n > 0 or claimed[action]:
+            enter_mean(prediction, action, near, state, prior[action], claimed[action], effect_range)
         prediction.weight[action] = total
-        prediction.modelled[action] = total >= threshold
+        prediction.modelled[action] = total >= threshold or claimed[action]
         least = min(least, total)
     return least
 

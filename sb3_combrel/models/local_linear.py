@@ -9,7 +9,17 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import n_products
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
-from sb3_combrel.models.linear_fits import FitScratch, Kernel, LinearFits, enter_plain, leave, recount_pairs, update_rows_plain
+from sb3_combrel.models.linear_fits import (
+    LEAST_SCALE,
+    FitScratch,
+    Kernel,
+    LinearFits,
+    enter_plain,
+    leave,
+    recount_pairs,
+    refit_changed,
+    update_rows_plain,
+)
 from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
@@ -18,8 +28,14 @@ from sb3_combrel.planning.q_values import Prediction
 # transferred instances is updated within an episode.
 MIN_CHANGE = 0.5
 
+# Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
+# values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
+# would make the states beside them look good for ever.
+ON_GRID = 0.5
+
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
+_refit_changed = EntryPoint(refit_changed)
 _join_transferred = EntryPoint(join_transferred_plain)
 
 
@@ -39,11 +55,19 @@ class LocalLinear(Model):
     again as ``n_neighbors`` its kernel narrows, and the sums are computed anew. With ``max_instances``, the nearest instance
     of the same action is replaced.
 
+    With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and pairs
+    that it claims to know are modelled before their own instances suffice.
+
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
+    takes_prior = True
+
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
+        self._prior = transfer if transfer is not None and transfer.use == "prior" else None
+        # Where instances come from for pairs that are not known.
+        self._giver = None if self._prior is not None else transfer
         grid = self.grid
         d, n_points, n_pairs, n_near = grid.n_variables, grid.n_points, len(self.known), settings.n_neighbors
         breadth = float(settings.model_breadth)
@@ -57,20 +81,22 @@ class LocalLinear(Model):
         self._set_fits(
             LinearFits(
                 sums=np.zeros((n_pairs, n_products(d))),
-                outcome=np.zeros((n_pairs, 3)),
+                outcome=np.zeros((n_pairs, 3 + 2 * d)),
                 fit=np.zeros((n_pairs, d + d * d)),
                 row=np.zeros((n_pairs, d + 2)),
-                unexplained=np.zeros(n_pairs),
+                unexplained=np.full(n_pairs, np.inf),
                 reach=np.full(n_pairs, self._kernel.reach),
                 scale=np.full(n_pairs, self._kernel.scale),
-                count=np.zeros(n_pairs, dtype=np.int32),
+                n_counted=np.zeros(n_pairs, dtype=np.int32),
                 limit=np.full(n_pairs, n_near + n_near // 2, dtype=np.int32),
                 total=self.own_weight,
                 last_total=np.zeros(n_pairs),
                 known=self.known,
+                claimed=np.zeros(n_pairs, dtype=np.bool_),
                 target=np.empty((self.n_actions, self.instances.capacity, d)),
-                prior=np.zeros((n_pairs, d)),
-                effect_range=np.stack([np.full((self.n_actions, d), np.inf), np.full((self.n_actions, d), -np.inf)]),
+                prior=np.zeros((n_pairs, d + 2)),
+                effect_range=np.zeros((3, self.n_actions, d)),
+                effect_scale=np.ones((self.n_actions, d)),
             )
         )
         self._scratch = FitScratch(
@@ -79,11 +105,12 @@ class LocalLinear(Model):
             factor=np.empty((d, d)),
             nearest=np.empty(n_near),
             along=np.empty((d, int(grid.arrays.shape.max()))),
-            range=np.empty((3, d), dtype=np.int64),
+            span=np.empty((3, d), dtype=np.int64),
             point=np.empty(n_points, dtype=np.int64),
             distance=np.empty(n_points),
         )
         self._plain_scratch = tuple(self._scratch)
+        self._renew_targets()
         self._near = NearestLists(
             item=np.empty((self.n_actions, n_near), dtype=np.int32),
             distance=np.empty((self.n_actions, n_near)),
@@ -91,9 +118,12 @@ class LocalLinear(Model):
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             fit=np.empty(d + d * d),
+            outcome=np.empty(3 + 2 * d),
         )
         self._plain_near = tuple(self._near)
-        self._prior_here = np.zeros((self.n_actions, d))
+        self._prior_version = -1
+        self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
+        self._all_actions = np.arange(self.n_actions)
         self._make_prediction(1)
         self._nothing = TransferredInstances.empty(1, d)
 
@@ -123,15 +153,15 @@ class LocalLinear(Model):
             has changed enough; the others may wait (see :meth:`outdated`)
         """
         slot, emptied = self._slot_for(state, action)
-        threshold = self.exploration_threshold
-        thresholds = threshold, 0.0 if self.transfer is None else MIN_CHANGE * threshold
+        min_change = 0.0 if self._giver is None else MIN_CHANGE * self.exploration_threshold
         n_changed = _enter.call(
             self._plain_instances,
             self._plain_fits,
             self.grid.plain,
             self._plain_kernel,
-            thresholds,
+            (self._threshold_on_grid(), min_change),
             (action, slot, state, next_state, reward, terminated),
+            self._prior_at(state[None], np.array([action]))[0][0],
             self._plain_scratch,
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
@@ -152,6 +182,53 @@ class LocalLinear(Model):
             self._set_fits(self.fits._replace(target=target))
         return size, NO_PAIRS
 
+    def _prior_at(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the prior predicts: effects, reward and end, shape (n, n_variables + 2); and whether it claims to know."""
+        if self._prior is None:
+            return self._no_prior
+        given = self._prior.prior(states, actions)
+        return np.column_stack([given.effect, given.reward, given.end]), given.weight >= self.settings.exploration_threshold
+
+    def renew_prior(self) -> np.ndarray:
+        if self._prior is None or self._prior.prior_version() == self._prior_version:
+            return NO_PAIRS
+        self._prior_version = self._prior.prior_version()
+        fits, n_points = self.fits, self.grid.n_points
+        points = self.grid.points()
+        for action in range(self.n_actions):
+            pairs = slice(action * n_points, (action + 1) * n_points)
+            fits.prior[pairs], fits.claimed[pairs] = self._prior_at(points, np.full(n_points, action))
+        self._renew_targets()
+        _recount.call(self.instances, fits, self.grid.arrays, self._kernel, self._threshold_on_grid(), self._scratch)
+        return np.arange(len(self.known))
+
+    def _renew_targets(self) -> None:
+        """Compute what the prior leaves over of each instance's effect, and the range of effects."""
+        fits, instances, d = self.fits, self.instances, self.grid.n_variables
+        fits.effect_range[0], fits.effect_range[1], fits.effect_range[2] = np.inf, -np.inf, 0.0
+        for action, size in enumerate(instances.size.tolist()):
+            effects = instances.effect[action, :size]
+            fits.target[action, :size] = effects
+            # One after the other, as they came.
+            fits.effect_range[2, action] = np.cumsum(np.abs(effects), axis=0)[-1] if size else 0.0
+            mean_size = fits.effect_range[2, action] / max(1, size)
+            fits.effect_scale[action] = np.maximum(2.0 * mean_size, LEAST_SCALE / self.grid.arrays.cells)
+            if self._prior is not None and size:
+                fits.target[action, :size] -= self._prior_at(instances.state[action, :size], np.full(size, action))[0][:, :d]
+            of_grid = fits.prior[action * self.grid.n_points : (action + 1) * self.grid.n_points, :d]
+            effects = effects if self._prior is None else np.vstack([effects, of_grid])
+            if len(effects):
+                fits.effect_range[0, action], fits.effect_range[1, action] = effects.min(axis=0), effects.max(axis=0)
+
+    def _threshold_on_grid(self) -> float:
+        return ON_GRID * self.exploration_threshold
+
+    def end_episode(self) -> np.ndarray:
+        """Fit all pairs again that have had instances since the last time."""
+        changed = np.empty(len(self.known), dtype=np.int64)
+        n = _refit_changed.call(self.fits, self.grid.arrays, self._scratch, changed)
+        return changed[:n]
+
     def outdated(self) -> np.ndarray:
         return np.flatnonzero(~self.fits.known & (self.fits.total != self.fits.last_total))
 
@@ -169,7 +246,7 @@ class LocalLinear(Model):
 
     def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
         """Transferred instances for pairs; known ones need none."""
-        if self.transfer is None or self.known[pairs].all():
+        if self._giver is None or self.known[pairs].all():
             if len(self._nothing.length) < len(pairs):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
@@ -177,7 +254,7 @@ class LocalLinear(Model):
         # Of a known pair the full threshold, so that no method has work with it; it may have been lowered.
         full = self.settings.exploration_threshold
         own_weight = np.where(self.known[pairs], np.maximum(full, self.own_weight[pairs]), self.own_weight[pairs])
-        given = self.transfer.transferred_to_sample(points, actions, own_weight)
+        given = self._giver.transferred_to_sample(points, actions, own_weight)
         self._check(given, own_weight)
         return given
 
@@ -192,7 +269,11 @@ class LocalLinear(Model):
 
     def _predict_own(self, state: np.ndarray) -> float:
         """Fill the prediction from the own instances; the least weight that an action has."""
-        of_model = self.fits.target, self.fits.effect_range, self._prior_here
+        if self._prior is None:
+            prior, claimed = self._no_prior
+        else:
+            prior, claimed = self._prior_at(np.repeat(state[None], self.n_actions, axis=0), self._all_actions)
+        of_model = self.fits.target, self.fits.effect_range, prior, claimed
         near, prediction = self._plain_near, self._plain_prediction
         threshold = self.exploration_threshold
         return float(
@@ -200,11 +281,11 @@ class LocalLinear(Model):
         )
 
     def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
-        if self._predict_own(state) >= self.exploration_threshold or self.transfer is None:
+        if self._predict_own(state) >= self.exploration_threshold or self._giver is None:
             return self._prediction, None
-        actions = np.arange(self.n_actions)
+        actions = self._all_actions
         states = np.repeat(state[None], self.n_actions, axis=0)
-        given = self.transfer.transferred(states, actions, self._prediction.weight)
+        given = self._giver.transferred(states, actions, self._prediction.weight)
         self._check(given, self._prediction.weight)
         room = 1 + given.weight.shape[1]
         if room > self._prediction.probability.shape[1]:
@@ -223,12 +304,9 @@ class LocalLinear(Model):
         fits = self.fits
         fits.reach[:] = state["reach"]
         fits.known[:] = state["known"] > 0.5
-        target = np.ascontiguousarray(instances.effect)
-        self._set_fits(fits._replace(target=target))
-        for action, size in enumerate(instances.size.tolist()):
-            if size:
-                fits.effect_range[0, action] = instances.effect[action, :size].min(axis=0)
-                fits.effect_range[1, action] = instances.effect[action, :size].max(axis=0)
-        _recount.call(self.instances, self.fits, self.grid.arrays, self._kernel, self.exploration_threshold, self._scratch)
+        self._set_fits(fits._replace(target=np.empty_like(instances.effect)))
+        if len(self.renew_prior()) == 0:
+            self._renew_targets()
+            _recount.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._threshold_on_grid(), self._scratch)
         fits.total[:] = state["total"]
         self.update_all_rows()

@@ -62,8 +62,8 @@ class Transfer(ABC):
     task: TargetTask | None = None
     rng: np.random.Generator
 
-    #: How it is used: "instances": :meth:`transferred` is asked where the target's own instances do not suffice; or "prior":
-    #: :meth:`prior` is asked for what the target's own instances are fitted to the remainder of, and `transferred` never.
+    #: How the model uses the source: "instances": as instances that join the target's own where these do not suffice; "prior":
+    #: as the mean that they are fitted to, see :meth:`prior`.
     use: str = "instances"
 
     #: Arguments of the constructor under the names that they had before: a file may still have them.

@@ -15,7 +15,7 @@ from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
 DEFAULT_SOURCE_BREADTH = 0.2
 DEFAULT_N_NEIGHBORS = 24
 # Rewards and ends jump from one state to the next: they are averaged over nearer instances.
-DEFAULT_OUTCOME_BREADTH = 0.1
+DEFAULT_OUTCOME_BREADTH = 0.05
 
 
 class SourceArrays(NamedTuple):
@@ -168,6 +168,7 @@ class SourceModel:
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             fit=np.empty(d + d * d),
+            outcome=np.empty(3 + 2 * d),
         )
         # Plain tuples for compiled code (see ``common.compiled``).
         self.arrays = SourceArrays(tuple(instances), effect_range, tuple(self.kernel), tuple(near))

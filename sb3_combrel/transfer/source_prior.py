@@ -88,7 +88,7 @@ class SourcePrior:
         self._uses: Counter[tuple[int, ...]] = Counter()
         self._candidates: list[tuple[int, ...]] = []
         self.choice: Choice | None = None
-        self._stored: tuple[np.ndarray, np.ndarray, Predicted] | None = None
+        self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
         if isinstance(choose, Choice):
             self._set_choice(choose)
 
@@ -118,15 +118,18 @@ class SourcePrior:
         return self.transfer_terminals and self.outcomes.confirmed > 0
 
     def _raw(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
-        """Predictions and coverage. Of many pairs, those asked for last are stored: what they claim changes more often."""
+        """Predictions and coverage. Those of many pairs at once are stored: what is claimed of them changes more often."""
         if len(actions) < MANY:
             return self.copies.predict(self._used, self._work_space, states, actions)
-        if self._stored is not None:
-            last_states, last_actions, predicted = self._stored
+        asked = len(actions), int(actions[0]), int(actions[-1])
+        if asked in self._stored:
+            last_states, last_actions, predicted = self._stored[asked]
             if np.array_equal(last_actions, actions) and np.array_equal(last_states, states):
                 return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
         predicted = self.copies.predict(self._used, self._work_space, states, actions)
-        self._stored = states.copy(), actions.copy(), predicted
+        if len(self._stored) > self.task.n_actions:
+            self._stored.clear()
+        self._stored[asked] = states.copy(), actions.copy(), predicted
         return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
 
     # ----------------------------------------------------------------- observing
@@ -208,7 +211,7 @@ class SourcePrior:
         self.choice = choice
         self._used = self.copies.uses(*choice)
         self._work_space = self.copies.work_space(self._used)
-        self._stored = None
+        self._stored.clear()
 
     def _replay(self) -> None:
         """Count anew what confirms and contradicts the ends and rewards that are predicted through another mapping."""

@@ -79,6 +79,18 @@ class TestDmControl:
         normal = np.array([-0.6 * math.cos(3 * x), -0.6 * math.cos(3 * y), 1])
         np.testing.assert_allclose(roof, normal / np.linalg.norm(normal), atol=1e-9)
 
+    def test_in_6d_a_second_car_shows_the_third_axis(self):
+        physics = combrel_envs.load("mountain_car", "climb_6d").physics
+        with physics.reset_context():
+            physics.set_car((0.1, -0.9, 0.3), (0.03, 0.0, 0.0))
+        places = physics.named.data.xpos
+        x, y, _ = places["car"]
+        z, across, height = places["track_car"] - places["track"]
+        assert (x, y) == (0.1, -0.9)
+        assert (z, across) == pytest.approx((0.3, 0.0)) and abs(height - math.sin(3 * z) / 3) < 0.01
+        assert (places["track_goal"] - places["track"])[[0, 2]] == pytest.approx((0.5, math.sin(1.5) / 3), abs=1e-3)
+        assert places["goal"] == pytest.approx((0.5, 0.5, 0.4 * math.sin(1.5)), abs=1e-3)
+
     @pytest.mark.parametrize("n_axes", [1, 2])
     def test_the_flag_stands_where_the_goal_begins(self, n_axes):
         physics = combrel_envs.load("mountain_car", f"climb_{2 * n_axes}d").physics
@@ -91,7 +103,7 @@ class TestDmControl:
         ("arguments", "message"),
         [
             (("mountain_bike", "climb_2d"), "domain must be one of 'mountain_car'"),
-            (("mountain_car", "climb"), "must be one of 'climb_2d', 'climb_4d', got 'climb'"),
+            (("mountain_car", "climb"), "must be one of 'climb_2d', 'climb_4d', 'climb_6d', got 'climb'"),
             (("mountain_car", "climb_2d", {"start": "top"}), "start must be one of"),
         ],
     )

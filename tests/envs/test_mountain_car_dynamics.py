@@ -3,7 +3,19 @@
 import gymnasium
 import numpy as np
 import pytest
-from helpers.mountain_cars import ID_2D, ID_4D, IDS, PLANS, TASKS, actions_of, env_in, expected_step, possible_states
+from helpers.mountain_cars import (
+    ID_2D,
+    ID_4D,
+    ID_6D,
+    IDS,
+    N_AXES,
+    PLANS,
+    TASKS,
+    actions_of,
+    env_in,
+    expected_step,
+    possible_states,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,15 +23,12 @@ import combrel_envs
 
 
 class TestDynamics:
-    @given(state=possible_states(2), action=st.integers(0, 4))
-    def test_a_step_in_4d_follows_the_equations(self, state, action):
-        env = env_in(ID_4D, state)
-        env.step(action)
-        np.testing.assert_allclose(env.unwrapped.state, expected_step(state, action), rtol=0, atol=1e-15)
-
-    @given(state=possible_states(1), action=st.integers(0, 2))
-    def test_a_step_in_2d_follows_the_equations(self, state, action):
-        env = env_in(ID_2D, state)
+    @pytest.mark.parametrize("env_id", IDS)
+    @given(data=st.data())
+    def test_a_step_follows_the_equations(self, env_id, data):
+        state = data.draw(possible_states(N_AXES[env_id]))
+        action = data.draw(st.integers(0, 2 * N_AXES[env_id]))
+        env = env_in(env_id, state)
         env.step(action)
         np.testing.assert_allclose(env.unwrapped.state, expected_step(state, action), rtol=0, atol=1e-15)
 
@@ -51,16 +60,18 @@ class TestDynamics:
             positions, velocities = np.split(env.unwrapped.state, 2)
             assert np.all((positions >= -1.2) & (positions <= 0.6) & (np.abs(velocities) <= 0.07))
 
-    @given(state=possible_states(2), action=st.integers(0, 2))
-    def test_a_step_along_one_axis_does_not_depend_on_the_other(self, state, action):
-        x, y, vx, vy = state
-        plane, line = env_in(ID_4D, state), env_in(ID_2D, [x, vx])
-        plane.step(action)
-        line.step(action)
-        assert plane.unwrapped.state[[0, 2]].tolist() == line.unwrapped.state.tolist()
-        line.reset(options={"state": [y, vy]})
-        line.step(0)
-        assert plane.unwrapped.state[[1, 3]].tolist() == line.unwrapped.state.tolist()
+    @pytest.mark.parametrize("env_id", [ID_4D, ID_6D])
+    @given(data=st.data())
+    def test_every_axis_moves_as_a_car_in_2d(self, env_id, data):
+        n_axes = N_AXES[env_id]
+        state = data.draw(possible_states(n_axes))
+        pushed, direction = data.draw(st.integers(0, n_axes - 1)), data.draw(st.integers(1, 2))
+        env = env_in(env_id, state)
+        env.step(2 * pushed + direction)
+        for axis in range(n_axes):
+            line = env_in(ID_2D, state[axis::n_axes])
+            line.step(direction if axis == pushed else 0)
+            assert env.unwrapped.state[axis::n_axes].tolist() == line.unwrapped.state.tolist()
 
     def test_the_left_wall_stops_the_car(self):
         env = env_in(ID_2D, [-1.19, -0.05])
@@ -92,7 +103,7 @@ class TestDynamics:
 
 
 class TestPlans:
-    @pytest.mark.parametrize(("env_id", "length"), [(ID_2D, 103), (ID_4D, 146)])
+    @pytest.mark.parametrize(("env_id", "length"), [(ID_2D, 103), (ID_4D, 146), (ID_6D, 200)])
     def test_a_known_plan_reaches_the_goal_on_its_last_step(self, env_id, length):
         env = gymnasium.make(env_id, start="fixed")
         env.reset()
@@ -117,8 +128,82 @@ class TestPlans:
             assert time_step.reward == -1.0
         assert terminated
 
-    def test_one_axis_at_the_goal_isnt_enough_in_4d(self):
-        env = env_in(ID_4D, [0.55, 0.3, 0.0, 0.0])
-        assert not env.step(0)[2]
-        env.reset(options={"state": [0.55, 0.55, 0.0, 0.0]})
-        assert env.step(0)[2]
+    @pytest.mark.parametrize("env_id", [ID_4D, ID_6D])
+    def test_every_axis_must_be_at_the_goal(self, env_id):
+        n_axes = N_AXES[env_id]
+        still = [0.0] * n_axes
+        for missing in range(n_axes):
+            env = env_in(env_id, [0.3 if axis == missing else 0.55 for axis in range(n_axes)] + still)
+            assert not env.step(0)[2]
+        assert env_in(env_id, [0.55] * n_axes + still).step(0)[2]
+
+
+class TestActionNoise:
+    """In the middle of the slope the velocity after one step tells which action was executed."""
+
+    STEPS = 2000
+
+    @staticmethod
+    def executed(states, n_axes):
+        place = [-0.5] * n_axes + [0.0] * n_axes
+        outcomes = [expected_step(place, action) for action in range(2 * n_axes + 1)]
+        return np.array([np.argmin([np.abs(state - outcome).sum() for outcome in outcomes]) for state in states])
+
+    def gymnasium_actions(self, env_id, action_noise, action, seed=0):
+        env = gymnasium.make(env_id, action_noise=action_noise)
+        env.reset(seed=seed)
+        states = []
+        for _ in range(self.STEPS):
+            env.reset(options={"state": [-0.5] * N_AXES[env_id] + [0.0] * N_AXES[env_id]})
+            env.step(action)
+            states.append(env.unwrapped.state)
+        return self.executed(states, N_AXES[env_id])
+
+    def dm_control_actions(self, env_id, action_noise, action, seed=0):
+        n_axes = N_AXES[env_id]
+        task_kwargs = {"action_noise": action_noise, "random": seed}
+        environment = combrel_envs.load("mountain_car", TASKS[env_id], task_kwargs, {"flat_observation": True})
+        environment.reset()
+        states = []
+        for _ in range(self.STEPS):
+            environment.physics.set_car([-0.5] * n_axes, [0.0] * n_axes)
+            states.append(environment.step(action).observation["observations"])
+        return self.executed(states, n_axes)
+
+    @pytest.mark.parametrize("env_id", IDS)
+    @pytest.mark.parametrize("interface", ["gymnasium_actions", "dm_control_actions"])
+    def test_random_actions_come_with_the_given_probability(self, env_id, interface):
+        n_actions = 2 * N_AXES[env_id] + 1
+        shares = np.bincount(getattr(self, interface)(env_id, 0.4, 1), minlength=n_actions) / self.STEPS
+        expected = np.full(n_actions, 0.4 / n_actions)
+        expected[1] += 0.6
+        # Four standard deviations.
+        np.testing.assert_array_less(np.abs(shares - expected), 4 * np.sqrt(expected * (1 - expected) / self.STEPS))
+
+    def test_a_seed_decides_the_random_actions(self):
+        first, same, other = (self.gymnasium_actions(ID_6D, 0.5, 0, seed).tolist() for seed in (1, 1, 2))
+        assert first == same != other
+
+    @pytest.mark.parametrize("interface", ["gymnasium_actions", "dm_control_actions"])
+    def test_without_noise_the_chosen_action_is_executed(self, interface):
+        assert set(getattr(self, interface)(ID_6D, 0.0, 5).tolist()) == {5}
+
+    def test_without_noise_no_random_numbers_are_drawn(self):
+        env = gymnasium.make(ID_4D)
+        env.reset(seed=0)
+        before = env.unwrapped.np_random.bit_generator.state
+        env.step(2)
+        assert env.unwrapped.np_random.bit_generator.state == before
+
+    def test_impossible_actions_are_errors_with_noise_too(self):
+        env = gymnasium.make(ID_6D, action_noise=1.0)
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match="action must be an integer from 0 to 6, got 7"):
+            env.step(7)
+
+    @pytest.mark.parametrize("action_noise", [-0.1, 1.1, float("nan"), True, "much", None])
+    def test_only_probabilities_are_possible(self, action_noise):
+        with pytest.raises(ValueError, match=r"action_noise must be a probability, .* got "):
+            gymnasium.make(ID_2D, action_noise=action_noise)
+        with pytest.raises(ValueError, match=r"action_noise must be a probability, .* got "):
+            combrel_envs.load("mountain_car", "climb_2d", {"action_noise": action_noise})

@@ -87,7 +87,7 @@ class TestStarts:
         starts = np.array(starts)
         low, high = env.observation_space.low, env.observation_space.high
         assert np.all(starts.min(axis=0) < low + 0.02 * (high - low))
-        if env_id == ID_4D:
+        if env_id != ID_2D:
             assert np.all(starts.max(axis=0) > high - 0.02 * (high - low))
         assert not np.any(np.all(starts[:, : starts.shape[1] // 2] >= 0.5, axis=1))
 

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
-from helpers.mountain_cars import ID_2D, ID_4D
+from helpers.mountain_cars import ID_2D, ID_4D, ID_6D
 
 import combrel_envs
 
@@ -29,6 +29,17 @@ class TestPictures:
         assert np.array_equal(before, same)
         changed = np.mean(np.any(np.abs(before.astype(int) - after) > 30, axis=-1))
         assert 0.001 < changed < (0.6 if camera == "close" else 0.1)
+
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    @pytest.mark.parametrize("camera", ["perspective", "top"])
+    def test_every_axis_of_6d_is_in_the_picture(self, axis, camera):
+        env = gymnasium.make(ID_6D, render_mode="rgb_array", width=160, height=120, camera=camera, start="fixed")
+        pictures = []
+        for position in (-0.9, 0.2):
+            env.reset(options={"state": [position if i == axis else -0.5 for i in range(3)] + [0.0] * 3})
+            pictures.append(env.render().astype(int))
+        env.close()
+        assert np.mean(np.any(np.abs(pictures[0] - pictures[1]) > 30, axis=-1)) > 0.001
 
     def test_both_interfaces_draw_the_same_picture(self):
         env = gymnasium.make(ID_4D, render_mode="rgb_array", width=160, height=120, start="fixed")

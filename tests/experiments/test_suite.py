@@ -25,7 +25,7 @@ from sb3_combrel.experiments.suite_measures import (
     summary_of_evaluation,
     summary_of_learning,
 )
-from sb3_combrel.experiments.suite_report import cells_of, columns_of, format_number, overview_table, task_table
+from sb3_combrel.experiments.suite_report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
 from sb3_combrel.experiments.suite_runs import SuiteRun, Variant, play
 from sb3_combrel.experiments.suite_tasks import TASKS, NoisyActions, Task, tasks_of
 from sb3_combrel.experiments.suite_transfers import TRANSFERS, make_transfer
@@ -343,3 +343,21 @@ def test_tables_of_hand_made_runs():
     assert table["greedy_mean", "b"][:4] == ("3", "-52.0 ± 1.15", "-52.0", "-54.0")
     overview = overview_table(cells, [SMALL], list(steps)).rows
     assert overview == [("small", "steps_1_to_3", "102.0 ± 1.15", "52.0 ± 1.15 *", "2 of 3 reached it")]
+
+
+def test_the_table_of_frozen_policies_counts_seeds():
+    columns = ("last10_return", "last10_failed", "greedy_mean", "greedy_worst", "greedy_as_good")
+    columns += ("stateless_mean", "stateless_worst", "stateless_as_good", "ms_per_step")
+    numbers = [
+        (-50.0, 0.0, -51.0, -60.0, 1.0, -90.0, -400.0, 0.0, 0.1),
+        (-60.0, 1.0, -61.0, -70.0, 1.0, -61.0, -70.0, 1.0, 0.3),
+    ]
+    rows = [
+        {"task": "small", "variant": "a", "seed": seed, **dict(zip(columns, own, strict=True))}
+        for seed, own in enumerate(numbers)
+    ]
+    (line,) = frozen_table(cells_of(rows, [SMALL], ["a", "b"], "a", "welch"), [SMALL], ["a", "b"]).rows
+    assert line[:3] == ("small", "a", "-55.0 ± 5.00")
+    assert line[3:6] == ("-56.0 ± 5.00", "-70.0", "2 of 2")
+    assert line[6:9] == ("-75.5 ± 14.5", "-400.0", "1 of 2")
+    assert line[9:] == ("1", "0.20 ± 0.10")

@@ -1,0 +1,76 @@
+"""Visits to cells of the grid where all is known: what ends the optimism of grid points that the agent cannot get nearer to.
+
+The value of a state is interpolated between the grid points around it. One of these may stay optimistic for ever: no instance
+comes near enough, because nothing leads there, while at the states that the agent visits every action is known. Its
+optimistic value reaches the states beside it all the same, and draws the agent to them again and again. So a grid point
+around which the agent was often enough, with every action known where it was, counts as known from what instances it has.
+"""
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.planning.grid import GridArrays, corners_of
+
+ENOUGH_VISITS = 3
+
+
+@compiled
+def note_visit_plain(state, weight, threshold, n_optimistic, visits, grid, scratch):
+    """Count a visit to the grid points around ``state`` that have an optimistic action, if every action is known there.
+
+    :param weight: float64, shape (n_actions,): of the own instances at ``state``
+    :param n_optimistic: int64, shape (n_points,): how many actions of each point are optimistic
+    :param visits: int32, shape (n_points,)
+    :param scratch: position, corner_index, corner_weight (see ``corners_of``); the points that have been visited often
+        enough are moved to the front of ``corner_index``
+    :return: how many these are
+    """
+    for action in range(len(weight)):
+        if weight[action] < threshold:
+            return 0
+    grid = GridArrays(*grid)
+    position, corner_index, corner_weight = scratch
+    for k in range(len(state)):
+        position[k] = state[k] * grid.cells[k] + grid.margin
+    found = 0
+    for c in range(corners_of(position, grid, corner_index, corner_weight)):
+        point = corner_index[c]
+        if n_optimistic[point] > 0:
+            visits[point] += 1
+            if visits[point] >= ENOUGH_VISITS:
+                corner_index[found] = point
+                found += 1
+    return found
+
+
+_note_visit = EntryPoint(note_visit_plain)
+
+
+class Visits:
+    """
+    Counts visits to grid points that have an optimistic action.
+
+    :param n_variables: number of state variables
+    :param n_points: number of grid points
+    """
+
+    def __init__(self, n_variables: int, n_points: int):
+        self.counts = np.zeros(n_points, dtype=np.int32)
+        self._corner_index = np.empty(2**n_variables, dtype=np.int64)
+        self._scratch = np.empty(n_variables), self._corner_index, np.empty(2**n_variables)
+
+    def note(
+        self, state: np.ndarray, weight: np.ndarray, threshold: float, n_optimistic: np.ndarray, grid: tuple
+    ) -> np.ndarray:
+        """
+        Count a visit.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :param weight: of the own instances of each action there, shape (n_actions,)
+        :param threshold: weight that makes an action known
+        :param n_optimistic: optimistic actions of each grid point, shape (n_points,)
+        :param grid: ``StateGrid.plain``
+        :return: grid points that have an optimistic action and have been visited often enough, int64
+        """
+        n = _note_visit.call(state, weight, threshold, n_optimistic, self.counts, grid, self._scratch)
+        return self._corner_index[:n]
