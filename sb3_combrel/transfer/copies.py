@@ -18,6 +18,8 @@ from sb3_combrel.transfer.source_model import SourceModel, predict_source
 SMALLEST_SCALE = 1e-12
 # Errors are compared with effects of at least this fraction of a typical one of the source.
 LEAST_EFFECT = 0.25
+# And count as at most this many times as large, squared: a bound of 1 would find noise to explain something.
+LARGEST_MISS = 2.0
 # From so many pairs on the different states of each copy are predicted once.
 MANY = 256
 
@@ -50,8 +52,8 @@ class CopySums(NamedTuple):
     :param stay: float64, same shape: compliances of each variable with "it stays as it is"
     :param compliance: float64, shape (n_copies, n_target_actions, most source actions): compliances of each copy
     :param error: float64, shape (n_copies, n_target_actions, most source actions, n_target_variables): squared errors
-    :param missed: float64, same shape: squared errors in parts of the squared effects, each at most 1, where the source has
-        data: times how much of the threshold its weight reaches, at most 1
+    :param missed: float64, same shape: squared errors in parts of the squared effects, each at most
+        ``LARGEST_MISS``, where the source has data: times how much of the threshold its weight reaches, at most 1
     :param founded: float64, shape (n_copies, n_target_actions, most source actions): sums of these factors
     """
 
@@ -150,7 +152,7 @@ def add_error(table, sums, at, effect, predicted, founded):
     error = (effect - predicted) ** 2
     sums.error[copy, action, u, v] += error
     compared = max(effect * effect, table.least[copy, v])
-    sums.missed[copy, action, u, v] += founded * (1.0 if error > compared else error / max(compared, 1e-300))
+    sums.missed[copy, action, u, v] += founded * min(LARGEST_MISS, error / max(compared, 1e-300))
     return error
 
 

@@ -11,6 +11,9 @@ from sb3_combrel.transfer.copies import Copies, CopySums
 
 # A mean compliance below this counts as this: one that is nothing must not outweigh all others.
 SMALLEST_COMPLIANCE = 1e-9
+# By this factor, for each of its variables, a copy must comply better than "they stay": each copy can choose among source
+# actions, and so complies a little better with noise.
+MIN_GAIN = 1.05
 # Divisions are searched subset by subset of the target's variables.
 MAX_FACTORED_VARIABLES = 12
 
@@ -70,11 +73,12 @@ def choose_factored(copies: Copies, sums: CopySums) -> Choice:
     Choose the division of the target's variables into copies and variables that stay, and each copy's source actions.
 
     The division is the one for which the product of all mean compliances is highest: of its copies, each with its best
-    source action for each target action, and of "it stays" for the variables in none. The mean of each target action counts
-    as often as there are transitions with it.
+    source action for each target action and over ``MIN_GAIN`` for each of its variables, and of "it stays" for the variables
+    in none. The mean of each target action counts as often as there are transitions with it.
     """
     action, mean = best_actions(copies, sums)
     scores = np.log(np.maximum(mean, SMALLEST_COMPLIANCE)) @ sums.n
+    scores -= np.log(MIN_GAIN) * sums.n.sum() * (copies.state >= 0).sum(axis=1)
     stay = sums.stay / np.maximum(sums.n, 1.0)[:, None]
     stays = sums.n @ np.log(np.maximum(stay, SMALLEST_COMPLIANCE))
     chosen = best_division(copies.state >= 0, scores, stays)

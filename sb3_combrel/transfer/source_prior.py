@@ -20,6 +20,8 @@ from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 FIRST_RENEWAL = 10
 # Choice and trust are renewed whenever this many times as much has been observed as at the last time.
 RENEWAL_GROWTH = 2**0.5
+# So many transitions are compared with what all copies predict; later ones one in so many, which suffices to notice a change.
+ALL_MEASURED, MEASURED_LATER = 500, 5
 # Transitions of a target action from which on a source is believed about it.
 MIN_TRANSITIONS = 10
 # How much of each variable's effects must be explained; less is not clearly better than "nothing changes".
@@ -145,7 +147,8 @@ class SourcePrior:
         recorded = self.n_observed <= self.max_transitions
         if recorded:
             self._record(state, action, reward, effect, terminated)
-            self.copies.measure(state, action, effect, self.sums, self.whole)
+            if self.n_observed <= ALL_MEASURED or self.n_observed % MEASURED_LATER == 0:
+                self.copies.measure(state, action, effect, self.sums, self.whole)
         if self.choice is not None:
             self._check(state, action, reward, effect, terminated, recorded)
         if self.n_observed >= self._renewal_due:
@@ -227,11 +230,11 @@ class SourcePrior:
         """
         Return which part of the effects is explained, for each target action, of the variable of which least is.
 
-        Of a transition and variable, 1 less squared error over squared effect, at least 0: so a few large effects, such as
+        Of a transition and variable, 1 less squared error over squared effect, within bounds: so a few large effects, such as
         those of a car that hits the wall, count no more than others. Of a variable in a copy, over the transitions where the
         source has data; of one that stays, over all: 0 where it moved.
 
-        :return: shape (n_target_actions,); 1 for an exact source, 0 for one no better than "nothing changes" and for an
+        :return: shape (n_target_actions,); 1 for an exact source, 0 or less for one no better than "nothing changes", 0 for an
             action with too few transitions
         """
         missed, founded = self._missed()
