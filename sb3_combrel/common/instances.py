@@ -1,10 +1,12 @@
 """Experience of one task, in unit coordinates, kept by action for compiled code."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, part
+from sb3_combrel.common.periodic import difference, flag_array
 
 BLOCK = 8
 
@@ -16,7 +18,7 @@ class Instances(NamedTuple):
     lets a search for near instances skip most blocks.
 
     :param state: float64, shape (n_actions, capacity, n_variables), unit coordinates
-    :param effect: float64, same shape: next state minus state, unit coordinates
+    :param effect: float64, same shape: next state minus state, unit coordinates; along a periodic variable the shortest way
     :param reward: float64, shape (n_actions, capacity)
     :param terminated: bool, same shape: the episode ended in a terminal state (not by a time limit)
     :param size: int64, shape (n_actions,)
@@ -25,6 +27,7 @@ class Instances(NamedTuple):
     :param gap: float64 scratch, shape (capacity / BLOCK,): how far a state is from the boxes
     :param seen: int64 scratch, shape (n_actions, capacity): the last search that began with each instance
     :param searches: int64 scratch, shape (1,): how many searches there were
+    :param periodic: bool, shape (n_variables,): periodic variables, whose coordinates are stored wrapped to [0, 1]
     """
 
     state: np.ndarray
@@ -37,10 +40,18 @@ class Instances(NamedTuple):
     gap: np.ndarray
     seen: np.ndarray
     searches: np.ndarray
+    periodic: np.ndarray
 
     @classmethod
-    def empty(cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK) -> "Instances":
-        """Make room for ``capacity`` (a multiple of BLOCK) instances of each action."""
+    def empty(
+        cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK, periodic: Sequence[bool] | np.ndarray | None = None
+    ) -> "Instances":
+        """
+        Make room for instances.
+
+        :param capacity: of each action, a multiple of BLOCK
+        :param periodic: one bool for each state variable; None: none is periodic
+        """
         n_blocks = capacity // BLOCK
         return cls(
             state=np.empty((n_actions, capacity, n_variables)),
@@ -53,6 +64,7 @@ class Instances(NamedTuple):
             gap=np.empty(n_blocks),
             seen=np.zeros((n_actions, capacity), dtype=np.int64),
             searches=np.zeros(1, dtype=np.int64),
+            periodic=flag_array(periodic, n_variables),
         )
 
     @classmethod
@@ -64,18 +76,23 @@ class Instances(NamedTuple):
         effect: np.ndarray,
         reward: np.ndarray,
         terminated: np.ndarray,
+        periodic: Sequence[bool] | np.ndarray | None = None,
     ) -> "Instances":
         """Instances given one a row, in their order.
 
         :param action: int64, shape (n,)
         :param state: shape (n, n_variables); ``effect``: the same
         :param reward: shape (n,); ``terminated``: bool, same shape
+        :param periodic: see :meth:`empty`; coordinates of periodic variables are wrapped to [0, 1]
         """
+        flags = flag_array(periodic, state.shape[1])
+        if flags.any():
+            state = np.where(flags, state - np.floor(state), state)
         counts = np.bincount(action, minlength=n_actions)
         capacity = 8 * BLOCK
         while capacity < counts.max():
             capacity *= 2
-        made = cls.empty(n_actions, state.shape[1], capacity)
+        made = cls.empty(n_actions, state.shape[1], capacity, flags)
         made.size[:] = counts
         for a, n in enumerate(counts):
             rows = np.flatnonzero(action == a)
@@ -88,15 +105,17 @@ class Instances(NamedTuple):
         return made
 
     @classmethod
-    def from_rows(cls, n_actions: int, rows: np.ndarray) -> "Instances":
+    def from_rows(cls, n_actions: int, rows: np.ndarray, periodic: Sequence[bool] | np.ndarray | None = None) -> "Instances":
         """
         Build them from :meth:`rows`, in the same order for each action.
 
         :param rows: float64, shape (n, 2 * n_variables + 3)
+        :param periodic: see :meth:`empty`
         """
         d = (rows.shape[1] - 3) // 2
         actions = np.clip(rows[:, 0], 0, n_actions - 1).astype(np.int64)
-        return cls.of_rows(n_actions, actions, rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d], rows[:, -2], rows[:, -1] > 0.5)
+        states, effects = rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d]
+        return cls.of_rows(n_actions, actions, states, effects, rows[:, -2], rows[:, -1] > 0.5, periodic)
 
     def rows(self) -> np.ndarray:
         """Action, state, effect, reward and terminated of each instance, by action: float64, shape (n, 2 n_variables + 3)."""
@@ -133,10 +152,13 @@ def put_instance(instances, transition):
     action, slot, state, next_state, reward, terminated = transition
     block = slot // BLOCK
     for k in range(len(state)):
-        instances.state[action, slot, k] = state[k]
-        instances.effect[action, slot, k] = next_state[k] - state[k]
-        instances.block_low[action, k, block] = min(instances.block_low[action, k, block], state[k])
-        instances.block_high[action, k, block] = max(instances.block_high[action, k, block], state[k])
+        at = state[k]
+        if instances.periodic[k]:
+            at -= np.floor(at)
+        instances.state[action, slot, k] = at
+        instances.effect[action, slot, k] = difference(next_state[k], state[k], instances.periodic[k])
+        instances.block_low[action, k, block] = min(instances.block_low[action, k, block], at)
+        instances.block_high[action, k, block] = max(instances.block_high[action, k, block], at)
     instances.reward[action, slot] = reward
     instances.terminated[action, slot] = terminated
     if slot == instances.size[action]:

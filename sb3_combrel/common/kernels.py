@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import inlined, part
+from sb3_combrel.common.compiled import inlined, inner, part
 from sb3_combrel.common.instances import BLOCK
+from sb3_combrel.common.periodic import difference as difference
 
 
 @inlined
@@ -45,32 +46,63 @@ def cut_by_fraction(weights, start, length, min_fraction):
 
 
 @inlined
-def squared_distance(state, other):
-    """Of two states."""
+def any_periodic(periodic):
+    """Whether a variable is periodic, for :func:`squared_distance`: asked once for many distances."""
+    found = False
+    for k in range(len(periodic)):
+        found = found or periodic[k]
+    return found
+
+
+@inlined
+def squared_distance(state, other, periodic, wraps):
+    """Of two states.
+
+    :param periodic: bool, shape (n_variables,); ``wraps``: whether any is
+    """
     distance = 0.0
     for k in range(len(state)):
         along = state[k] - other[k]
+        if wraps:
+            along = difference(along, 0.0, periodic[k])
         distance += along * along
     return distance
 
 
 @part
-def measure_gaps(state, low, high, n_blocks, gap):
+def measure_gaps(state, low, high, periodic, n_blocks, gap):
     """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers.
 
-    :param low: float64, shape (n_variables, at least n_blocks); ``high``: the same
+    :param low: float64, shape (n_variables, at least n_blocks); ``high``: the same; of a periodic variable within [0, 1]
+    :param periodic: bool, shape (n_variables,)
     """
     gap[:n_blocks] = 0.0
     for k in range(len(state)):
         at = state[k]
         low_k = low[k]
         high_k = high[k]
+        if periodic[k]:
+            measure_gaps_around(at - np.floor(at), low_k, high_k, n_blocks, gap)
+            continue
         for block in range(n_blocks):
             below = low_k[block] - at
             above = at - high_k[block]
             outside = below if below > above else above
             outside = outside if outside > 0.0 else 0.0
             gap[block] += outside * outside
+
+
+@inner
+def measure_gaps_around(at, low, high, n_blocks, gap):
+    """Add the squared distances along one periodic variable: a box is as far as its nearer end, on either way around."""
+    for block in range(n_blocks):
+        below = low[block] - at
+        above = at - high[block]
+        outside = below if below > above else above
+        around = 1.0 + (above if below > above else below)
+        outside = outside if outside < around else around
+        outside = outside if outside > 0.0 else 0.0
+        gap[block] += outside * outside
 
 
 @part
@@ -93,24 +125,26 @@ def near_instances(instances, action, state, kernel, indices, weights, n_before)
     length = np.int64(0)
     total = 0.0
     count = instances.size[action]
+    wraps = any_periodic(instances.periodic)
     instances.searches[0] += 1
     search = instances.searches[0]
     for b in range(n_before):
         before = np.int64(indices[b])
         if before < count:
             instances.seen[action, before] = search
-            w = np.exp(squared_distance(state, instances.state[action, before]) * scale)
+            w = np.exp(squared_distance(state, instances.state[action, before], instances.periodic, wraps) * scale)
             if w >= min_weight:
                 length, total = insert_by_weight(indices, weights, start, length, total, before, w, min_fraction)
     if length > 0:
         farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
     n_blocks = (count + BLOCK - 1) // BLOCK
-    measure_gaps(state, instances.block_low[action], instances.block_high[action], n_blocks, instances.gap)
+    low, high = instances.block_low[action], instances.block_high[action]
+    measure_gaps(state, low, high, instances.periodic, n_blocks, instances.gap)
     for block in range(n_blocks):
         if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i])
+            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
             if distance > farthest or instances.seen[action, i] == search:
                 continue
             w = np.exp(distance * scale)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.periodic import flag_array
 from sb3_combrel.common.scaling import StateScaling, scale_into_box
 
 _scale_into_box = EntryPoint(scale_into_box)
@@ -18,11 +20,15 @@ class ObservationScaler:
     """
     Scales observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
 
+    Periodic variables are wrapped instead: any angle is the same as one between the bounds.
+
     :param scaling: raw <-> unit coordinates
+    :param periodic: one bool for each state variable; None: none is periodic
     """
 
-    def __init__(self, scaling: StateScaling):
+    def __init__(self, scaling: StateScaling, periodic: Sequence[bool] | None = None):
         self.scaling = scaling
+        self._periodic = flag_array(periodic, scaling.n_variables)
         # Compiled code takes arrays that can be written to, and those of the scaling cannot.
         self._low, self._range = scaling.low.copy(), scaling.high - scaling.low
         self._warned = False
@@ -38,8 +44,12 @@ class ObservationScaler:
         raw = np.ascontiguousarray(observations, dtype=np.float64)
         inside = np.empty_like(raw)
         flat = (-1, self.scaling.n_variables)
-        if _scale_into_box.call(raw.reshape(flat), self._low, self._range, inside.reshape(flat)):
-            self._check_outside(observations, self.scaling.to_unit(raw) - inside)
+        if _scale_into_box.call(raw.reshape(flat), self._low, self._range, self._periodic, inside.reshape(flat)):
+            excess = self.scaling.to_unit(raw) - inside
+            with np.errstate(invalid="ignore"):
+                # Whole periods are no excess; what is not finite stays so.
+                excess[..., self._periodic] *= 0.0
+            self._check_outside(observations, excess)
         return inside
 
     def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:

@@ -173,18 +173,21 @@ def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64]
 
 
 @compiled
-def scale_into_box(states, low, ranges, units):
-    """:meth:`StateScaling.to_unit`, and what is outside the unit cube is moved to its boundary.
+def scale_into_box(states, low, ranges, periodic, units):
+    """:meth:`StateScaling.to_unit`, and what is outside the unit cube is moved to its boundary, or wrapped into it.
 
     :param states: float64, raw units, shape (n, n_variables)
-    :param low: shape (n_variables,); ``ranges``: high - low
+    :param low: shape (n_variables,); ``ranges``: high - low; ``periodic``: bool, whether to wrap each variable
     :param units: receives the unit coordinates, shape (n, n_variables)
-    :return: whether anything was outside, or no number
+    :return: whether anything was moved, or is no number
     """
     outside = False
     for i in range(len(states)):
         for k in range(len(low)):
             unit = (states[i, k] - low[k]) / ranges[k]
+            if periodic[k]:
+                # Not a number if the observation is infinite.
+                unit -= np.floor(unit)
             units[i, k] = min(max(unit, 0.0), 1.0)
             if units[i, k] != unit:
                 outside = True

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.wrappers import DiscretizeAction
 
 from sb3_combrel.experiments import ball_striking, mountain_car
@@ -21,6 +22,7 @@ from sb3_combrel.experiments.suite_measures import (
     steps_until_median,
 )
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.wrappers import AngleObservation
 
 
 class NoisyActions(gym.ActionWrapper):
@@ -95,7 +97,12 @@ class Task:
 
 def make_pendulum() -> gym.Env:
     """Make the pendulum with five torques: Gymnasium's ``DiscretizeAction`` takes the centres of five intervals."""
-    return DiscretizeAction(make_task("Pendulum-v1", disable_env_checker=True), bins=5)
+    return AngleObservation(DiscretizeAction(make_task("Pendulum-v1", disable_env_checker=True), bins=5))
+
+
+def make_acrobot() -> gym.Env:
+    """Make the acrobot with its two angles in place of their cosines and sines."""
+    return AngleObservation(make_task("Acrobot-v1", disable_env_checker=True))
 
 
 def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
@@ -121,7 +128,7 @@ CART_POLE: dict[str, Any] = {
 #: As in zoo_configs/fitted_rmax.yml: the bounds of the velocities leave out what the swing-up does not reach.
 ACROBOT: dict[str, Any] = {
     "gamma": 0.99,
-    "bounds": ([-1.0, -1.0, -1.0, -1.0, -7.0, -12.0], [1.0, 1.0, 1.0, 1.0, 7.0, 12.0]),
+    "bounds": ([-np.pi, -np.pi, -7.0, -12.0], [np.pi, np.pi, 7.0, 12.0]),
 }
 
 #: A twentieth of the robot's step. Without any it visits the points of a lattice only, which is a case of its own.
@@ -134,7 +141,6 @@ _car_2d = partial(make_task, mountain_car.SOURCE_ID, max_episode_steps=CAP)
 _car_4d = partial(make_task, mountain_car.TARGET_ID, max_episode_steps=CAP)
 _car_6d = partial(make_task, "combrel/MountainCar6D-v0", max_episode_steps=CAP)
 _gym_car = partial(make_task, "MountainCar-v0", disable_env_checker=True)
-_acrobot = partial(make_task, "Acrobot-v1", disable_env_checker=True)
 _cart_pole = partial(make_task, "CartPole-v1", disable_env_checker=True)
 _noisy_car_2d = partial(make_noisy, mountain_car.SOURCE_ID, max_episode_steps=CAP)
 _noisy_gym_car = partial(make_noisy, "MountainCar-v0", disable_env_checker=True)
@@ -159,8 +165,8 @@ _ALL = (
     Task("MountainCar2D-noisy", _noisy_car_2d, n_episodes=50, measures=(_LAST_OF_50,), headline=_LAST_OF_50.name),
     Task("MountainCar-v0", _gym_car, n_steps=1500),
     Task("MountainCar-v0-noisy", _noisy_gym_car, n_steps=3000),
-    Task("Acrobot-v1", _acrobot, ACROBOT, n_steps=6000),
-    Task("Acrobot-v1-15000", _acrobot, ACROBOT, n_steps=15_000),
+    Task("Acrobot-v1", make_acrobot, ACROBOT, n_steps=6000),
+    Task("Acrobot-v1-15000", make_acrobot, ACROBOT, n_steps=15_000),
     Task("CartPole-v1", _cart_pole, CART_POLE, n_steps=3000, failure_return=_FALLEN),
     Task("Pendulum-v1", make_pendulum, {"gamma": 0.97}, n_steps=1000, failure_return=_NOT_UP),
     *(

@@ -67,13 +67,17 @@ class FittedRMaxAgent:
         self._prediction_rng = np.random.default_rng(self.rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
         d = task.n_variables
         self.max_backups = settings.backups_for(d)
+        #: Which state variables are periodic.
+        self.periodic = settings.periodic_for(d)
         self.model_settings = settings.model_settings(d)
         breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
-        self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight)
+        self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight, self.periodic)
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfer is not None)
         warn_if_long(self.workload, self.grid)
         self.n_truncated = 0
         self.n_backups = 0
+        #: How often an action without a model was chosen in learning.
+        self.n_optimistic_actions = 0
         # Measure the time of planning, which takes some itself.
         self.timed = False
         self.planning_seconds = 0.0
@@ -96,6 +100,7 @@ class FittedRMaxAgent:
             min_fraction=self.model_settings.min_fraction,
             state_names=tuple(self.task.state_names),
             action_names=tuple(self.task.action_names),
+            periodic=self.periodic,
         )
         transfer.bind(target, self.rng)
         return target
@@ -156,10 +161,12 @@ class FittedRMaxAgent:
             self._note_visit(state, prediction)
         visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)
-        if best >= 0:
-            return best
-        ties = np.flatnonzero(self._q.q == self._q.q.max())
-        return int(ties[self.rng.integers(len(ties))])
+        if best < 0:
+            ties = np.flatnonzero(self._q.q == self._q.q.max())
+            best = int(ties[self.rng.integers(len(ties))])
+        if not prediction.modelled[best]:
+            self.n_optimistic_actions += 1
+        return best
 
     def _note_visit(self, state: np.ndarray, prediction: Prediction) -> None:
         """Let grid points beside which all has been known often enough count as known (see ``planning.visits``)."""

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
+from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_combrel.common.checks import as_count, check_count, count_text
@@ -37,6 +38,23 @@ def _is_policy(thing: Any, aliases: Container[str]) -> bool:
     if isinstance(thing, str):
         return thing in aliases or (thing.endswith("Policy") and thing.isidentifier())
     return isinstance(thing, type) and issubclass(thing, BasePolicy)
+
+
+def check_actions(action_space: spaces.Space[Any]) -> int:
+    """
+    Check that actions are discrete.
+
+    :return: how many there are
+    :raises ValueError: if they are not; for continuous ones it says how to make them discrete
+    """
+    if isinstance(action_space, spaces.Discrete):
+        return int(action_space.n)
+    message = f"FittedRMax needs Discrete actions, the environment has {action_space}"
+    if isinstance(action_space, spaces.Box) and len(action_space.shape) == 1:
+        n = action_space.shape[0]
+        bins = "5" if n == 1 else f"({', '.join('3' * n)})"
+        message += f"; take a few of the continuous ones: env = gymnasium.wrappers.DiscretizeAction(env, bins={bins})"
+    raise ValueError(message)
 
 
 def check_seed(seed: object) -> None:

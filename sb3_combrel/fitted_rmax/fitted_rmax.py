@@ -11,7 +11,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
@@ -24,6 +23,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import (
     DEFAULT_POLICY,
+    check_actions,
     check_policy_kwargs,
     check_seed,
     check_total_timesteps,
@@ -33,8 +33,9 @@ from sb3_combrel.fitted_rmax.arguments import (
 )
 from sb3_combrel.fitted_rmax.persistence import PersistentAlgorithm
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.fitted_rmax.progress import ProgressWatch
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
-from sb3_combrel.fitted_rmax.vec_envs import names_of, refuse_normalized_observations, true_outcomes
+from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 
@@ -81,11 +82,13 @@ class FittedRMax(PersistentAlgorithm):
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
     :param transfer: a transfer method, such as ``COMBREL(source)``; or a dict, as in RL-Zoo's YAML files, from the
         method's name to its arguments. A copy of it is used.
-    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: 0.09 for one or two state
-        variables, 0.15 for three, 0.2 for more. With a smaller one the model is more exact and more is explored.
-    :param min_fraction: an instance counts while it has this fraction of the weight of the nearer ones; 0.1 keeps at most
-        11 instances a pair, 0.01 (the original's) 101
-    :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach
+    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: with ``degree=1`` 0.15 for one
+        or two state variables, 0.25 for three, 0.4 for four or five, 0.5 for more; with ``degree=0`` 0.09, 0.15 and 0.2. With
+        a smaller one the model is more exact and more is explored.
+    :param min_fraction: with ``degree=0``, an instance counts while it has this fraction of the weight of the nearer ones; 0.1
+        keeps at most 11 instances a pair, 0.01 (the original's) 101
+    :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach. None: 0.05 with
+        ``degree=1``, 0.01 with ``degree=0``
     :param exploration_threshold: weight of instances that makes a state-action pair known, before it is lowered
     :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: at
         least 6 for one or two variables, 4 for three, 3 for more, and finer if the breadth needs it and memory allows.
@@ -93,10 +96,22 @@ class FittedRMax(PersistentAlgorithm):
     :param gamma: discount factor, in (0, 1]
     :param planning_tolerance: changes of value up to this are not propagated
     :param max_backups: grid points backed up in a step at most, besides those whose model changed; 400 times as many when an
-        episode ends. None: 400 / 2^d with d state variables, as the cost of a backup grows with 2^d.
-    :param max_instances: of one action; beyond, the instance in the fewest lists of grid points is replaced. None: no limit.
+        episode ends. None: 1600 / 2^d with d state variables (400 / 2^d with ``degree=0``), as the cost of a backup grows
+        with 2^d.
+    :param max_instances: of one action; beyond, the nearest instance is replaced (with ``degree=0`` the one in the fewest
+        lists of grid points). None: no limit.
     :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
         where those are infinite
+    :param degree: of the local model: 1, effects are fitted as linear functions of the state to the instances near it
+        (:class:`~sb3_combrel.models.local_linear.LocalLinear`); or 0, their kernel average, Jong & Stone's, which needs more
+        instances (:class:`~sb3_combrel.models.kernel_average.KernelAverage`)
+    :param n_neighbors: with ``degree=1``, instances that a fit is made to. None: 16 for one or two state variables, 24 for
+        three, 30 for four, 40 for five, 60 for more
+    :param outcome_breadth: with ``degree=1``, breadth of the narrower kernel by which rewards, ends, and what a fit leaves
+        unexplained are averaged
+    :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
+        Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
+        says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.
     :param stats_window_size: window size for the rollout logging, in episodes
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation; ``dict(model_class=...)`` for another
@@ -137,6 +152,7 @@ class FittedRMax(PersistentAlgorithm):
         degree: int = DEFAULTS.degree,
         n_neighbors: int | None = DEFAULTS.n_neighbors,
         outcome_breadth: float = DEFAULTS.outcome_breadth,
+        periodic: Sequence[bool] | None = DEFAULTS.periodic,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -171,9 +187,11 @@ class FittedRMax(PersistentAlgorithm):
         self.max_backups = max_backups
         self.max_instances = max_instances
         self.bounds = bounds
-        self.degree = degree
+        # Files of version 0.1.0, which had the kernel average only, say nothing of it: loading sets what they say after this.
+        self.degree = degree if _init_setup_model else 0
         self.n_neighbors = n_neighbors
         self.outcome_breadth = outcome_breadth
+        self.periodic = periodic
         self._warned_of_max_value = False
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
@@ -184,6 +202,8 @@ class FittedRMax(PersistentAlgorithm):
         self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             refuse_normalized_observations(self.env)
+        if self.periodic is None:
+            self.periodic = periodic_of(self.env)
         if self.seed is None:
             # A script that seeds numpy is then reproducible, as with the other algorithms.
             self._rng = np.random.default_rng(np.random.randint(2**31))
@@ -202,6 +222,7 @@ class FittedRMax(PersistentAlgorithm):
         )
         self.policy = self.policy.to(self.device)
         self._episode_rewards: list[list[float]] = []
+        self._progress = ProgressWatch(self.max_value, self.gamma, self.planning_tolerance)
         if self.verbose >= 1:
             print(self.agent.workload)
 
@@ -216,14 +237,14 @@ class FittedRMax(PersistentAlgorithm):
 
     def _check_arguments(self) -> None:
         """Refuse what does not fit before anything is built."""
-        if not isinstance(self.action_space, spaces.Discrete):
-            raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
+        check_actions(self.action_space)
         check_seed(self.seed)
         check_count("stats_window_size", self._stats_window_size)
         check_type("tensorboard_log", self.tensorboard_log, (str, Path, type(None)), "the path of a folder or None")
         check_policy_kwargs(self.policy_kwargs, self.policy_class, (*FittedRMaxSettings.names(), *PASSED_TO_POLICY))
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         self.settings.resolution_for(n_variables)
+        self.settings.periodic_for(n_variables)
 
     @property
     def settings(self) -> FittedRMaxSettings:
@@ -338,6 +359,7 @@ class FittedRMax(PersistentAlgorithm):
         self._episode_rewards[env_index] = []
         if not self._warned_of_max_value and (terminated or min(rewards) >= 0.0):
             self._warned_of_max_value = warn_of_max_value(self.max_value, rewards, self.gamma)
+        self._progress.note(rewards, terminated, self.agent.n_optimistic_actions)
 
     def dump_logs(self) -> None:
         """Write log data."""

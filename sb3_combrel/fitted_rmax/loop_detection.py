@@ -76,4 +76,6 @@ def memories(state: Sequence[Any] | None, episode_start: np.ndarray | None, n: i
 
 def small_cell(state: np.ndarray, grid: StateGrid) -> Hashable:
     """The small cell around a state (unit coordinates), of the size of those of the corrections."""
-    return (state * grid.arrays.cells * CELLS_PER_GRID_CELL + CELL_OFFSET).astype(np.int64).tobytes()
+    n_cells = grid.arrays.cells * CELLS_PER_GRID_CELL
+    cell = np.floor(state * n_cells + CELL_OFFSET) if grid.arrays.periodic.any() else state * n_cells + CELL_OFFSET
+    return np.where(grid.arrays.periodic, cell % n_cells, cell).astype(np.int64).tobytes()

@@ -147,7 +147,7 @@ class PersistentAlgorithm(BaseAlgorithm):
         return given
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_numbers", "_last_states"]
+        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_numbers", "_last_states", "_progress"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

@@ -80,8 +80,8 @@ class FittedRMaxPolicy(BasePolicy):
         names = (() if given_names is None else given_names for given_names in (state_names, action_names))
         task = Task(self.scaling, int(action_space.n), *names)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
-        #: Observations, raw units, to unit coordinates; what is outside the bounds is moved to the boundary.
-        self.to_unit = ObservationScaler(self.scaling)
+        #: Observations, raw units, to unit coordinates; what is outside the bounds is moved to the boundary, or wrapped.
+        self.to_unit = ObservationScaler(self.scaling, self.agent.periodic)
         self._first_action = int(action_space.start)
         self._settings = settings
         self._model_class = model_class
@@ -186,6 +186,8 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         expected = self.agent.get_state()
+        # Files of version 0.1.0 do not have it.
+        state_dict.setdefault(prefix + "visits", th.as_tensor(expected["visits"] * 0.0))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):

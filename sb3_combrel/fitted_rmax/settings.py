@@ -7,15 +7,17 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
+from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.models.base import Model, ModelSettings
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.models.local_linear import LocalLinear
 
-# By default so many corners of grid cells are looked at in a step: a backup costs as much as a cell has corners.
-CORNERS_A_STEP = 400
+# By default so many corners of grid cells are looked at in a step, by degree of the local model: a backup costs as much as a
+# cell has corners.
+CORNERS_A_STEP = {0: 400, 1: 1600}
 # By degree of the local model and number of state variables, the last one for more.
 DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
-DEFAULT_NEIGHBORS = (16, 16, 24, 40, 40, 60)
+DEFAULT_NEIGHBORS = (16, 16, 24, 30, 40, 60)
 DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
 # More than any step has time for; at an episode's end there are 400 times as many, which must fit into an int64.
@@ -32,7 +34,7 @@ class FittedRMaxSettings:
     :raises ValueError: if one is out of its range
     """
 
-    degree: int = 0
+    degree: int = 1
     model_breadth: float | None = None
     n_neighbors: int | None = None
     outcome_breadth: float = 0.05
@@ -46,6 +48,7 @@ class FittedRMaxSettings:
     max_backups: int | None = None
     max_instances: int | None = 20_000
     bounds: tuple[Any, Any] | None = None
+    periodic: Sequence[bool] | None = None
 
     def __post_init__(self) -> None:
         if self.degree not in (0, 1) or isinstance(self.degree, bool):
@@ -85,7 +88,7 @@ class FittedRMaxSettings:
 
     def backups_for(self, n_variables: int) -> int:
         """The backups of a step with so many state variables."""
-        return max(1, CORNERS_A_STEP // 2**n_variables) if self.max_backups is None else int(self.max_backups)
+        return max(1, CORNERS_A_STEP[self.degree] // 2**n_variables) if self.max_backups is None else int(self.max_backups)
 
     def resolution_for(self, n_variables: int) -> int | Sequence[int] | None:
         """
@@ -95,6 +98,14 @@ class FittedRMaxSettings:
         """
         check_resolution(self.resolution, n_variables)
         return self.resolution
+
+    def periodic_for(self, n_variables: int) -> tuple[bool, ...]:
+        """
+        Which state variables are periodic, checked against their number.
+
+        :raises ValueError: if it is not None or one bool for each state variable
+        """
+        return periodic_flags(self.periodic, n_variables)
 
     def model_settings(self, n_variables: int) -> ModelSettings:
         """What a model of a task with so many state variables needs of them."""

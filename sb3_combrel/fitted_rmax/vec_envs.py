@@ -25,6 +25,16 @@ def names_of(env: VecEnv | None) -> dict[str, Any]:
     return found
 
 
+def periodic_of(env: VecEnv | None) -> list[bool] | None:
+    """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
+    n = 0 if env is None else (env.observation_space.shape or (0,))[0]
+    if env is None or n == 0 or not env.has_attr("periodic"):
+        return None
+    value = env.get_attr("periodic", 0)[0]
+    is_list = isinstance(value, Sequence | np.ndarray) and len(value) == n
+    return [bool(flag) for flag in value] if is_list and all(isinstance(flag, bool | np.bool_) for flag in value) else None
+
+
 def refuse_normalized_observations(env: VecEnv) -> None:
     """
     :raises ValueError: if a ``VecNormalize`` normalizes the observations

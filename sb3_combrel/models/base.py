@@ -99,7 +99,7 @@ class Model(ABC):
         self.settings = settings
         self.transfer = transfer
         self.exploration_threshold = float(settings.exploration_threshold)
-        self.instances = Instances.empty(self.n_actions, self.grid.n_variables)
+        self.instances = Instances.empty(self.n_actions, self.grid.n_variables, periodic=self.grid.arrays.periodic)
         n_pairs = self.n_actions * self.grid.n_points
         # Weight of each pair's own instances, and whether it has reached the threshold.
         self.own_weight = np.zeros(n_pairs)
@@ -229,7 +229,7 @@ class Model(ABC):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`get_state` returned, and update all rows of the finite MDP; for a new model."""
-        self.instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1])
+        self.instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self._oldest[:] = 0
         self.known[:] = state["known"] > 0.5
         self.own_weight[:] = state["total"]

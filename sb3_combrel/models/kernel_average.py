@@ -227,7 +227,7 @@ class KernelAverage(Model):
         """
         rows, known, total = state["instances"], state["known"] > 0.5, state["total"]
         rows = rows[np.argsort(np.clip(rows[:, 0], 0, self.n_actions - 1), kind="stable")]
-        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1])
+        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
         self._set_arrays(self.arrays._replace(**self._of_instances()))
         grid, arrays = self.grid.arrays, self.arrays
         note_all_effects.call(self.instances, arrays, grid)

@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import Instances, put_instance
-from sb3_combrel.common.kernels import cut_by_fraction, insert_by_weight
+from sb3_combrel.common.kernels import cut_by_fraction, difference, insert_by_weight
 from sb3_combrel.common.list_store import ListStore, reserve
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.planning.grid import GridArrays
@@ -54,7 +54,8 @@ class ReachScratch(NamedTuple):
     """Work space for the grid points that an instance reaches.
 
     :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
-    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
+    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one; along a
+        periodic variable the last may come before the first
     :param point: int64, shape (n_points,): points within reach; ``weight``: float64, same shape: the instance's weight there
     """
 
@@ -73,6 +74,41 @@ class Outcomes(NamedTuple):
 
 
 @part
+def factors_in_reach(state, kernel, grid, scratch):
+    """Write the first and the last grid coordinate within reach to ``scratch.at``, and the kernel's factors between them.
+
+    :return: whether there are any along every variable
+    """
+    breadth, min_weight, _ = kernel
+    first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
+    reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
+    for k in range(len(state)):
+        begin = int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin[k]))
+        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin[k])) + 1
+        n = grid.shape[k]
+        if not grid.periodic[k]:
+            begin = max(0, begin)
+            beyond = min(n, beyond)
+        elif beyond - begin >= n:
+            begin, beyond = 0, n
+        else:
+            turns = begin // n
+            begin -= turns * n
+            beyond -= turns * n
+        if begin >= beyond:
+            return False
+        for j in range(begin, beyond):
+            point = j if j < n else j - n
+            apart = difference((point - grid.margin[k]) / grid.cells[k], state[k], grid.periodic[k]) / breadth
+            scratch.kernel[k, point] = np.exp(-apart * apart)
+        first[k] = begin
+        # Beyond the last point of a periodic variable come the first ones.
+        last[k] = beyond if beyond <= n else beyond - n
+        at[k] = begin
+    return True
+
+
+@part
 def points_in_reach(state, kernel, grid, entry, scratch):
     """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
 
@@ -82,22 +118,13 @@ def points_in_reach(state, kernel, grid, entry, scratch):
     :param entry: float64, shape (n_points,)
     :return: how many; they and the weights are in ``scratch.point`` and ``scratch.weight``
     """
-    breadth, min_weight, _ = kernel
+    _, min_weight, _ = kernel
     first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
-    d = len(state)
-    reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
-    for k in range(d):
-        first[k] = max(0, int(np.ceil((state[k] - reach) * grid.cells[k] + grid.margin)))
-        beyond = int(np.floor((state[k] + reach) * grid.cells[k] + grid.margin)) + 1
-        last[k] = min(grid.shape[k], beyond)
-        if first[k] >= last[k]:
-            return 0
-        for j in range(first[k], last[k]):
-            apart = ((j - grid.margin) / grid.cells[k] - state[k]) / breadth
-            scratch.kernel[k, j] = np.exp(-apart * apart)
-        at[k] = first[k]
+    if not factors_in_reach(state, kernel, grid, scratch):
+        return 0
     found = 0
-    inner = d - 1
+    inner = len(state) - 1
+    n_runs = 1 if first[inner] < last[inner] else 2
     while True:
         outer_weight = 1.0
         base = 0
@@ -105,16 +132,21 @@ def points_in_reach(state, kernel, grid, entry, scratch):
             outer_weight *= scratch.kernel[k, at[k]]
             base += at[k] * grid.strides[k]
         if outer_weight >= min_weight:
-            for j in range(first[inner], last[inner]):
-                w = outer_weight * scratch.kernel[inner, j]
-                if w >= entry[base + j] and w >= min_weight:
-                    scratch.point[found] = base + j
-                    scratch.weight[found] = w
-                    found += 1
+            for run in range(n_runs):
+                begin = first[inner] if run == 0 else 0
+                end = grid.shape[inner] if run + 1 < n_runs else last[inner]
+                for j in range(begin, end):
+                    w = outer_weight * scratch.kernel[inner, j]
+                    if w >= entry[base + j] and w >= min_weight:
+                        scratch.point[found] = base + j
+                        scratch.weight[found] = w
+                        found += 1
         k = inner - 1
         while k >= 0:
             at[k] += 1
-            if at[k] < last[k]:
+            if at[k] != last[k]:
+                if at[k] == grid.shape[k]:
+                    at[k] = 0
                 break
             at[k] = first[k]
             k -= 1

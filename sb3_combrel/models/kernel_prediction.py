@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.kernels import near_instances, squared_distance
+from sb3_combrel.common.kernels import any_periodic, near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.planning.q_values import Prediction
 
@@ -67,8 +67,9 @@ def known_before(instances, action, state, kernel, threshold, total):
     scale = -1.0 / (breadth * breadth)
     farthest = np.log(least) / scale
     everything = 0.0
+    wraps = any_periodic(instances.periodic)
     for i in range(instances.size[action]):
-        distance = squared_distance(state, instances.state[action, i])
+        distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
         if distance <= farthest:
             everything += np.exp(distance * scale)
     return everything >= threshold

@@ -4,7 +4,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled
 from sb3_combrel.common.instances import Instances, along_curve
-from sb3_combrel.common.kernels import insert_by_weight, near_instances
+from sb3_combrel.common.kernels import difference, insert_by_weight, near_instances
 from sb3_combrel.common.list_store import reserve
 from sb3_combrel.models.kernel_lists import note_corners
 
@@ -38,7 +38,7 @@ def refill_lists(arrays, instances, slots, grid, kernel, threshold, scratch, pai
         length = np.int64(0)
         total = 0.0
         for f in range(found):
-            w = kernel_weight(instances.state[action, item[f]], at, breadth)
+            w = kernel_weight(instances.state[action, item[f]], at, instances.periodic, breadth)
             if w >= min_weight:
                 slot = slots[action, item[f]]
                 start = lists.start[pair]
@@ -65,9 +65,10 @@ def in_neighbourhoods(instances: Instances, listed: np.ndarray) -> tuple[Instanc
         there = np.flatnonzero(of_action)
         n = len(there)
         slots[action, :n] = order = there[np.argsort(along_curve(instances.state[action, there]), kind="stable")]
-        columns = (instances.state, instances.effect, instances.reward, instances.terminated)
-        rows.append((np.full(n, action), *(column[action, order] for column in columns)))
-    return Instances.of_rows(len(instances.size), *map(np.concatenate, zip(*rows, strict=True))), slots
+        kept = (instances.state, instances.effect, instances.reward, instances.terminated)
+        rows.append((np.full(n, action), *(column[action, order] for column in kept)))
+    actions, states, effects, rewards, ends = map(np.concatenate, zip(*rows, strict=True))
+    return Instances.of_rows(len(instances.size), actions, states, effects, rewards, ends, instances.periodic), slots
 
 
 @compiled
@@ -76,15 +77,15 @@ def unit_coordinates_of(point, grid, at):
     for k in range(len(at)):
         along = point // grid.strides[k]
         point -= along * grid.strides[k]
-        at[k] = (along - grid.margin) / grid.cells[k]
+        at[k] = (along - grid.margin[k]) / grid.cells[k]
 
 
 @compiled
-def kernel_weight(state, at, breadth):
+def kernel_weight(state, at, periodic, breadth):
     """The weight of an instance at a grid point, to the last bit what ``points_in_reach`` says."""
     weight = 1.0
     for k in range(len(at)):
-        apart = (at[k] - state[k]) / breadth
+        apart = difference(at[k], state[k], periodic[k]) / breadth
         weight *= np.exp(-apart * apart)
     return weight
 

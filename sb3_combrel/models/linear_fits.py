@@ -6,8 +6,9 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, inner, part
 from sb3_combrel.common.instances import BLOCK, Instances, put_instance
-from sb3_combrel.common.kernels import measure_gaps, squared_distance
+from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
+from sb3_combrel.common.periodic import bring_near, difference
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.kernel_refill import unit_coordinates_of
 from sb3_combrel.planning.grid import GridArrays
@@ -28,8 +29,8 @@ PRIOR_WEIGHT = 0.5
 PRIOR_OUTCOME_WEIGHT = 0.1
 # Within an episode a pair is fitted again once what new instances leave unexplained may move its prediction by the first,
 # and its row is written again when the prediction has moved by the second; in parts of the size of the action's effects.
-MAX_UNEXPLAINED = 0.1
-TOLERANCE = 0.05
+MAX_UNEXPLAINED = 0.2
+TOLERANCE = 0.1
 # A variable that hardly ever changes is measured by this part of a cell.
 LEAST_SCALE = 0.02
 
@@ -83,6 +84,7 @@ class FitScratch(NamedTuple):
     """Work space for fits.
 
     :param at: float64, shape (n_variables,): unit coordinates of a pair's point
+    :param entering: float64, same shape: where an instance is that comes or goes; ``state``: one that is counted anew
     :param products: float64, shape (2, n_products): of an instance that comes or goes, and of one that is counted anew
     :param factor: float64, shape (n_variables, n_variables)
     :param nearest: float64, shape (n_neighbors,): squared distances
@@ -92,6 +94,8 @@ class FitScratch(NamedTuple):
     """
 
     at: np.ndarray
+    entering: np.ndarray
+    state: np.ndarray
     products: np.ndarray
     factor: np.ndarray
     nearest: np.ndarray
@@ -135,13 +139,17 @@ def points_within(state, reach, widest, grid, scratch):
     d = len(state)
     radius = np.sqrt(widest) * (1 + 1e-12)
     for k in range(d):
-        first[k] = max(0, int(np.ceil((state[k] - radius) * grid.cells[k] + grid.margin)))
-        beyond = int(np.floor((state[k] + radius) * grid.cells[k] + grid.margin)) + 1
-        last[k] = min(grid.shape[k], beyond)
+        if grid.periodic[k]:
+            first[k] = 0
+            last[k] = grid.shape[k]
+        else:
+            first[k] = max(0, int(np.ceil((state[k] - radius) * grid.cells[k] + grid.margin[k])))
+            beyond = int(np.floor((state[k] + radius) * grid.cells[k] + grid.margin[k])) + 1
+            last[k] = min(grid.shape[k], beyond)
         if first[k] >= last[k]:
             return 0
         for j in range(first[k], last[k]):
-            apart = (j - grid.margin) / grid.cells[k] - state[k]
+            apart = difference((j - grid.margin[k]) / grid.cells[k], state[k], grid.periodic[k])
             scratch.along[k, j] = apart * apart
         at[k] = first[k]
     found = 0
@@ -209,12 +217,12 @@ def unexplained_effect(fit, outcome, k):
 
 
 @inlined
-def contradiction(fits, pair, instances, action, slot, shares):
+def contradiction(fits, pair, instances, action, slot, state, shares):
     """By how much an instance may change what its pair predicts.
 
+    :param state: where it is, near the pair's point (see ``bring_near``)
     :param shares: the fraction of the pair's weight that it has, and of the pair's narrower weight
     """
-    state = instances.state[action, slot]
     d = len(state)
     most = 0.0
     for k in range(d):
@@ -240,16 +248,18 @@ def recount(instances, fits, pair, action, kernel, scratch):
     reach = fits.reach[pair]
     n_blocks = measure_blocks(instances, action, scratch.at)
     products = scratch.products[1]
+    wraps = any_periodic(instances.periodic)
     count = np.int64(0)
     total = 0.0
     for block in range(n_blocks):
         if instances.gap[block] > reach * (1 + 1e-12):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
-            distance = squared_distance(scratch.at, instances.state[action, i])
+            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
             if distance > reach:
                 continue
-            products_of(instances.state[action, i], fits.target[action, i], products)
+            bring_near(instances.state[action, i], scratch.at, instances.periodic, scratch.state)
+            products_of(scratch.state, fits.target[action, i], products)
             reward, terminated = instances.reward[action, i], instances.terminated[action, i]
             count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
             total += np.exp(distance * kernel.scale)
@@ -265,7 +275,7 @@ def recount(instances, fits, pair, action, kernel, scratch):
 def measure_blocks(instances, action, at):
     """Measure how far the blocks of an action's instances are; how many blocks there are."""
     n_blocks = (instances.size[action] + BLOCK - 1) // BLOCK
-    measure_gaps(at, instances.block_low[action], instances.block_high[action], n_blocks, instances.gap)
+    measure_gaps(at, instances.block_low[action], instances.block_high[action], instances.periodic, n_blocks, instances.gap)
     return n_blocks
 
 
@@ -275,12 +285,13 @@ def narrow(instances, fits, pair, action, kernel, scratch):
     reach = fits.reach[pair]
     n_blocks = measure_blocks(instances, action, scratch.at)
     nearest = scratch.nearest
+    wraps = any_periodic(instances.periodic)
     length = 0
     for block in range(n_blocks):
         if instances.gap[block] > reach * (1 + 1e-12):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
-            distance = squared_distance(scratch.at, instances.state[action, i])
+            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
             if distance > reach:
                 continue
             k = length if length < kernel.n_neighbors else length - 1
@@ -370,7 +381,10 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
     n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
     put_instance(instances, transition)
-    state = instances.state[action, slot]
+    state = scratch.entering
+    wraps = any_periodic(grid.periodic)
+    for k in range(len(state)):
+        state[k] = instances.state[action, slot, k]
     for k in range(len(state)):
         effect = instances.effect[action, slot, k]
         fits.target[action, slot, k] = effect - prior[k]
@@ -387,6 +401,10 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
         point = scratch.point[f]
         pair = first_pair + point
         distance = scratch.distance[f]
+        if wraps:
+            unit_coordinates_of(point, grid, scratch.at)
+            bring_near(instances.state[action, slot], scratch.at, grid.periodic, state)
+            products_of(state, fits.target[action, slot], products)
         shares = count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
         fits.n_counted[pair] += 1
         if not fits.known[pair]:
@@ -395,7 +413,7 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
                 fits.known[pair] = True
                 fits.unexplained[pair] = np.inf
         if fits.known[pair] or fits.claimed[pair]:
-            fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, shares)
+            fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, state, shares)
             if fits.unexplained[pair] <= MAX_UNEXPLAINED and fits.n_counted[pair] <= fits.limit[pair]:
                 continue
             first = fits.unexplained[pair] == np.inf
@@ -425,16 +443,20 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     """
     n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
-    state = instances.state[action, slot]
+    state = scratch.entering
     reward, terminated = instances.reward[action, slot], instances.terminated[action, slot]
     for k in range(len(state)):
         fits.effect_range[2, action, k] -= abs(instances.effect[action, slot, k])
     products = scratch.products[0]
-    products_of(state, fits.target[action, slot], products)
-    n_found = points_within(state, fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch)
+    n_found = points_within(
+        instances.state[action, slot], fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch
+    )
     emptied = 0
     for f in range(n_found):
         pair = first_pair + scratch.point[f]
+        unit_coordinates_of(scratch.point[f], grid, scratch.at)
+        bring_near(instances.state[action, slot], scratch.at, grid.periodic, state)
+        products_of(state, fits.target[action, slot], products)
         count_instance(fits, pair, scratch.distance[f], products, reward, terminated, kernel, -1.0)
         fits.n_counted[pair] -= 1
         if fits.n_counted[pair] <= 0:

@@ -6,8 +6,9 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import BLOCK, Instances
-from sb3_combrel.common.kernels import measure_gaps, squared_distance
+from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
+from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.linear_fits import (
     PRIOR_WEIGHT,
@@ -26,6 +27,7 @@ class NearestLists(NamedTuple):
     :param item: int32, shape (n_actions, n_neighbors): instances, nearest first
     :param distance: float64, same shape: their squared distances
     :param length: int64, shape (n_actions,)
+    :param state: float64, shape (n_variables,)
     :param products: float64, shape (2, n_products): sums, and of one instance
     :param factor: float64, shape (n_variables, n_variables); ``fit`` and ``outcome``: as in ``LinearFits``, of one pair
     """
@@ -33,6 +35,7 @@ class NearestLists(NamedTuple):
     item: np.ndarray
     distance: np.ndarray
     length: np.ndarray
+    state: np.ndarray
     products: np.ndarray
     factor: np.ndarray
     fit: np.ndarray
@@ -71,6 +74,7 @@ def nearest_instances(instances, action, state, farthest, items, distances, n_be
     """
     count = instances.size[action]
     room = len(items)
+    wraps = any_periodic(instances.periodic)
     instances.searches[0] += 1
     search = instances.searches[0]
     length = np.int64(0)
@@ -78,18 +82,18 @@ def nearest_instances(instances, action, state, farthest, items, distances, n_be
         before = np.int64(items[b])
         if before < count:
             instances.seen[action, before] = search
-            distance = squared_distance(state, instances.state[action, before])
+            distance = squared_distance(state, instances.state[action, before], instances.periodic, wraps)
             if distance <= farthest:
                 length = insert_by_distance(items, distances, length, before, distance)
     if length == room:
         farthest = distances[room - 1]
     n_blocks = (count + BLOCK - 1) // BLOCK
-    measure_gaps(state, instances.block_low[action], instances.block_high[action], n_blocks, instances.gap)
+    measure_gaps(state, instances.block_low[action], instances.block_high[action], instances.periodic, n_blocks, instances.gap)
     for block in range(n_blocks):
         if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i])
+            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
             if distance > farthest or instances.seen[action, i] == search:
                 continue
             length = insert_by_distance(items, distances, length, i, distance)
@@ -116,7 +120,8 @@ def fit_nearest(instances, target, action, state, kernel, near):
     for k in range(length):
         i = near.item[action, k]
         distance = near.distance[action, k]
-        products_of(instances.state[action, i], target[action, i], products)
+        bring_near(instances.state[action, i], state, instances.periodic, near.state)
+        products_of(near.state, target[action, i], products)
         add_products(sums, np.exp(distance * scale), products)
         total += np.exp(distance * kernel.scale)
         # Seen from the nearest: far from all instances the weights would be too small for a quotient.
@@ -126,7 +131,7 @@ def fit_nearest(instances, target, action, state, kernel, near):
         if instances.terminated[action, i]:
             outcome[2] += weight
         for v in range(d):
-            outcome[3 + v] += weight * instances.state[action, i, v]
+            outcome[3 + v] += weight * near.state[v]
             outcome[3 + d + v] += weight * target[action, i, v]
     closeness = max(1e-200, np.exp(nearest * kernel.outcome_scale))
     for k in range(len(outcome)):

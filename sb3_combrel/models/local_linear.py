@@ -7,6 +7,7 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import n_products
+from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
 from sb3_combrel.models.linear_fits import (
@@ -101,6 +102,8 @@ class LocalLinear(Model):
         )
         self._scratch = FitScratch(
             at=np.empty(d),
+            entering=np.empty(d),
+            state=np.empty(d),
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             nearest=np.empty(n_near),
@@ -115,6 +118,7 @@ class LocalLinear(Model):
             item=np.empty((self.n_actions, n_near), dtype=np.int32),
             distance=np.empty((self.n_actions, n_near)),
             length=np.zeros(self.n_actions, dtype=np.int64),
+            state=np.empty(d),
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             fit=np.empty(d + d * d),
@@ -172,7 +176,8 @@ class LocalLinear(Model):
         instances = self._instances
         size = int(instances.size[action])
         if self.settings.max_instances is not None and size >= self.settings.max_instances:
-            slot = int(((instances.state[action, :size] - state) ** 2).sum(axis=1).argmin())
+            apart = differences(instances.state[action, :size], state, instances.periodic)
+            slot = int((apart**2).sum(axis=1).argmin())
             n = _leave.call(instances, self.fits, self.grid.arrays, self._kernel, action, slot, self._scratch)
             return slot, self._scratch.point[:n] + action * self.grid.n_points
         if size == instances.capacity:
@@ -299,7 +304,7 @@ class LocalLinear(Model):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Compute sums and fits from the instances; pairs that were known stay known."""
-        instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1])
+        instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self.instances = instances
         fits = self.fits
         fits.reach[:] = state["reach"]

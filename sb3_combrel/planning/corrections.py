@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
-from sb3_combrel.planning.grid import interpolate
+from sb3_combrel.planning.grid import interpolate, wrapped
 
 CELLS_PER_GRID_CELL = 3
 # Box edges, joint limits and round step lengths lie on round numbers. A state on a cell's edge would be stored on one side
@@ -127,13 +127,18 @@ class ValueScratch(NamedTuple):
 
 
 @inlined
-def cell_key(position, shape):
+def cell_key(position, grid):
     """The number of the small cell around a position in grid coordinates."""
     key = 0
     for k in range(len(position)):
-        last = shape[k] - 1
-        at = min(max(position[k], 0.0), float(last))
-        key = key * (last * CELLS_PER_GRID_CELL + 1) + int(at * CELLS_PER_GRID_CELL + CELL_OFFSET)
+        if grid.periodic[k]:
+            n_cells = grid.shape[k] * CELLS_PER_GRID_CELL
+            cell = int(wrapped(position[k], grid.shape[k]) * CELLS_PER_GRID_CELL + CELL_OFFSET) % n_cells
+        else:
+            last = grid.shape[k] - 1
+            n_cells = last * CELLS_PER_GRID_CELL + 1
+            cell = int(min(max(position[k], 0.0), float(last)) * CELLS_PER_GRID_CELL + CELL_OFFSET)
+        key = key * n_cells + cell
     return key
 
 
@@ -162,7 +167,7 @@ def corrected_value(values, corrections, grid, scratch):
     """The value at ``scratch.position``: interpolated, and capped if the cell has been corrected."""
     value = interpolate(values, scratch.position, grid, scratch.corner_index, scratch.corner_weight)
     if corrections.n_states[0] > 0:
-        m = corrections.table[find_cell(corrections.table, corrections.key, cell_key(scratch.position, grid.shape))]
+        m = corrections.table[find_cell(corrections.table, corrections.key, cell_key(scratch.position, grid))]
         if m >= 0:
             value = cap_value(value, m, values, corrections, grid, scratch)
     return value
@@ -172,7 +177,7 @@ def corrected_value(values, corrections, grid, scratch):
 def cap_value(value, m, values, corrections, grid, scratch):
     """``value``, lowered by as much as the interpolated value at corrected state ``m`` is too high."""
     for k in range(len(scratch.corrected)):
-        scratch.corrected[k] = corrections.state[m, k] * grid.cells[k] + grid.margin
+        scratch.corrected[k] = corrections.state[m, k] * grid.cells[k] + grid.margin[k]
     there = interpolate(values, scratch.corrected, grid, scratch.corner_index, scratch.corner_weight)
     return value + min(0.0, corrections.value[m] - there)
 
@@ -201,8 +206,8 @@ def visit(values, corrections, state, best_q, visitor, grid, scratch):
         of the interpolated value that is not corrected; visits in an episode before which nothing is
     """
     for k in range(len(state)):
-        scratch.position[k] = state[k] * grid.cells[k] + grid.margin
-    key = cell_key(scratch.position, grid.shape)
+        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
+    key = cell_key(scratch.position, grid)
     at = find_cell(corrections.table, corrections.key, key)
     m = corrections.table[at]
     episode, tolerance, max_visits = visitor

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.periodic import flag_array
 
 
 class GridArrays(NamedTuple):
@@ -16,7 +17,8 @@ class GridArrays(NamedTuple):
     :param shape: int64, shape (n_variables,): points along each variable
     :param strides: int64, same shape: what one step along a variable adds to a point's number
     :param cells: float64, same shape: cells per unit
-    :param margin: cells beyond either end of the unit box
+    :param margin: float64, same shape: cells beyond either end of the unit box
+    :param periodic: bool, same shape: the last point along a variable is a cell away from the first; it has no margin
 
     A state with unit coordinates u has *grid coordinates* u * cells + margin: whole numbers at the grid points.
     """
@@ -24,14 +26,23 @@ class GridArrays(NamedTuple):
     shape: np.ndarray
     strides: np.ndarray
     cells: np.ndarray
-    margin: float
+    margin: np.ndarray
+    periodic: np.ndarray
+
+
+@inlined
+def wrapped(at, n):
+    """A grid coordinate of a periodic variable with ``n`` points, in [0, n)."""
+    at -= n * np.floor(at / n)
+    # A tiny negative one is rounded up to n.
+    return at if at < n else 0.0
 
 
 @inlined
 def corners_of(position, grid, corner_index, corner_weight):
     """Grid points around ``position`` and their multilinear weights.
 
-    :param position: float64, shape (n_variables,): grid coordinates; clipped into the grid
+    :param position: float64, shape (n_variables,): grid coordinates; wrapped or clipped into the grid
     :param corner_index: int64 scratch, shape (2 ** n_variables,)
     :param corner_weight: float64 scratch of the same shape
     :return: how many corners have a weight above 0
@@ -41,14 +52,20 @@ def corners_of(position, grid, corner_index, corner_weight):
     n_corners = 1
     for k in range(len(position)):
         last = grid.shape[k] - 1
-        at = min(max(position[k], 0.0), float(last))
+        stride = grid.strides[k]
+        if grid.periodic[k]:
+            at = wrapped(position[k], grid.shape[k])
+        else:
+            at = min(max(position[k], 0.0), float(last))
         low = int(at)
         part = at - low
         for c in range(n_corners):
-            corner_index[c] += low * grid.strides[k]
+            corner_index[c] += low * stride
         if part > 0.0:
+            # Beyond the last point there is something between the points of a periodic variable only.
+            step = stride if low < last else -last * stride
             for c in range(n_corners):
-                corner_index[n_corners + c] = corner_index[c] + grid.strides[k]
+                corner_index[n_corners + c] = corner_index[c] + step
                 corner_weight[n_corners + c] = corner_weight[c] * part
                 corner_weight[c] *= 1.0 - part
             n_corners *= 2
@@ -74,22 +91,32 @@ class StateGrid:
     """A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
 
     Effects are relative, so a predicted successor can lie outside the box. In the margin it has a value of its own;
-    beyond that it counts as the nearest point of the grid.
+    beyond that it counts as the nearest point of the grid. Along a periodic variable the grid has no end: there are
+    2**resolution points and no margin.
 
     :param n_variables: number of state variables
     :param resolution: one number for all variables, or one for each
-    :param margin: cells beyond either end of the box
+    :param margin: cells beyond either end of the box, along the variables that are not periodic
+    :param periodic: one bool for each state variable; None: none is periodic
     """
 
-    def __init__(self, n_variables: int, resolution: int | Sequence[int], margin: int = 0):
+    def __init__(
+        self,
+        n_variables: int,
+        resolution: int | Sequence[int],
+        margin: int = 0,
+        periodic: Sequence[bool] | np.ndarray | None = None,
+    ):
         per_variable = np.broadcast_to(np.asarray(resolution, dtype=np.int64), (n_variables,))
-        shape = 2**per_variable + 1 + 2 * margin
+        flags = flag_array(periodic, n_variables)
+        margins = np.where(flags, 0, margin)
+        shape = np.where(flags, 2**per_variable, 2**per_variable + 1 + 2 * margins)
         strides = np.concatenate([np.cumprod(shape[:0:-1])[::-1], [1]]).astype(np.int64)
         self.n_variables = n_variables
         self.resolution = tuple(int(r) for r in per_variable)
         self.margin = margin
         self.n_points = int(np.prod(shape))
-        self.arrays = GridArrays(shape=shape, strides=strides, cells=2.0**per_variable, margin=float(margin))
+        self.arrays = GridArrays(shape, strides, 2.0**per_variable, margins.astype(np.float64), flags)
         # The same as a plain tuple (see ``common.compiled``).
         self.plain = tuple(self.arrays)
         self._corner_index = np.empty(2**n_variables, dtype=np.int64)
@@ -107,7 +134,7 @@ class StateGrid:
         :return: unit coordinates, shape (n, n_variables)
         """
         coordinates = np.stack(np.unravel_index(points, tuple(self.arrays.shape)), axis=-1)
-        return (coordinates - self.margin) / self.arrays.cells
+        return (coordinates - self.arrays.margin) / self.arrays.cells
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
         """Multilinear interpolation.
@@ -115,7 +142,7 @@ class StateGrid:
         :param values: at the grid points, shape (n_points,)
         :param state: unit coordinates, shape (n_variables,); outside the grid the nearest point of it counts
         """
-        position = state * self.arrays.cells + self.margin
+        position = state * self.arrays.cells + self.arrays.margin
         return interpolate_once(values, position, self.arrays, self._corner_index, self._corner_weight)
 
 
@@ -144,26 +171,32 @@ MAX_PAIRS_BY_DEFAULT = 1_000_000
 
 
 def fitting_grid(
-    n_variables: int, n_actions: int, resolution: int | Sequence[int] | None, model_breadth: float, min_weight: float
+    n_variables: int,
+    n_actions: int,
+    resolution: int | Sequence[int] | None,
+    model_breadth: float,
+    min_weight: float,
+    periodic: Sequence[bool] | None = None,
 ) -> StateGrid:
     """The grid for a task: of the given resolution, or of one that suits the kernel.
 
     Up to two variables it has a margin of one cell, as the original has states outside the box: there it finds the
     shorter of two plans more often. With more variables the margin would double the grid for little.
 
+    :param periodic: one bool for each state variable; None: none is periodic
     :raises ValueError: if the grid would not fit in memory
     """
     reach = model_breadth * np.sqrt(-np.log(min_weight))
     margin = 1 if n_variables <= 2 else 0
     if resolution is None:
         resolution = default_resolution(n_variables, reach)
-        while resolution > 1 and _n_points(n_variables, resolution, margin) * n_actions > MAX_PAIRS_BY_DEFAULT:
+        while resolution > 1 and _n_points(n_variables, resolution, margin, periodic) * n_actions > MAX_PAIRS_BY_DEFAULT:
             resolution -= 1
-    n_points = _n_points(n_variables, resolution, margin)
+    n_points = _n_points(n_variables, resolution, margin, periodic)
     size = n_points * (n_actions * BYTES_PER_PAIR + BYTES_PER_POINT)
     if size > _memory() / 2:
         fits = int(np.max(resolution))
-        while fits > 1 and _n_points(n_variables, fits, margin) * (n_actions * BYTES_PER_PAIR) > _memory() / 2:
+        while fits > 1 and _n_points(n_variables, fits, margin, periodic) * (n_actions * BYTES_PER_PAIR) > _memory() / 2:
             fits -= 1
         raise ValueError(
             f"resolution={resolution} with {n_variables} state variables and {n_actions} actions means {n_points:,} grid "
@@ -171,12 +204,13 @@ def fitting_grid(
             f"resolution={fits} fits"
         )
     _warn_if_too_coarse(n_variables, resolution, reach, model_breadth)
-    return StateGrid(n_variables, resolution, margin)
+    return StateGrid(n_variables, resolution, margin, periodic)
 
 
-def _n_points(n_variables: int, resolution: int | Sequence[int], margin: int) -> int:
+def _n_points(n_variables: int, resolution: int | Sequence[int], margin: int, periodic: Sequence[bool] | None) -> int:
     axes = np.broadcast_to(np.asarray(resolution), (n_variables,))
-    return int(np.prod([2 ** int(r) + 1 + 2 * margin for r in axes], dtype=object))
+    ends = [0 if wraps else 1 + 2 * margin for wraps in flag_array(periodic, n_variables)]
+    return int(np.prod([2 ** int(r) + end for r, end in zip(axes, ends, strict=True)], dtype=object))
 
 
 def _memory() -> float:

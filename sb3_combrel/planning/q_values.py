@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
+from sb3_combrel.common.periodic import difference
 from sb3_combrel.planning.corrections import CorrectionArrays, ValueScratch, corrected_value, visit
 from sb3_combrel.planning.grid import GridArrays
 
@@ -68,10 +69,13 @@ def moves(state, effect, grid, scratch):
     """Write where ``effect`` leads from ``state`` to ``scratch.position`` (grid coordinates); whether that is elsewhere."""
     moved = 0.0
     for k in range(len(state)):
-        last = float(grid.shape[k] - 1)
-        here = state[k] * grid.cells[k] + grid.margin
-        there = min(max(here + effect[k] * grid.cells[k], 0.0), last)
-        moved = max(moved, abs(there - here))
+        here = state[k] * grid.cells[k] + grid.margin[k]
+        there = here + effect[k] * grid.cells[k]
+        if grid.periodic[k]:
+            moved = max(moved, abs(difference(effect[k], 0.0, True)) * grid.cells[k])
+        else:
+            there = min(max(there, 0.0), float(grid.shape[k] - 1))
+            moved = max(moved, abs(there - here))
         scratch.position[k] = there
     return moved >= 1e-9
 

@@ -161,7 +161,7 @@ def backup_around(values, mdp, queue, state, grid, bounds, tolerance, scratch):
     Where the agent is, a value that is too large must be lowered at once: until then the agent stays.
     """
     for k in range(len(state)):
-        scratch.position[k] = state[k] * grid.cells[k] + grid.margin
+        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
     backups = 0
     for c in range(corners_of(scratch.position, grid, scratch.corner_index, scratch.corner_weight)):
         point = scratch.corner_index[c]

@@ -31,7 +31,7 @@ def note_visit_plain(state, weight, threshold, n_optimistic, visits, grid, scrat
     grid = GridArrays(*grid)
     position, corner_index, corner_weight = scratch
     for k in range(len(state)):
-        position[k] = state[k] * grid.cells[k] + grid.margin
+        position[k] = state[k] * grid.cells[k] + grid.margin[k]
     found = 0
     for c in range(corners_of(position, grid, corner_index, corner_weight)):
         point = corner_index[c]

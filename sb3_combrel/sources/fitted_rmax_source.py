@@ -46,11 +46,12 @@ def learn_transitions(env: str | gym.Env[Any, Any], seed: int | None, n_episodes
         raise RuntimeError("Fitted R-Max is not registered as a learner of source tasks: import sb3_combrel first")
     task = make_env(env)
     try:
-        model = _registered[0](task, seed=seed, **learner)
+        model: Any = _registered[0](task, seed=seed, **learner)
         recorder = TransitionRecorder(bounds=learner.get("bounds"), seed=seed)
         # Episodes end the learning, not steps: the task may end them at any length.
         model.learn(10**9, callback=[recorder, StopTrainingOnMaxEpisodes(n_episodes)])
-        return recorder.transitions()
+        # The learner's, which need not be the environment's.
+        return recorder.transitions()._replace(periodic=model.policy.agent.periodic)
     finally:
         if isinstance(env, str):
             task.close()

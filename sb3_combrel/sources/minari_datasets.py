@@ -69,7 +69,7 @@ def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> Mina
             action_space=spaces.Discrete(source.n_actions),
             **metadata,
         )
-    names = {"state_names": source.state_names, "action_names": source.action_names}
+    names = {name: getattr(source, name) for name in ("state_names", "action_names", "periodic")}
     dataset.storage.update_metadata({_METADATA_KEY: json.dumps({"names": names, "origin": source.origin})})
     return dataset
 

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_combrel.common.checks import as_count
+from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.common.serialisation import damage_text, register_reader, register_writer
 from sb3_combrel.sources import fitted_rmax_source, minari_datasets, q_learning, recording
@@ -52,6 +53,7 @@ class SourceInstances:
     :param state_names: name of each state variable; by default s0, s1, ...
     :param action_names: name of each action; by default a0, a1, ...
     :param origin: where the instances came from, a dict that JSON can hold
+    :param periodic: which state variables are periodic, their bounds one period apart: one bool for each; () for none
     :raises ValueError: if there are no instances, or if an argument does not fit the others or is not finite
     """
 
@@ -66,6 +68,7 @@ class SourceInstances:
     state_names: tuple[str, ...] = ()
     action_names: tuple[str, ...] = ()
     origin: Mapping[str, Any] = field(default_factory=dict)
+    periodic: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
         scaling = StateScaling(self.low, self.high)
@@ -87,6 +90,7 @@ class SourceInstances:
             object.__setattr__(self, name, array)
         object.__setattr__(self, "state_names", checked_names("state_names", self.state_names, d, "s"))
         object.__setattr__(self, "action_names", checked_names("action_names", self.action_names, self.n_actions, "a"))
+        object.__setattr__(self, "periodic", periodic_flags(None if self.periodic == () else self.periodic, d))
         try:
             object.__setattr__(self, "origin", json.loads(json.dumps(dict(self.origin))))
         except (TypeError, ValueError) as error:
@@ -255,7 +259,8 @@ class SourceInstances:
         if method == "random":
             rows = random_rows(self.terminated, n_instances, rng)
         else:
-            rows = covering_rows(self.scaling.to_unit(self.states), self.actions, self.terminated, n_instances, rng)
+            units, flags = self.scaling.to_unit(self.states), np.array(self.periodic)
+            rows = covering_rows(units, self.actions, self.terminated, n_instances, rng, flags)
         chosen = {"method": method, "seed": seed, "chosen_from": len(self)}
         return self._with_rows(rows, {**self.origin, "subset": chosen})
 
@@ -302,6 +307,7 @@ class SourceInstances:
             "state_names": self.state_names,
             "action_names": self.action_names,
             "origin": self.origin,
+            "periodic": self.periodic,
         }
         return {name: getattr(self, name) for name in ARRAY_NAMES}, header
 
@@ -336,6 +342,7 @@ class SourceInstances:
             state_names=tuple(header["state_names"]),
             action_names=tuple(header["action_names"]),
             origin=header["origin"],
+            periodic=tuple(header.get("periodic", ())),
         )
 
     def _transitions(self) -> Transitions:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_combrel.common.periodic import differences
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -31,7 +33,14 @@ def random_rows(terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Gener
     return _keep_terminal(rng.choice(len(terminated), n_rows, replace=False), terminated, rng)
 
 
-def covering_rows(units: Floats, actions: Ints, terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Generator) -> Ints:
+def covering_rows(
+    units: Floats,
+    actions: Ints,
+    terminated: NDArray[np.bool_],
+    n_rows: int,
+    rng: np.random.Generator,
+    periodic: NDArray[np.bool_] | None = None,
+) -> Ints:
     """
     About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
 
@@ -40,6 +49,7 @@ def covering_rows(units: Floats, actions: Ints, terminated: NDArray[np.bool_], n
     :param terminated: which of them are terminal, shape (n,)
     :param n_rows: number of instances to select; all if there are no more
     :param rng: picks the first instance of each action
+    :param periodic: which state variables are periodic, bool, shape (n_variables,); None for none
     :return: row numbers, ascending
     """
     if n_rows >= len(actions):
@@ -47,18 +57,18 @@ def covering_rows(units: Floats, actions: Ints, terminated: NDArray[np.bool_], n
     rows_of = [np.flatnonzero(actions == action) for action in np.unique(actions)]
     quotas = _equal_quotas(np.array([len(rows) for rows in rows_of]), n_rows)
     # Selected rows of an action come in the order of selection, so the last one is the least informative.
-    chosen = [rows[_farthest_points(units[rows], quota, rng)] for rows, quota in zip(rows_of, quotas, strict=True)]
+    chosen = [rows[_farthest_points(units[rows], quota, rng, periodic)] for rows, quota in zip(rows_of, quotas, strict=True)]
     return _keep_terminal(np.concatenate(chosen), terminated, rng)
 
 
-def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator) -> Ints:
+def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator, periodic: NDArray[np.bool_] | None) -> Ints:
     """Begin anywhere, then always add the point that is farthest from all points so far."""
     chosen = np.empty(n_points, dtype=np.int64)
     distance = np.full(len(units), np.inf)
     candidate = int(rng.integers(len(units)))
     for i in range(n_points):
         chosen[i] = candidate
-        np.minimum(distance, ((units - units[candidate]) ** 2).sum(axis=1), out=distance)
+        np.minimum(distance, (differences(units, units[candidate], periodic) ** 2).sum(axis=1), out=distance)
         # Of identical states one is as good as another, but none must be chosen twice.
         distance[candidate] = -1.0
         candidate = int(distance.argmax())

@@ -33,6 +33,7 @@ class Transitions(NamedTuple):
     :param state_names: names of the state variables, () if not known
     :param action_names: names of the actions, () if not known
     :param origin: where the transitions came from, a dict that JSON can hold
+    :param periodic: which state variables are periodic, () for none
     """
 
     states: Floats
@@ -46,6 +47,7 @@ class Transitions(NamedTuple):
     state_names: tuple[str, ...]
     action_names: tuple[str, ...]
     origin: Mapping[str, Any]
+    periodic: tuple[bool, ...] = ()
 
 
 class TransitionLog:
@@ -92,14 +94,14 @@ class TransitionLog:
             self._rows[position] = row
 
     def transitions(
-        self, scaling: StateScaling, n_actions: int, names: Mapping[str, Sequence[str]], origin: Mapping[str, Any]
+        self, scaling: StateScaling, n_actions: int, names: Mapping[str, Sequence[Any]], origin: Mapping[str, Any]
     ) -> Transitions:
         """
         What is in the log.
 
         :param scaling: bounds of the states
         :param n_actions: number of actions of the task
-        :param names: ``state_names`` and ``action_names``, as far as known
+        :param names: ``state_names``, ``action_names`` and ``periodic``, as far as known
         :param origin: where the transitions came from
         :raises ValueError: if there are no transitions
         """
@@ -118,6 +120,7 @@ class TransitionLog:
             tuple(names.get("state_names", ())),
             tuple(names.get("action_names", ())),
             origin,
+            tuple(names.get("periodic", ())),
         )
 
 

@@ -49,8 +49,9 @@ def plane_through(
     across, up = variables
     g = grid.arrays
     unit = np.full(grid.n_variables, 0.5) if at is None else np.clip(scaling.to_unit(at), 0.0, 1.0)
-    held = np.rint(unit * g.cells + g.margin).astype(np.int64)
-    inner = [np.arange(grid.margin, n - grid.margin) for n in g.shape]
+    nearest = np.rint(unit * g.cells + g.margin).astype(np.int64)
+    held = np.where(g.periodic, nearest % g.shape, nearest)
+    inner = [np.arange(margin, n - margin) for margin, n in zip(g.margin.astype(np.int64), g.shape, strict=True)]
     held_state = scaling.to_raw((held - g.margin) / g.cells)
     points = np.array(int(held @ g.strides)) + (inner[across] - held[across]) * g.strides[across]
     rows = np.zeros(1, dtype=np.int64) if up == across else (inner[up] - held[up]) * g.strides[up]
@@ -68,7 +69,9 @@ def plane_through(
 def _edges(grid: StateGrid, scaling: StateScaling, variable: int) -> tuple[float, float]:
     half_cell = 0.5 / grid.arrays.cells[variable]
     low, high = scaling.low[variable], scaling.high[variable]
-    return float(low - half_cell * (high - low)), float(high + half_cell * (high - low))
+    # The last point of a periodic variable is a cell away from its upper bound, which is the lower one again.
+    beyond = -half_cell if grid.arrays.periodic[variable] else half_cell
+    return float(low - half_cell * (high - low)), float(high + beyond * (high - low))
 
 
 def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> list[tuple[int, int]]:

@@ -25,7 +25,11 @@ def default_bandwidths(source: Instances) -> Bandwidths:
         if n > 1:
             states = source.state[action, :n]
             nth = min(N_SHARING, n - 1) + 1
-            distances.append(cKDTree(states).query(states, k=[nth])[0].ravel())
+            if source.periodic.any():
+                # The tree wants them below the period.
+                states = np.where(source.periodic, states % 1.0, states)
+            tree = cKDTree(states, boxsize=np.where(source.periodic, 1.0, 0.0) if source.periodic.any() else None)
+            distances.append(tree.query(states, k=[nth])[0].ravel())
         effects.append((source.effect[action, :n] ** 2).sum(axis=1))
         rewards.append(source.reward[action, :n])
     start = float(np.median(np.concatenate(distances))) ** 2 if distances else 0.02

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 
 if TYPE_CHECKING:
@@ -32,6 +34,8 @@ class TargetTask:
     :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
     :param state_names: names of the state variables, for display
     :param action_names: names of the actions, for display
+    :param periodic: which state variables are periodic, so that 0 and 1 are the same unit coordinate: one bool for each,
+        None for none
     """
 
     scaling: StateScaling
@@ -42,6 +46,10 @@ class TargetTask:
     min_fraction: float
     state_names: tuple[str, ...]
     action_names: tuple[str, ...]
+    periodic: Sequence[bool] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "periodic", periodic_flags(self.periodic, self.n_variables))
 
     @property
     def n_variables(self) -> int:

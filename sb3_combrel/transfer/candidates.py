@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.instances import Instances, along_curve
+from sb3_combrel.common.periodic import differences
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -213,20 +214,24 @@ def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
     """
     Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
 
-    They are sorted along a curve that fills the space, so that a search passes over most blocks.
+    They are sorted along a curve that fills the space, so that a search passes over most blocks. A variable counts as
+    periodic if it is in all sources that have it.
     """
     n_actions = sum(source.n_actions for source in sources)
     n_variables = max(source.n_variables for source in sources)
-    columns, offset = [], 0
+    columns, offset, periodic = [], 0, np.ones(n_variables, dtype=np.bool_)
     for source in sources:
+        periodic[: source.n_variables] &= source.periodic
         states = source.scaling.to_unit(source.states)
-        effects = source.scaling.to_unit(source.next_states) - states
+        effects = differences(source.scaling.to_unit(source.next_states), states, np.array(source.periodic))
+        states = np.where(source.periodic, states - np.floor(states), states) if any(source.periodic) else states
         order = np.argsort(along_curve(states), kind="stable")
         padding = ((0, 0), (0, n_variables - source.n_variables))
         rows = (source.actions + offset, np.pad(states, padding), np.pad(effects, padding), source.rewards, source.terminated)
         columns.append([column[order] for column in rows])
         offset += source.n_actions
-    return Instances.of_rows(n_actions, *map(np.concatenate, zip(*columns, strict=True)))
+    actions, starts, moves, rewards, ends = map(np.concatenate, zip(*columns, strict=True))
+    return Instances.of_rows(n_actions, actions, starts, moves, rewards, ends, periodic)
 
 
 def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:

@@ -7,12 +7,14 @@ a product of one factor a variable, the exponentials needed are one for each pai
 whatever the number of state mappings.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner_fast, part
 from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.periodic import difference, flag_array
 from sb3_combrel.transfer.candidates import MappingTable
 from sb3_combrel.transfer.equations import Bandwidths
 
@@ -63,6 +65,7 @@ class ComplianceScratch(NamedTuple):
     :param weight: float64, shape (n,): product of a mapping's start kernels; ``hit``: of its outcome kernels
     :param still: float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
     :param min_evidence: sum of start kernels below which a mapping has no compliance
+    :param periodic: bool, shape (n_target_variables,): which variables of the target are periodic
     """
 
     variable: np.ndarray
@@ -82,16 +85,23 @@ class ComplianceScratch(NamedTuple):
     hit: np.ndarray
     still: np.ndarray
     min_evidence: float
+    periodic: np.ndarray
 
     @classmethod
     def for_mappings(
-        cls, mappings: MappingTable, source: Instances, start: np.ndarray | float, min_evidence: float = DEFAULT_MIN_EVIDENCE
+        cls,
+        mappings: MappingTable,
+        source: Instances,
+        start: np.ndarray | float,
+        min_evidence: float = DEFAULT_MIN_EVIDENCE,
+        periodic: Sequence[bool] | None = None,
     ) -> "ComplianceScratch":
         """
         Make work space for a table of state mappings and the instances of a source.
 
         :param start: start bandwidth, of all mappings or of each, shape (n_state_mappings,)
         :param min_evidence: see the class
+        :param periodic: see the class; None: none is periodic
         """
         largest = int(source.size.max())
         number: dict[tuple[int, int, bool], int] = {}
@@ -122,6 +132,7 @@ class ComplianceScratch(NamedTuple):
             hit=np.empty(largest),
             still=np.empty(n_mappings),
             min_evidence=float(min_evidence),
+            periodic=flag_array(periodic, mappings.variable.shape[1]),
         )
 
 
@@ -161,12 +172,17 @@ def _exponentiate(row, n):
 
 
 @inner_fast
-def _squares(at, of_source, bandwidth, row, n):
+def _squares(at, of_source, bandwidth, periodic, row, n):
     """Write to ``row`` the squared distances of ``at`` from what the source instances have, over the bandwidth."""
     scale = 1.0 / bandwidth
-    for j in range(n):
-        apart = at - of_source[j]
-        row[j] = apart * apart * scale
+    if periodic:
+        for j in range(n):
+            apart = difference(at, of_source[j], True)
+            row[j] = apart * apart * scale
+    else:
+        for j in range(n):
+            apart = at - of_source[j]
+            row[j] = apart * apart * scale
 
 
 @inner_fast
@@ -177,13 +193,16 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
         v = scratch.variable[f]
         k = scratch.source[f]
         side = -1.0 if scratch.mirrored[f] else 1.0
-        _squares(side * effect[v], scratch.effect[action, k], bandwidths.outcome, scratch.outcome[f], n)
+        periodic = scratch.periodic[v]
+        _squares(side * effect[v], scratch.effect[action, k], bandwidths.outcome, periodic, scratch.outcome[f], n)
         _exponentiate(scratch.outcome[f], n)
     for s in range(len(scratch.start_factor)):
         f = scratch.start_factor[s]
         at = state[scratch.variable[f]]
         at = 1.0 - at if scratch.mirrored[f] else at
-        _squares(at, scratch.state[action, scratch.source[f]], scratch.start_bandwidth[s], scratch.start[s], n)
+        periodic = scratch.periodic[scratch.variable[f]]
+        of_source = scratch.state[action, scratch.source[f]]
+        _squares(at, of_source, scratch.start_bandwidth[s], periodic, scratch.start[s], n)
         _exponentiate(scratch.start[s], n)
     for j in range(n):
         off = reward - source.reward[action, j]

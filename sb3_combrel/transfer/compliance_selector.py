@@ -89,7 +89,9 @@ class ComplianceSelector(Selector):
         self.n_switches = 0
         self._allocate()
         # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
-        scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances, options.starts, options.min_evidence)
+        scratch = ComplianceScratch.for_mappings(
+            candidates.table, candidates.instances, options.starts, options.min_evidence, task.periodic
+        )
         source, mappings = tuple(candidates.instances), tuple(candidates.table)
         self._measuring = source, mappings, tuple(options.bandwidths), tuple(scratch), self._table
         self._limits = float(task.exploration_threshold), self.limit
@@ -108,7 +110,8 @@ class ComplianceSelector(Selector):
         self._listed = np.empty((n_actions, 64), dtype=np.int64)
         self._n_listed = np.zeros(n_actions, dtype=np.int64)
         # Variable by variable: the loop over all states reads them in a row.
-        self._sample = np.ascontiguousarray(self.task.sample_states.T)
+        self._periodic = np.array(self.task.periodic)
+        self._sample = np.ascontiguousarray(self.task.sample_states.T), self._periodic
         self._apart = np.empty(n_points)
         self._near = np.full((n_actions, n_points, n_neighbors), -1, dtype=np.int64)
         self._distance = np.full((n_actions, n_points, n_neighbors), self.limit)
@@ -176,7 +179,8 @@ class ComplianceSelector(Selector):
         if n > len(self._found_at[0]):
             self._make_room_at(2 * n)
         near, _, first, last = self._found_at
-        query, recorded = (states, actions, own_weight), (self.transitions.states, self._listed, self._n_listed)
+        query = states, actions, own_weight
+        recorded = self.transitions.states, self._listed, self._n_listed, self._periodic
         while not _select.call(query, recorded, self._limits, self._plain_cache, self.first, self._draws_at, self._found_at):
             self._measure(near[:n])
         return first[:n], last[:n]

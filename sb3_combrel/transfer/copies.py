@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
-from sb3_combrel.common.instances import Instances, along_curve
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.periodic import differences
 from sb3_combrel.models.linear_fits import Kernel
 from sb3_combrel.models.linear_prediction import NearestLists
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel, predict_source
 
 # The smallest scale that compliance is measured by, squared unit coordinates: a variable that never moves.
@@ -27,9 +30,9 @@ MANY = 256
 class CopyTable(NamedTuple):
     """Copies of sources for compiled code, one a row.
 
-    :param variable: int64, shape (n_copies, n_target_variables): variable of the copy that a target variable is, -1: none
+    :param variable: int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
     :param sign: float64, same shape: -1 where it is mirrored
-    :param share: float64, shape (n_copies, n_copy_variables): 1 / number of target variables that a variable of the copy has
+    :param share: float64, shape (n_copies, n_source_variables): 1 / number of target variables that a variable of the copy has
     :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least
     :param first: int64, shape (n_copies,): the model's number of the source's first action; ``n_actions``: same shape
     """
@@ -86,7 +89,7 @@ class CopySums(NamedTuple):
 class CopyScratch(NamedTuple):
     """Work space.
 
-    :param at: float64, shape (n_copy_variables,): a state as the copy has it; ``effect``: what the source predicts there
+    :param at: float64, shape (n_source_variables,): a state as the copy has it; ``effect``: what the source predicts there
     :param scale: float64, shape (n_target_variables,): what squared errors are compared with in compliance
     """
 
@@ -112,7 +115,7 @@ class Uses(NamedTuple):
 class UsePredictions(NamedTuple):
     """What each use predicts at one state: work space of :func:`predict_pairs`.
 
-    :param done: bool, shape (n_uses,); ``effect``: float64, shape (n_uses, n_copy_variables)
+    :param done: bool, shape (n_uses,); ``effect``: float64, shape (n_uses, n_source_variables)
     :param outcome: float64, shape (n_uses, 3): reward, probability of termination, weight
     """
 
@@ -256,7 +259,7 @@ def predict_pairs_plain(source, table, uses, pairs, predicted, found):
 def join_copies(table, uses, action, i, effects, outcomes, predicted):
     """Write what all copies predict of pair ``i``.
 
-    :param effects: float64, shape (n_uses, n_copy_variables): of each use; ``outcomes``: float64, shape (n_uses, 3)
+    :param effects: float64, shape (n_uses, n_source_variables): of each use; ``outcomes``: float64, shape (n_uses, 3)
     """
     effect, reward, end, weight = predicted
     effect[i, :] = 0.0
@@ -286,7 +289,7 @@ def join_many_plain(table, uses, actions, found, predicted):
     """:func:`join_copies` for many pairs.
 
     :param found: for each use and pair, the number of its prediction, int64, shape (n_uses, n); and these predictions,
-        float64, shape (n_predictions, n_copy_variables) and (n_predictions, 3)
+        float64, shape (n_predictions, n_source_variables) and (n_predictions, 3)
     """
     table, uses = CopyTable(*table), Uses(*uses)
     rows, effects, outcomes, effect_here, outcome_here = found
@@ -338,20 +341,17 @@ class Copies:
         self.state = state
         self.sign = sign
         used = [tuple(np.unique(row[row >= 0]).tolist()) for row in state]
-        n_copy_variables = max(map(len, used))
         first: dict[tuple[int, tuple[int, ...]], int] = {}
         n_actions = 0
         for key in zip(source.tolist(), used, strict=True):
             if key not in first:
                 first[key] = n_actions
                 n_actions += sources[key[0]].n_actions
-        self.model = SourceModel(_seen_through(sources, list(first), n_copy_variables), breadth)
-        variable = np.array(
-            [[kept.index(k) if k >= 0 else -1 for k in row] for row, kept in zip(state.tolist(), used, strict=True)]
-        )
-        count = (variable[:, :, None] == np.arange(n_copy_variables)).sum(axis=1)
+        self.model = SourceModel(_seen_through(sources, list(first)), breadth)
+        n_variables = self.model.n_variables
+        count = (state[:, :, None] == np.arange(n_variables)).sum(axis=1)
         self.table = CopyTable(
-            variable=variable.astype(np.int64),
+            variable=np.ascontiguousarray(state, dtype=np.int64),
             sign=np.ascontiguousarray(sign, dtype=np.float64),
             share=1.0 / np.maximum(count, 1),
             least=(LEAST_EFFECT * self._typical_effects()) ** 2,
@@ -360,7 +360,7 @@ class Copies:
         )
         self._plain_table = tuple(self.table)
         d = state.shape[1]
-        self._scratch = tuple(CopyScratch(np.empty(n_copy_variables), np.empty(n_copy_variables), np.empty(d)))
+        self._scratch = tuple(CopyScratch(np.empty(n_variables), np.empty(n_variables), np.empty(d)))
 
     def __len__(self) -> int:
         return len(self.source)
@@ -454,7 +454,7 @@ class Copies:
         return rows, np.concatenate(effects), np.concatenate(outcomes)
 
     def _as_copy(self, copy: int, states: np.ndarray) -> np.ndarray:
-        """Target states as a copy has them, shape (n, n_copy_variables)."""
+        """Target states as a copy has them, shape (n, n_source_variables)."""
         at = np.zeros((len(states), self.model.n_variables))
         for v in np.flatnonzero(self.table.variable[copy] >= 0):
             k = self.table.variable[copy, v]
@@ -470,7 +470,8 @@ class Copies:
         """
         typical = []
         for source in self.sources:
-            size = np.abs(source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))
+            to_unit = source.scaling.to_unit
+            size = np.abs(differences(to_unit(source.next_states), to_unit(source.states), np.array(source.periodic)))
             median = np.median(size, axis=0)
             typical.append(np.where(median > 0.0, median, size.mean(axis=0)))
         found = np.zeros(self.state.shape)
@@ -496,20 +497,17 @@ def distinct_rows(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return one_of, kind
 
 
-def _seen_through(
-    sources: Sequence[SourceInstances], parts: Sequence[tuple[int, tuple[int, ...]]], n_variables: int
-) -> Instances:
-    """Instances of (source, variables) after (source, variables), their actions numbered on, with ``n_variables`` columns."""
-    n_actions = 0
-    columns = []
+def _seen_through(sources: Sequence[SourceInstances], parts: Sequence[tuple[int, tuple[int, ...]]]) -> Instances:
+    """
+    Instances of (source, variables) after (source, variables), their actions numbered on.
+
+    All other variables are 0, so that they make no difference.
+    """
+    chosen = []
     for number, used in parts:
-        source = sources[number]
-        states = source.scaling.to_unit(source.states)
-        effects = (source.scaling.to_unit(source.next_states) - states)[:, list(used)]
-        states = states[:, list(used)]
-        order = np.argsort(along_curve(states), kind="stable")
-        padding = ((0, 0), (0, n_variables - len(used)))
-        rows = source.actions + n_actions, np.pad(states, padding), np.pad(effects, padding), source.rewards, source.terminated
-        columns.append([column[order] for column in rows])
-        n_actions += source.n_actions
-    return Instances.of_rows(n_actions, *map(np.concatenate, zip(*columns, strict=True)))
+        instances = sources[number]
+        left_out = [k for k in range(instances.n_variables) if k not in used]
+        low, states, next_states = (np.array(array) for array in (instances.low, instances.states, instances.next_states))
+        states[:, left_out] = next_states[:, left_out] = low[left_out]
+        chosen.append(dataclasses.replace(instances, states=states, next_states=next_states))
+    return stacked_instances(chosen)

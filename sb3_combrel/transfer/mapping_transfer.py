@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_positive
+from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -113,6 +114,8 @@ class MappingTransfer(Transfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
+        self._periodic = np.array(task.periodic)
+        self._wraps = bool(self._periodic.any())
         if self.use == "prior":
             self._prior = self._make_prior(task)
             return
@@ -195,13 +198,14 @@ class MappingTransfer(Transfer):
     # --------------------------------------------------------------- observing
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
         if self.use == "prior":
-            self._prior.observe(state, action, reward, next_state - state, terminated)
+            self._prior.observe(state, action, reward, effect, terminated)
             return
         selector = self._selector
         selector.before_transition()
         if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
-            selector.add_transition(self._transitions.add(state, action, reward, next_state - state))
+            selector.add_transition(self._transitions.add(state, action, reward, effect))
             n_used = selector.n_used()
             if self.relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
                 self._renew_relevance(n_used)
@@ -233,7 +237,8 @@ class MappingTransfer(Transfer):
 
     def _renew_relevance(self, n_used: int) -> None:
         mu, values = float(self.relevance_fraction), self._translator.relevance
-        renew_relevance(self.candidates, self._transitions, n_used, self._bandwidths, self._starts, mu, values)
+        bandwidths = self._bandwidths, self._starts
+        renew_relevance(self.candidates, self._transitions, n_used, bandwidths, self._periodic, mu, values)
         self._n_of_relevance = n_used
 
     # --------------------------------------------------------------- describing

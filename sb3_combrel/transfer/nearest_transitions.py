@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner, part
+from sb3_combrel.common.kernels import any_periodic, difference
 
 
 class ComplianceCache(NamedTuple):
@@ -44,11 +45,12 @@ class ComplianceCache(NamedTuple):
 
 
 @compiled
-def add_to_sample(i, state, sample_states, near, distance, due, apart):
+def add_to_sample(i, state, sample, near, distance, due, apart):
     """
     Add transition ``i`` to the nearest ones of every sample state that has it among them.
 
-    :param sample_states: one variable a row, shape (n_variables, n_points): many states at once in vector registers
+    :param sample: (states of the sample, one variable a row, shape (n_variables, n_points): many at once in vector registers;
+        which variables are periodic, bool, shape (n_variables,))
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
     :param distance: squared distances to them, the limit for none, updated
     :param due: bool, shape (n_points,): becomes True where it was added: the choice there has to be renewed
@@ -57,12 +59,18 @@ def add_to_sample(i, state, sample_states, near, distance, due, apart):
     n_points = len(apart)
     last = near.shape[1] - 1
     apart[:] = 0.0
+    sample_states, periodic = sample
     for v in range(len(state)):
         at = state[v]
         of_sample = sample_states[v]
-        for p in range(n_points):
-            along = of_sample[p] - at
-            apart[p] += along * along
+        if periodic[v]:
+            for p in range(n_points):
+                along = difference(of_sample[p], at, True)
+                apart[p] += along * along
+        else:
+            for p in range(n_points):
+                along = of_sample[p] - at
+                apart[p] += along * along
     for p in range(n_points):
         if apart[p] < distance[p, last]:
             add_neighbor(i, apart[p], near[p], distance[p])
@@ -89,15 +97,17 @@ def find_nearest(query, recorded, limits, near, distance):
     :param query: (states, actions, own_weight), shapes (n, n_variables), (n,) and (n,): where ``own_weight`` reaches the
         threshold none are needed, and none are found
     :param recorded: (states of the recorded transitions; those that count for each action, int64, shape (n_actions,
-        capacity); how many these are, shape (n_actions,))
+        capacity); how many these are, shape (n_actions,); which state variables are periodic, bool, shape (n_variables,))
     :param limits: (threshold, squared distance from which on a transition does not count)
     :param near: receives the transitions, the nearest first, -1 for none, int64, shape (at least n, n_neighbors)
     :param distance: float64 scratch, same shape
     """
     states, actions, own_weight = query
-    at, listed, n_listed = recorded
+    at, listed, n_listed, periodic = recorded
     threshold, limit = limits
     last = near.shape[1] - 1
+    # Asked once, not for every transition.
+    wraps = any_periodic(periodic)
     for r in range(len(actions)):
         near[r] = -1
         distance[r] = limit
@@ -109,6 +119,8 @@ def find_nearest(query, recorded, limits, near, distance):
             apart = 0.0
             for v in range(states.shape[1]):
                 along = at[i, v] - states[r, v]
+                if wraps:
+                    along = difference(along, 0.0, periodic[v])
                 apart += along * along
             if apart < distance[r, last]:
                 add_neighbor(i, apart, near[r], distance[r])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inner
+from sb3_combrel.common.periodic import difference
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
@@ -12,8 +13,8 @@ def renew_relevance(
     candidates: Candidates,
     transitions: RecordedTransitions,
     n_used: int,
-    bandwidths: Bandwidths,
-    starts: np.ndarray,
+    bandwidths: tuple[Bandwidths, np.ndarray],
+    periodic: np.ndarray,
     mu: float,
     values: np.ndarray,
 ) -> None:
@@ -22,16 +23,18 @@ def renew_relevance(
 
     :param candidates: the candidates of every target action
     :param transitions: the target transitions, of which the first ``n_used`` count
-    :param bandwidths: of Eq. 2; ``starts``: the start bandwidth of each state mapping, shape (n_state_mappings,)
+    :param bandwidths: of Eq. 2, and the start bandwidth of each state mapping, shape (n_state_mappings,)
+    :param periodic: which state variables of the target are periodic, bool, shape (n_variables,)
     :param mu: fraction of the weight of Eq. 4
     :param values: receives the relevances, shape (n_candidates, most instances of an action)
     """
+    of_all, starts = bandwidths
     for c, origin in enumerate(candidates.origins):
         rows = np.flatnonzero(transitions.actions[:n_used] == origin.target_action)
         row = candidates.arrays.row[c]
         target = transitions.states[rows], transitions.effects[rows], transitions.rewards[rows]
-        mapping = candidates.table.variable[row], candidates.table.sign[row]
-        of_row = bandwidths._replace(start=float(starts[row]))
+        mapping = candidates.table.variable[row], candidates.table.sign[row], periodic
+        of_row = of_all._replace(start=float(starts[row]))
         action, weight = candidates.arrays.action[c], np.empty(len(rows))
         _relevance.call(target, candidates.instances, action, mapping, of_row, mu, weight, values[c])
 
@@ -49,13 +52,14 @@ def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
     :param target: (states, effects, rewards) of the transitions with one target action: unit coordinates, shape (n,
         n_target_variables); next states minus states, same shape; raw, shape (n,)
     :param source: Instances of the source; ``action``: the source action
-    :param mapping: (source variable of each target variable, -1 for none; sign, -1 where mirrored)
+    :param mapping: (source variable of each target variable, -1 for none; sign, -1 where mirrored; whether the target
+        variable is periodic)
     :param bandwidths: of Eq. 2; ``mu``: fraction of the weight of Eq. 4
     :param weight: float64 scratch, shape (n,)
     :param values: receives the relevances, at least as many as ``source.size[action]``
     """
     states, effects, rewards = target
-    index, sign = mapping
+    index, sign, periodic = mapping
     n, d = states.shape
     for j in range(source.size[action]):
         total = 0.0
@@ -69,9 +73,9 @@ def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
                 if index[v] >= 0:
                     here = source.state[action, j, index[v]]
                     moved = sign[v] * source.effect[action, j, index[v]]
-                    along = states[i, v] - (1.0 - here if sign[v] < 0.0 else here)
+                    along = difference(states[i, v], 1.0 - here if sign[v] < 0.0 else here, periodic[v])
                     apart += along * along
-                missed += (effects[i, v] - moved) ** 2
+                missed += difference(effects[i, v], moved, periodic[v]) ** 2
             w = np.exp(-apart / bandwidths.start)
             weight[i] = w
             total += w

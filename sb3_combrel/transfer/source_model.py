@@ -9,6 +9,7 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint, compiled, inner
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
+from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.models.linear_fits import RIDGE, Kernel, narrowed
 from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
 
@@ -73,7 +74,8 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
     end = 0.0
     for k in range(length):
         i = item[k]
-        products_of(instances.state[action, i], instances.effect[action, i], products)
+        bring_near(instances.state[action, i], state, instances.periodic, near.state)
+        products_of(near.state, instances.effect[action, i], products)
         # Seen from the nearest: far from all instances the ridge would outweigh them, and a quotient could be 0 / 0.
         beyond = distance[k] - distance[0]
         add_products(sums, np.exp(beyond * scale), products)
@@ -165,6 +167,7 @@ class SourceModel:
             item=np.zeros((n_actions, n_neighbors), dtype=np.int32),
             distance=np.empty((n_actions, n_neighbors)),
             length=np.zeros(n_actions, dtype=np.int64),
+            state=np.empty(d),
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             fit=np.empty(d + d * d),

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
 from sb3_combrel.common.instances import BLOCK, Instances
-from sb3_combrel.common.kernels import list_room
+from sb3_combrel.common.kernels import difference, list_room
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
@@ -88,7 +88,7 @@ class TranslationScratch(NamedTuple):
     :param number: int64, shape (room, 2): instance and candidate
     :param value: float64, shape (room, 2): what it is ranked by, and its weight
     :param variable: int64, shape (n_variables,): source variables that a candidate compares with
-    :param at: float64, same shape: where the state lies along each
+    :param at: float64, same shape: where the state lies along each; ``periodic``: bool, whether it wraps there
     :param gap: float64, shape (n_blocks,): squared distances of the blocks' boxes
     :param full: bool, shape (1,): an instance that was needed did not fit
     """
@@ -97,6 +97,7 @@ class TranslationScratch(NamedTuple):
     value: np.ndarray
     variable: np.ndarray
     at: np.ndarray
+    periodic: np.ndarray
     gap: np.ndarray
     full: np.ndarray
 
@@ -108,6 +109,7 @@ class TranslationScratch(NamedTuple):
             value=np.empty((max_instances + 1, 2)),
             variable=np.empty(n_variables, dtype=np.int64),
             at=np.empty(n_variables),
+            periodic=np.zeros(n_variables, dtype=np.bool_),
             gap=np.empty(n_blocks),
             full=np.zeros(1, dtype=np.bool_),
         )
@@ -122,6 +124,7 @@ class TranslationArrays(NamedTuple):
     :param rules: when and how instances are translated
     :param relevance: float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
     :param scratch: work space
+    :param periodic: bool, shape (n_target_variables,): translated instances lie in the target's space, which wraps along these
     """
 
     source: SourceArrays
@@ -129,17 +132,19 @@ class TranslationArrays(NamedTuple):
     rules: TranslationRules
     relevance: np.ndarray
     scratch: TranslationScratch
+    periodic: np.ndarray
 
     def plain(self) -> tuple[Any, ...]:
         """The same as plain tuples (see ``common.compiled``)."""
-        return tuple(self.source), tuple(self.mappings), tuple(self.rules), self.relevance, tuple(self.scratch)
+        structs = tuple(self.source), tuple(self.mappings), tuple(self.rules)
+        return *structs, self.relevance, tuple(self.scratch), self.periodic
 
 
 @inlined
 def as_arrays(plain):
     """:class:`TranslationArrays` from plain tuples."""
     source, mappings, rules = SourceArrays(*plain[0]), CandidateMappings(*plain[1]), TranslationRules(*plain[2])
-    return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]))
+    return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]), plain[5])
 
 
 @part
@@ -204,11 +209,12 @@ def gather(state, own, candidate, arrays, kept):
         if k >= 0:
             mirrored = sign[v] < 0.0
             scratch.variable[n_mapped] = k
+            scratch.periodic[n_mapped] = arrays.periodic[v]
             scratch.at[n_mapped] = 1.0 - state[v] if mirrored else state[v]
             n_mapped += 1
     size = source.size[action]
     low, high = source.block_low[action], source.block_high[action]
-    nearest_block = measure_blocks(low, high, size, n_mapped, scratch.variable, scratch.at, scratch.gap)
+    nearest_block = measure_blocks(low, high, size, n_mapped, scratch)
     nearest = far
     # The instances in the nearest block exclude most other blocks.
     for turn in range(-1, (size + BLOCK - 1) // BLOCK):
@@ -218,7 +224,7 @@ def gather(state, own, candidate, arrays, kept):
         for j in range(block * BLOCK, min(size, (block + 1) * BLOCK)):
             apart = 0.0
             for m in range(n_mapped):
-                along = scratch.at[m] - source.state[action, j, scratch.variable[m]]
+                along = difference(scratch.at[m], source.state[action, j, scratch.variable[m]], scratch.periodic[m])
                 apart += along * along
             if apart <= nearest:
                 weight = np.exp(apart * scale)
@@ -230,8 +236,9 @@ def gather(state, own, candidate, arrays, kept):
 
 
 @part
-def measure_blocks(low, high, size, n_mapped, variable, at, gap):
-    """Write to ``gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
+def measure_blocks(low, high, size, n_mapped, scratch):
+    """Write to ``scratch.gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
+    variable, at, gap = scratch.variable, scratch.at, scratch.gap
     nearest_block = 0
     for block in range((size + BLOCK - 1) // BLOCK):
         total = 0.0
@@ -240,6 +247,9 @@ def measure_blocks(low, high, size, n_mapped, variable, at, gap):
             below = low[k, block] - at[m]
             above = at[m] - high[k, block]
             outside = below if below > above else above
+            if scratch.periodic[m]:
+                # Around the other way the far end of the box is the nearer one.
+                outside = min(outside, 1.0 + min(below, above))
             if outside > 0.0:
                 total += outside * outside
         gap[block] = total
@@ -333,6 +343,7 @@ class Translator:
                 ),
                 relevance=np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0)),
                 scratch=self._make_scratch(),
+                periodic=np.array(task.periodic),
             )
         )
         self._make_room(task.n_actions)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
-from gymnasium import spaces
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.arguments import check_actions
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.planning.grid import fitting_grid
@@ -69,10 +69,8 @@ class ZooFittedRMax(FittedRMax):
         """Compute the resolution for "coarser" or "finer"."""
         if wanted not in ("coarser", "finer"):
             raise ValueError(f'resolution must be a whole number, one for each variable, "coarser" or "finer", got {wanted!r}')
-        if not isinstance(self.action_space, spaces.Discrete):
-            raise ValueError(f"FittedRMax needs Discrete actions, the environment has {self.action_space}")
+        n_actions = check_actions(self.action_space)
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
-        n_actions = int(self.action_space.n)
         breadth = self.settings.breadth_for(n_variables)
         suited, *_ = fitting_grid(n_variables, n_actions, None, breadth, self.settings.min_weight_by_degree()).resolution
         if wanted == "coarser":

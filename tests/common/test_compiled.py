@@ -18,12 +18,12 @@ from sb3_combrel.common.scaling import StateScaling, scale_into_box
 
 def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
     states = np.array([[0.5, 3.0], [-2.0, 1.0]])
-    low, ranges = np.array([0.0, 1.0]), np.array([2.0, 4.0])
+    low, ranges, flags = np.array([0.0, 1.0]), np.array([2.0, 4.0]), np.array([False, True])
     scale = EntryPoint(scale_into_box)
     for again in (scale, scale, copy.deepcopy(scale), pickle.loads(pickle.dumps(scale))):
         for call in (again, again.call):
             units, expected = np.empty_like(states), np.empty_like(states)
-            assert call(states, low, ranges, units) == scale_into_box(states, low, ranges, expected)
+            assert call(states, low, ranges, flags, units) == scale_into_box(states, low, ranges, flags, expected)
             np.testing.assert_array_equal(units, expected)
 
 
@@ -31,11 +31,12 @@ def test_scale_into_box_is_to_unit_moved_into_the_box():
     scaling = StateScaling(np.array([-1.0, 0.0, 10.0]), np.array([1.0, 5.0, 11.0]))
     states = np.random.default_rng(0).uniform([-2.0, -1.0, 9.5], [2.0, 6.0, 11.5], (100, 3))
     units = np.empty_like(states)
-    assert scale_into_box(states, scaling.low, scaling.high - scaling.low, units)
+    low, ranges, flags = scaling.low, scaling.high - scaling.low, np.zeros(3, dtype=bool)
+    assert scale_into_box(states, low, ranges, flags, units)
     np.testing.assert_array_equal(units, np.clip(scaling.to_unit(states), 0.0, 1.0))
     inside = scaling.to_raw(np.full((1, 3), 0.5))
-    assert not scale_into_box(inside, scaling.low, scaling.high - scaling.low, units[:1])
-    assert scale_into_box(np.full((1, 3), np.nan), scaling.low, scaling.high - scaling.low, units[:1])
+    assert not scale_into_box(inside, low, ranges, flags, units[:1])
+    assert scale_into_box(np.full((1, 3), np.nan), low, ranges, flags, units[:1])
 
 
 # ------------------------------------------------------------- garbage collection
@@ -94,8 +95,8 @@ from sb3_combrel.common.instances import Instances, put_instance_at
 from sb3_combrel.common.scaling import scale_into_box
 
 one = np.zeros((1, 1))
-EntryPoint(scale_into_box).call(one, np.zeros(1), np.ones(1), one.copy())
-EntryPoint(scale_into_box).call(one.astype(np.float32), np.zeros(1), np.ones(1), one.copy())
+EntryPoint(scale_into_box).call(one, np.zeros(1), np.ones(1), np.zeros(1, dtype=bool), one.copy())
+EntryPoint(scale_into_box).call(one.astype(np.float32), np.zeros(1), np.ones(1), np.zeros(1, dtype=bool), one.copy())
 instances = Instances.empty(1, 1)
 put_instance_at.call(instances, (0, 0, np.zeros(1), np.ones(1), -1.0, False))
 assert instances.size[0] == 1 and gc.isenabled()

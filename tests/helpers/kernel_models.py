@@ -10,8 +10,23 @@ from sb3_combrel.planning.mdp import FiniteMDP
 
 N_ACTIONS = 2
 
-# (resolution by variable, margin): a few hundred points at most, as the naive loops are slow.
-GRIDS = [((3,), 1), ((4,), 0), ((2, 2), 1), ((3, 2), 0), ((2, 1), 1), ((1, 2, 1), 0), ((1, 1, 1), 1)]
+# (resolution by variable, margin), and which variables are periodic where some are: a few hundred points at most, as the
+# naive loops are slow.
+PERIODIC_GRIDS = [
+    ((3,), 1, (True,)),
+    ((2, 2), 1, (True, False)),
+    ((2, 3), 0, (False, True)),
+    ((1, 2, 1), 1, (True, False, True)),
+]
+GRIDS = [((3,), 1), ((4,), 0), ((2, 2), 1), ((3, 2), 0), ((2, 1), 1), ((1, 2, 1), 0), ((1, 1, 1), 1), *PERIODIC_GRIDS]
+
+
+def make_grid(grid):
+    """The package's grid of an entry of GRIDS."""
+    resolution, margin, periodic = *grid, *(None,) * (3 - len(grid))
+    return StateGrid(len(resolution), resolution, margin, periodic)
+
+
 KERNELS = [
     dict(breadth=0.3, min_weight=0.01, min_fraction=0.13),
     dict(breadth=0.15, min_weight=0.01, min_fraction=0.02),
@@ -38,9 +53,8 @@ def random_transitions(seed, n_variables, n):
 def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model_class=KernelAverage, threshold=1.0):
     """A model on a finite MDP of its own, ``model.mdp``.
 
-    :param grid: (resolution by variable, margin)
+    :param grid: an entry of GRIDS, or another such
     """
-    resolution, margin = grid
     settings = ModelSettings(
         model_breadth=kernel["breadth"],
         min_weight=kernel["min_weight"],
@@ -48,14 +62,13 @@ def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model
         exploration_threshold=threshold,
         max_instances=max_instances,
     )
-    mdp = FiniteMDP(StateGrid(len(resolution), resolution, margin), N_ACTIONS, gamma)
+    mdp = FiniteMDP(make_grid(grid), N_ACTIONS, gamma)
     return model_class(mdp, settings, transfer)
 
 
 def model_and_definition(grid, kernel, gamma=1.0, max_instances=None):
-    resolution, margin = grid
     model = make_model(grid, kernel, gamma, max_instances)
-    return model, NaiveFittedRMax(resolution, margin, N_ACTIONS, kernel, gamma=gamma)
+    return model, NaiveFittedRMax(*grid[:2], N_ACTIONS, kernel, gamma=gamma, periodic=grid[2] if len(grid) > 2 else None)
 
 
 def learn(model, transitions):
@@ -73,7 +86,7 @@ def learn_both(model, naive, transitions):
 def add_instances(naive, transitions):
     """Add transitions to the definition without the slow look at which pairs become known."""
     for state, action, reward, next_state, terminated in transitions:
-        naive.instances[action].append(Instance(state, action, reward, next_state, terminated))
+        naive.instances[action].append(Instance(state, action, reward, next_state, terminated, naive.grid.periodic))
 
 
 def pairs_of(naive):

@@ -13,25 +13,38 @@ import numpy as np
 class Instance:
     """One transition in unit coordinates."""
 
-    def __init__(self, state, action, reward, next_state, terminated):
+    def __init__(self, state, action, reward, next_state, terminated, periodic=None):
         self.state = np.array(state, dtype=float)
         self.action = action
         self.reward = reward
-        self.effect = np.array(next_state, dtype=float) - self.state
+        self.effect = np.array(apart(next_state, self.state, periodic))
         self.terminated = terminated
+
+
+def apart(a, b, periodic=None):
+    """What separates two states along each variable; along a periodic one the shortest way around."""
+    found = []
+    for x, y, wraps in zip(a, b, periodic or [False] * len(b), strict=True):
+        d = x - y
+        while wraps and d >= 0.5:
+            d -= 1.0
+        while wraps and d < -0.5:
+            d += 1.0
+        found.append(d)
+    return found
 
 
 def kernel(distance_squared, breadth):
     return math.exp(-distance_squared / breadth**2)
 
 
-def kept_instances(state, instances, breadth, min_weight, min_fraction):
+def kept_instances(state, instances, breadth, min_weight, min_fraction, periodic=None):
     """(number, weight) of the instances that count at ``state``, nearest first."""
     weighted = []
     for number, instance in enumerate(instances):
         if instance is None:
             continue
-        w = kernel(sum((a - b) ** 2 for a, b in zip(state, instance.state, strict=True)), breadth)
+        w = kernel(sum(d**2 for d in apart(state, instance.state, periodic)), breadth)
         if w >= min_weight:
             weighted.append((number, w))
     weighted.sort(key=lambda pair: -pair[1])
@@ -46,21 +59,27 @@ def kept_instances(state, instances, breadth, min_weight, min_fraction):
 class NaiveGrid:
     """Grid points by their whole-numbered coordinates."""
 
-    def __init__(self, resolution, margin):
+    def __init__(self, resolution, margin, periodic=None):
         self.cells = [2**r for r in resolution]
-        self.margin = margin
-        self.shape = [c + 1 + 2 * margin for c in self.cells]
+        self.periodic = list(periodic or [False] * len(resolution))
+        self.margin = [0 if wraps else margin for wraps in self.periodic]
+        self.shape = [c if wraps else c + 1 + 2 * margin for c, wraps in zip(self.cells, self.periodic, strict=True)]
         self.coordinates = list(itertools.product(*[range(n) for n in self.shape]))
         self.number = {coordinates: i for i, coordinates in enumerate(self.coordinates)}
 
     def unit(self, point):
-        return np.array([(c - self.margin) / n for c, n in zip(self.coordinates[point], self.cells, strict=True)])
+        return np.array([(c - m) / n for c, m, n in zip(self.coordinates[point], self.margin, self.cells, strict=True)])
 
     def corners(self, unit):
-        """{point: weight} of multilinear interpolation; what lies outside the grid is clipped to its edge."""
+        """{point: weight} of multilinear interpolation; what lies outside the grid is clipped to its edge, or goes around."""
         by_variable = []
-        for u, cells, n in zip(unit, self.cells, self.shape, strict=True):
-            at = min(max(u * cells + self.margin, 0.0), n - 1.0)
+        for u, cells, n, margin, wraps in zip(unit, self.cells, self.shape, self.margin, self.periodic, strict=True):
+            if wraps:
+                low = math.floor(u * cells)
+                part = u * cells - low
+                by_variable.append([(low % n, 1.0 - part), ((low + 1) % n, part)])
+                continue
+            at = min(max(u * cells + margin, 0.0), n - 1.0)
             low = min(math.floor(at), n - 2)
             by_variable.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
         corners = {}
@@ -71,17 +90,17 @@ class NaiveGrid:
         return corners
 
     def clipped(self, unit):
-        low = [-self.margin / c for c in self.cells]
-        high = [1.0 + self.margin / c for c in self.cells]
-        return np.clip(unit, low, high)
+        edges = zip(self.margin, self.cells, self.periodic, strict=True)
+        beyond = [math.inf if wraps else margin / c for margin, c, wraps in edges]
+        return np.clip(unit, [-b for b in beyond], [1.0 + b for b in beyond])
 
 
 class NaiveFittedRMax:
     """The model, its values and Q, all from scratch."""
 
-    def __init__(self, resolution, margin, n_actions, kernel, *, threshold=1.0, gamma=1.0, max_value=0.0):
+    def __init__(self, resolution, margin, n_actions, kernel, *, threshold=1.0, gamma=1.0, max_value=0.0, periodic=None):
         """:param kernel: dict of ``breadth``, ``min_weight`` and ``min_fraction``"""
-        self.grid = NaiveGrid(resolution, margin)
+        self.grid = NaiveGrid(resolution, margin, periodic)
         self.n_points = len(self.grid.coordinates)
         self.n_actions = n_actions
         self.kernel = (kernel["breadth"], kernel["min_weight"], kernel["min_fraction"])
@@ -92,13 +111,13 @@ class NaiveFittedRMax:
         self.known = np.zeros((n_actions, self.n_points), dtype=bool)
 
     def add(self, state, action, reward, next_state, terminated):
-        self.instances[action].append(Instance(state, action, reward, next_state, terminated))
+        self.instances[action].append(Instance(state, action, reward, next_state, terminated, self.grid.periodic))
         for point in range(self.n_points):
             if sum(w for _, w in self.list_of(action, point)) >= self.threshold:
                 self.known[action, point] = True
 
     def kept_at(self, state, action):
-        return kept_instances(state, self.instances[action], *self.kernel)
+        return kept_instances(state, self.instances[action], *self.kernel, self.grid.periodic)
 
     def list_of(self, action, point):
         return self.kept_at(self.grid.unit(point), action)
@@ -148,8 +167,8 @@ class NaiveFittedRMax:
         Of any instances those that weigh f T / (1 + f) or more suffice, f being min_fraction and T the threshold.
         """
         breadth, min_weight, min_fraction = self.kernel
-        kept = kept_instances(state, self.instances[action], breadth, min_weight, min_fraction)
-        heavy = kept_instances(state, self.instances[action], breadth, min_weight, 0.0)
+        kept = kept_instances(state, self.instances[action], breadth, min_weight, min_fraction, self.grid.periodic)
+        heavy = kept_instances(state, self.instances[action], breadth, min_weight, 0.0, self.grid.periodic)
         least = min_fraction * self.threshold / (1.0 + min_fraction)
         return max(sum(w for _, w in kept), sum(w for _, w in heavy if w >= least)) >= self.threshold
 

@@ -37,12 +37,15 @@ class NaiveLists:
         for point in range(self.naive.n_points):
             candidates = [*self.lists[point], slot]
             ordered = sorted(candidates, key=lambda s, point=point: (-self.weight(point, s), s))
-            kept = kept_instances(self.naive.grid.unit(point), [self.instances[s] for s in ordered], *self.naive.kernel)
+            kept = kept_instances(
+                self.naive.grid.unit(point), [self.instances[s] for s in ordered], *self.naive.kernel, self.naive.grid.periodic
+            )
             self.lists[point] = [ordered[number] for number, _ in kept]
             self.known[point] |= sum(w for _, w in kept) >= self.naive.threshold
 
     def weight(self, point, slot):
-        kept = kept_instances(self.naive.grid.unit(point), [self.instances[slot]], self.naive.kernel[0], 0.0, 1.0)
+        breadth, periodic = self.naive.kernel[0], self.naive.grid.periodic
+        kept = kept_instances(self.naive.grid.unit(point), [self.instances[slot]], breadth, 0.0, 1.0, periodic)
         return kept[0][1]
 
     def n_lists(self, slot):
@@ -57,7 +60,7 @@ class NaiveLists:
 
 @settings(deadline=None, derandomize=True, max_examples=12)
 @given(
-    st.sampled_from([((3,), 1), ((2, 2), 0), ((1, 1, 1), 0)]),
+    st.sampled_from([((3,), 1), ((2, 2), 0), ((1, 1, 1), 0), ((3,), 0, (True,)), ((2, 2), 1, (False, True))]),
     st.sampled_from(KERNELS),
     st.integers(0, 10**6),
     st.integers(1, 12),

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from helpers.kernel_models import GRIDS
+from helpers.kernel_models import GRIDS, make_grid
 from helpers.naive_fitted_rmax import NaiveGrid
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,21 +15,19 @@ from sb3_combrel.planning.grid import StateGrid, fitting_grid
 @settings(deadline=None, derandomize=True, max_examples=60)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6))
 def test_interpolation_is_multilinear_between_grid_points_and_constant_beyond_them(grid, seed):
-    resolution, margin = grid
     rng = np.random.default_rng(seed)
-    own, naive = StateGrid(len(resolution), resolution, margin), NaiveGrid(resolution, margin)
+    own, naive = make_grid(grid), NaiveGrid(*grid)
     values = rng.normal(size=own.n_points)
-    for state in rng.uniform(-0.8, 1.8, (10, len(resolution))):
+    for state in rng.uniform(-0.8, 1.8, (10, own.n_variables)):
         expected = sum(weight * values[point] for point, weight in naive.corners(state).items())
         assert own.interpolate(values, state) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=str)
 def test_interpolation_at_a_grid_point_is_its_value(grid):
-    resolution, margin = grid
-    own = StateGrid(len(resolution), resolution, margin)
+    own = make_grid(grid)
     values = np.random.default_rng(0).normal(size=own.n_points)
-    assert len(own.points()) == own.n_points == np.prod([2**r + 1 + 2 * margin for r in resolution])
+    assert len(own.points()) == own.n_points == np.prod(NaiveGrid(*grid).shape)
     for point, state in enumerate(own.points()):
         assert own.interpolate(values, state) == pytest.approx(values[point])
 

@@ -2,18 +2,16 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import GRIDS, N_ACTIONS, assert_same_row, row_of, without_staying
+from helpers.kernel_models import GRIDS, N_ACTIONS, assert_same_row, make_grid, row_of, without_staying
 from helpers.naive_fitted_rmax import NaiveGrid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.planning.mdp import FiniteMDP
 
 
 def make_mdp(grid=((2,), 0), gamma=1.0):
-    resolution, margin = grid
-    return FiniteMDP(StateGrid(len(resolution), resolution, margin), N_ACTIONS, gamma), NaiveGrid(resolution, margin)
+    return FiniteMDP(make_grid(grid), N_ACTIONS, gamma), NaiveGrid(*grid)
 
 
 def write(mdp, pairs, probability, effect, reward, modelled=True):

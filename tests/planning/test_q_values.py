@@ -15,7 +15,7 @@ from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 N_ACTIONS = 3
 
 
-def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, threshold=1.0, **kernel):
+def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, threshold=1.0, periodic=None, **kernel):
     kernel = dict(breadth=0.3, min_weight=0.01, min_fraction=0.13) | kernel
     agent = make_agent(
         n_variables,
@@ -27,11 +27,10 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
         resolution=resolution,
         gamma=gamma,
         max_value=max_value,
+        periodic=periodic,
     )
-    grid = agent.grid
-    naive = NaiveFittedRMax(
-        grid.resolution, grid.margin, N_ACTIONS, kernel, threshold=threshold, gamma=gamma, max_value=max_value
-    )
+    settings = dict(threshold=threshold, gamma=gamma, max_value=max_value, periodic=periodic)
+    naive = NaiveFittedRMax(agent.grid.resolution, agent.grid.margin, N_ACTIONS, kernel, **settings)
     return agent, naive
 
 
@@ -43,10 +42,13 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     st.sampled_from([1.0, 0.9]),
     st.sampled_from([0.3, 1.0, 2.5]),
     st.sampled_from([0.0, 7.0, -3.0]),
+    st.sampled_from([None, (True, True, True), (True, False, True)]),
 )
-def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, gamma, threshold, max_value):
+def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, gamma, threshold, max_value, periodic):
     rng = np.random.default_rng(seed)
-    agent, naive = agent_and_definition(n_variables, 2, gamma=gamma, threshold=threshold, max_value=max_value)
+    flags = None if periodic is None else periodic[:n_variables]
+    arguments = dict(gamma=gamma, threshold=threshold, max_value=max_value, periodic=flags)
+    agent, naive = agent_and_definition(n_variables, 2, **arguments)
     transitions = []
     for _ in range(n):
         state = rng.random(n_variables)

@@ -15,9 +15,12 @@ MIN_VALUE = -60.0
 class Problem:
     """A planner with its model, and the definition, given the same transitions."""
 
-    def __init__(self, resolution=(2, 2), margin=1, gamma=1.0, max_value=0.0, tolerance=1e-11, max_instances=None):
-        self.model = make_model((resolution, margin), KERNEL, gamma, max_instances)
-        self.naive = NaiveFittedRMax(resolution, margin, N_ACTIONS, KERNEL, gamma=gamma, max_value=max_value)
+    def __init__(
+        self, resolution=(2, 2), margin=1, gamma=1.0, max_value=0.0, tolerance=1e-11, max_instances=None, periodic=None
+    ):
+        self.model = make_model((resolution, margin, periodic), KERNEL, gamma, max_instances)
+        values = dict(gamma=gamma, max_value=max_value, periodic=periodic)
+        self.naive = NaiveFittedRMax(resolution, margin, N_ACTIONS, KERNEL, **values)
         self.planner = Planner(self.model.mdp, max_value=max_value, min_value=MIN_VALUE, tolerance=tolerance)
 
     def update(self, transition, max_backups=NO_LIMIT):
@@ -55,11 +58,21 @@ def walk(seed, n, n_variables=2, goal=0.8, reward=lambda rng: -1.0):
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
-    ("resolution", "margin", "gamma", "max_value"),
-    [((2, 2), 1, 0.9, 5.0), ((4,), 0, 0.97, 10.0), ((1, 2, 1), 0, 0.8, 3.0), ((3, 2), 0, 1.0, 0.0), ((2, 2), 1, 1.0, 0.0)],
+    ("resolution", "margin", "gamma", "max_value", "periodic"),
+    [
+        ((2, 2), 1, 0.9, 5.0, None),
+        ((4,), 0, 0.97, 10.0, None),
+        ((1, 2, 1), 0, 0.8, 3.0, None),
+        ((3, 2), 0, 1.0, 0.0, None),
+        ((2, 2), 1, 1.0, 0.0, None),
+        ((2, 3), 1, 0.9, 5.0, (False, True)),
+        ((3, 3), 0, 0.9, 5.0, (True, True)),
+    ],
 )
-def test_sweeping_to_convergence_gives_the_values_of_exact_value_iteration(resolution, margin, gamma, max_value, seed):
-    problem = Problem(resolution, margin, gamma, max_value)
+def test_sweeping_to_convergence_gives_the_values_of_exact_value_iteration(
+    resolution, margin, gamma, max_value, periodic, seed
+):
+    problem = Problem(resolution, margin, gamma, max_value, periodic=periodic)
     noise = (lambda rng: -1.0) if gamma == 1.0 else (lambda rng: float(rng.normal()))
     problem.learn(walk(seed, 120, len(resolution), reward=noise))
     assert problem.planner.n_queued == 0
@@ -141,13 +154,16 @@ def neighbours_of(point, grid):
     at = np.unravel_index(point, points.shape)
     for axis, n in enumerate(points.shape):
         for step in (-1, 1):
-            if 0 <= at[axis] + step < n:
-                yield points[tuple(c + step * (k == axis) for k, c in enumerate(at))]
+            if 0 <= at[axis] + step < n or grid.arrays.periodic[axis]:
+                yield points[tuple((c + step * (k == axis)) % points.shape[k] for k, c in enumerate(at))]
 
 
-@pytest.mark.parametrize(("resolution", "seed", "n"), [((4,), 0, 4), ((4,), 5, 4), ((3, 3), 1, 14)])
-def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, seed, n):
-    problem = Problem(resolution, 0, gamma=0.9, max_value=2.0, tolerance=1e-12)
+@pytest.mark.parametrize(
+    ("resolution", "seed", "n", "periodic"),
+    [((4,), 0, 4, None), ((4,), 5, 4, None), ((3, 3), 1, 14, None), ((4,), 0, 3, (True,)), ((3, 3), 1, 14, (False, True))],
+)
+def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, seed, n, periodic):
+    problem = Problem(resolution, 0, gamma=0.9, max_value=2.0, tolerance=1e-12, periodic=periodic)
     for transition in walk(seed, n, len(resolution)):
         problem.update(transition)
     modelled = problem.model.mdp.arrays.n_optimistic < N_ACTIONS

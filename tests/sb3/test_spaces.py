@@ -1,5 +1,7 @@
 """Spaces that work; those that do not are refused in tests/fitted_rmax/test_bad_input.py."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -51,6 +53,30 @@ def test_learning_predicting_and_saving_with_every_space(space, actions, tmp_pat
 def test_observations_that_are_whole_numbers_are_refused(dtype):
     with pytest.raises(ValueError, match=f"floating-point numbers, got dtype {dtype.__name__}"):
         FittedRMax(Anywhere(spaces.Box(0, 9, (2,), dtype=dtype), spaces.Discrete(2)))
+
+
+@pytest.mark.parametrize(
+    ("actions", "n_discrete"),
+    [(spaces.Box(-2.0, 2.0, (1,)), 5), (spaces.Box(-2.0, 2.0, (2,)), 9)],
+    ids=str,
+)
+def test_continuous_actions_are_refused_with_the_line_that_makes_them_discrete(actions, n_discrete):
+    env = Anywhere(SPACES["float32"], actions)
+    with pytest.raises(ValueError, match="needs Discrete actions, the environment has Box") as caught:
+        FittedRMax(env)
+    [line] = re.findall(r"env = (gymnasium\.wrappers\..*)$", str(caught.value))
+    env = eval(line, {"gymnasium": gym, "env": env})
+    model = FittedRMax(env, resolution=2, model_breadth=0.3, seed=0).learn(30)
+    assert model.action_space == spaces.Discrete(n_discrete)
+
+
+@pytest.mark.parametrize(
+    "actions", [spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2), spaces.Box(0.0, 1.0, (2, 2))], ids=str
+)
+def test_other_actions_are_refused(actions):
+    with pytest.raises(ValueError, match="needs Discrete actions, the environment has") as caught:
+        FittedRMax(Anywhere(SPACES["float32"], actions))
+    assert "DiscretizeAction" not in str(caught.value)
 
 
 def test_actions_may_start_anywhere(make):

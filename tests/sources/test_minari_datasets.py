@@ -1,5 +1,6 @@
 """Source instances to Minari datasets and back."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -24,6 +25,11 @@ class TestMinari:
         assert_same(SourceInstances.from_minari("combrel/corridor-v0"), source)
         assert_same(SourceInstances.from_minari(dataset), source)
         assert len(SourceInstances.from_minari(dataset, n_instances=10, seed=0)) == 10
+
+    def test_periodic_variables_stay_periodic(self):
+        source = SourceInstances.record(None, Corridor(), 20, seed=0)
+        source = dataclasses.replace(source, periodic=(True,) * source.n_variables)
+        assert SourceInstances.from_minari(source.to_minari("corridor-v1")).periodic == source.periodic
 
     def test_instances_that_follow_one_another_are_one_episode(self):
         source = SourceInstances.record(lambda state: 0, Corridor(step_size=0.125), 20, seed=0)

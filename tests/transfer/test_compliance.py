@@ -232,7 +232,7 @@ def relevances(source, source_action, mapping, action, transitions, bandwidths, 
     states = np.array([t.state for t in of_action]).reshape(-1, d)
     effects = np.array([t.next_state - t.state for t in of_action]).reshape(-1, d)
     target = states, effects, np.array([t.reward for t in of_action])
-    of_mapping = mapping.state_index, mapping.state_sign
+    of_mapping = mapping.state_index, mapping.state_sign, np.zeros(len(mapping.state_index), dtype=bool)
     relevance(target, instances, source_action, of_mapping, bandwidths, mu, np.empty(len(of_action)), values)
     return values[: instances.size[source_action]]
 

@@ -56,7 +56,7 @@ def compiled_relevances(sample, source, mapping, action, bandwidths, mu):
     of_action = sample.with_action(action)
     found = np.full(int(instances.size.max()), np.nan)
     target, scratch = (of_action.state, of_action.effect, of_action.reward), np.empty(len(of_action.reward))
-    of_mapping = mapping.state_index, mapping.state_sign
+    of_mapping = mapping.state_index, mapping.state_sign, np.zeros(len(mapping.state_index), dtype=bool)
     compiled_relevance.relevance(target, instances, source_action, of_mapping, bandwidths, mu, scratch, found)
     return found[naive.places_of(source, instances)[source.actions == source_action]]
 

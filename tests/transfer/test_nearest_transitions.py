@@ -13,6 +13,7 @@ from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sam
 
 N_DRAWS = 4000
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+NOT_PERIODIC = np.zeros(2, dtype=bool)
 
 
 def random_cache(rng, n_transitions, n_candidates, least=0.4):
@@ -51,28 +52,44 @@ def test_each_candidate_is_drawn_in_proportion_to_its_mean_compliance(seed, n_ca
 
 
 @settings(deadline=None, derandomize=True, max_examples=40)
-@given(st.integers(0, 10**6), st.booleans())
-def test_at_a_sample_state_the_choice_is_the_same_as_on_the_grid(seed, drawn):
+@given(st.integers(0, 10**6), st.booleans(), st.sampled_from([(False, False), (True, False), (True, True)]))
+def test_at_a_sample_state_the_choice_is_the_same_as_on_the_grid(seed, drawn, periodic):
     rng = np.random.default_rng(seed)
     n_actions, n_candidates, n, first = 2, 4, 20, np.array([0, 4, 8])
     cache, states, actions = random_cache(rng, n, n_candidates), rng.random((n, 2)), rng.integers(n_actions, size=n)
     draws = rng.random(n_actions) if drawn else np.empty(0)
     limit = 0.3**2
     near, distance = np.full((n_actions, len(POINTS), 3), -1), np.full((n_actions, len(POINTS), 3), limit)
-    due, by_variable = np.zeros((n_actions, len(POINTS)), dtype=bool), np.ascontiguousarray(POINTS.T)
+    due = np.zeros((n_actions, len(POINTS)), dtype=bool)
+    sample = np.ascontiguousarray(POINTS.T), np.array(periodic)
     for i, action in enumerate(actions):
-        add_to_sample(i, states[i], by_variable, near[action], distance[action], due[action], np.empty(len(POINTS)))
+        add_to_sample(i, states[i], sample, near[action], distance[action], due[action], np.empty(len(POINTS)))
     np.testing.assert_array_equal(due, near[:, :, 0] >= 0)
     on_grid, each = np.full(n_actions * len(POINTS), -1), np.repeat(np.arange(n_actions), len(POINTS))
     of_pairs = draws[each] if drawn else draws
     choose_plain(np.arange(len(on_grid)), each, near.reshape(-1, 3), tuple(cache), first, of_pairs, on_grid)
-    recorded = states, *by_action(actions, n_actions)
+    recorded = states, *by_action(actions, n_actions), np.array(periodic)
     for p, state in enumerate(POINTS):
         asked = np.tile(state, (n_actions, 1)), np.arange(n_actions), np.zeros(n_actions)
         found = room_for(n_actions)
         assert select_plain(asked, recorded, (1.0, limit), tuple(cache), first, draws, found)
         np.testing.assert_array_equal(found[0], near[:, p])
+        np.testing.assert_array_equal(np.sort(found[0], axis=1), nearest(state, states, actions, periodic, limit))
         np.testing.assert_array_equal(candidates_of(found), on_grid.reshape(n_actions, -1)[:, p])
+
+
+def nearest(state, states, actions, periodic, limit):
+    """The three nearest transitions of each action, one by one, in the order of their numbers; -1 for none."""
+    rows = []
+    for action in range(2):
+        near = []
+        for i in np.flatnonzero(actions == action):
+            apart = np.abs(states[i] - state)
+            apart = [min(a, 1.0 - a) if wraps else a for a, wraps in zip(apart, periodic, strict=True)]
+            near.append((sum(a * a for a in apart), i))
+        kept = [i for distance, i in sorted(near)[:3] if distance < limit]
+        rows.append([-1] * (3 - len(kept)) + sorted(kept))
+    return rows
 
 
 def room_for(n, k=3):
@@ -98,7 +115,7 @@ def by_action(actions, n_actions):
 
 def test_an_action_that_needs_nothing_has_no_neighbors():
     query = np.zeros((2, 2)), np.arange(2), np.array([0.9, 1.0])
-    recorded = np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2)
+    recorded = np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2), NOT_PERIODIC
     found, cache = room_for(2), random_cache(np.random.default_rng(0), 3, 2, least=0.0)
     assert select_plain(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found)
     assert found[0].tolist() == [[0, -1, -1], [-1, -1, -1]]
@@ -107,7 +124,8 @@ def test_an_action_that_needs_nothing_has_no_neighbors():
 
 
 def test_nothing_is_selected_before_all_neighbors_have_been_measured():
-    query, recorded = (np.zeros((2, 2)), np.arange(2), np.zeros(2)), (np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2))
+    query = np.zeros((2, 2)), np.arange(2), np.zeros(2)
+    recorded = np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2), NOT_PERIODIC
     found, cache = room_for(2), random_cache(np.random.default_rng(0), 3, 2, least=0.0)
     found[2][:], found[3][:] = 7, 7
     for i, complete in ((2, False), (0, True)):
@@ -127,7 +145,7 @@ def test_the_best_candidate_is_the_best_mapping_of_algorithm_1(seed, n_candidate
     cache.compliance[:] = np.round(8.0 * cache.compliance) / 8.0
     transitions = equations.Transitions(sample, actions, np.zeros((20, 2)), np.zeros(20), np.zeros(20, dtype=bool))
     query, first = (rng.random((8, 2)), np.tile(np.arange(2), 4), np.zeros(8)), np.array([0, n_candidates, 2 * n_candidates])
-    found, recorded = room_for(8, k), (sample, *by_action(actions, 2))
+    found, recorded = room_for(8, k), (sample, *by_action(actions, 2), NOT_PERIODIC)
     assert select_plain(query, recorded, (1.0, np.inf), tuple(cache), first, np.empty(0), found)
     for state, action, chosen in zip(query[0], query[1], candidates_of(found), strict=True):
         near = equations.nearest_transitions(state, action, transitions, k)

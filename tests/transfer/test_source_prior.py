@@ -1,5 +1,7 @@
 """A source as a prior: what it predicts and claims of targets that it fits, and of others."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers import factored as f
@@ -300,6 +302,31 @@ def test_what_was_learned_goes_on_after_saving_and_loading(name, n):
     for transfer in (ours, theirs):
         live(transfer, n, n + 40)
     same(ours, theirs, *asked)
+
+
+def test_angles_go_around():
+    """The same dynamics seen half a turn on, so that the target crosses from 1 to 0 where the source is amid its data."""
+    rng = np.random.default_rng(0)
+    source = dataclasses.replace(f.oscillator_source(), periodic=(True, False))
+    states, actions, effects = f.walk(f.copies_mapping(1), 200)
+    turned = np.column_stack([(states[:, 0] + 0.5) % 1.0, states[:, 1]])
+    next_states = np.column_stack([(turned[:, 0] + effects[:, 0]) % 1.0, states[:, 1] + effects[:, 1]])
+    shifted = dataclasses.replace(
+        source,
+        states=source.states + [2.0, 0.0],
+        next_states=source.next_states + [2.0, 0.0],
+    )
+    transfer = COMBREL(shifted, "factored", use="prior")
+    task = dataclasses.replace(f.target_task(2, 3), periodic=(True, False))
+    transfer.bind(task, rng)
+    for state, action, after in zip(turned, actions.tolist(), next_states, strict=True):
+        transfer.observe(state, action, -1.0, after, False)
+    assert transfer.describe_prior() == "a0: Wait on (s0, s1); a1: Down on (s0, s1); a2: Up on (s0, s1)"
+    inner, actions = inside(100, 2, 3)
+    for turns in (0.0, 1.0, -1.0):
+        found = transfer.prior(np.column_stack([(inner[:, 0] + 0.5) % 1.0 + turns, inner[:, 1]]), actions)
+        np.testing.assert_allclose(found.effect, f.oscillate(inner, actions), atol=2e-3)
+        assert (found.weight[found.end < 0.1] > 1.0).mean() > 0.95
 
 
 def test_with_two_sources_the_one_that_fits_is_found():

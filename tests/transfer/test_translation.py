@@ -45,6 +45,7 @@ def translated(states, own, mappings, source, task, breadth, transfer_terminals=
         TranslationRules(threshold, breadth, task.min_weight, fraction, transfer_terminals, relevance is not None),
         np.empty((1, 0)) if relevance is None else relevance,
         TranslationScratch.empty(room, d, instances.block_low.shape[2]),
+        np.zeros(d, dtype=bool),
     )
     ranges = np.zeros(n, dtype=np.int64), np.full(n, len(rows))
     translate_plain(states, own, ranges, arrays.plain(), tuple(found))

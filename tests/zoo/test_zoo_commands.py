@@ -119,6 +119,14 @@ class TestShippedConfigurations:
         tasks = {CAR, BIG_CAR, "combrel/ICubTorsoStrike-v0", "combrel/ICubArmStrike-v0"}
         assert tasks <= set(yaml.safe_load((CONFIGS / f"{algo}.yml").read_text()))
 
+    @pytest.mark.parametrize(("env", "n_actions"), [("Pendulum-v1", 5), ("Acrobot-v1", 3)])
+    def test_tasks_with_angles_have_their_wrappers(self, tmp_path, env, n_actions):
+        assert call("train", *train_args(tmp_path, "--eval-freq", 30, env=env, n=60)) == 0
+        (model_file,) = tmp_path.glob(f"fitted_rmax/*/{env}.zip")
+        model = FittedRMax.load(model_file)
+        assert any(model.agent.periodic) and model.action_space.n == n_actions
+        assert call("enjoy", "--algo", "fitted_rmax", "--env", env, "-f", tmp_path, "--no-render", "-n", 5) == 0
+
     @pytest.mark.slow
     @pytest.mark.parametrize("algo", ["dqn", "qrdqn", "ppo"])
     def test_a_table_compares_them_with_fitted_rmax(self, logs, tmp_path, capsys, algo):

@@ -1,0 +1,81 @@
+"""Warnings where learning cannot make progress, or makes none, which an unsuitable ``max_value`` often causes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+# So many episodes in a row are no coincidence.
+IDLE_EPISODES = 3
+EQUAL_RETURNS = 20
+
+
+class ProgressWatch:
+    """
+    Looks at the episodes of learning, and warns once of each of two things that learning would never get out of.
+
+    - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
+      ``max_value`` of what is unknown, and nothing draws the agent to the unknown. An example is MountainCarContinuous with
+      gamma 1, where the best known plan is to do nothing.
+    - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time: nothing that
+      exploration reaches makes a difference.
+
+    :param max_value: value of what is unknown
+    :param gamma: discount factor
+    :param tolerance: what is too small to matter for values
+    """
+
+    def __init__(self, max_value: float, gamma: float, tolerance: float):
+        self.max_value = float(max_value)
+        self.gamma = float(gamma)
+        self.tolerance = float(tolerance)
+        self._n_idle = 0
+        self._n_equal = 0
+        self._last_return: float | None = None
+        self._n_optimistic = 0
+        self._warned: set[str] = set()
+
+    def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
+        """
+        Look at an episode.
+
+        :param rewards: its rewards
+        :param terminated: whether it ended in a terminal state, not by its time limit
+        :param n_optimistic_actions: how often an action without a model was chosen since learning began
+        """
+        self._note_cost(rewards, terminated)
+        explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
+        self._note_return(rewards, terminated, explored)
+
+    def _note_cost(self, rewards: Sequence[float], terminated: bool) -> None:
+        keeps_value = self.gamma == 1.0 or abs(self.max_value) <= self.tolerance
+        idle = keeps_value and not terminated and sum(map(abs, rewards)) <= self.tolerance
+        self._n_idle = self._n_idle + 1 if idle else 0
+        if self._n_idle == IDLE_EPISODES:
+            self._warn(
+                "idle",
+                f"max_value={self.max_value:g} with gamma={self.gamma:g}: {IDLE_EPISODES} episodes in a row had no reward but "
+                "0, and steps that cost nothing keep the value of what is known at max_value, so that nothing draws the agent "
+                "to what is unknown. Pass the largest return that the task can give as max_value, such as the reward of its "
+                "goal, above 0, and a gamma below 1, such as gamma=0.99",
+            )
+
+    def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:
+        total = sum(rewards)
+        # Where rewards are collected until the time limit it is a success to reach it.
+        stuck = explored and not terminated and min(rewards) <= 0.0
+        self._n_equal = (self._n_equal + 1 if total == self._last_return else 1) if stuck else 0
+        self._last_return = total
+        if self._n_equal == EQUAL_RETURNS:
+            self._warn(
+                "equal",
+                f"the last {EQUAL_RETURNS} returns are all {total:g}, though the agent still tries actions for the first time "
+                f"(max_value={self.max_value:g}, gamma={self.gamma:g}): nothing that it has reached makes a difference. "
+                "max_value must be above the return of a good policy, but not by far; with a larger model_breadth, or a "
+                "longer time limit, exploration gets farther",
+            )
+
+    def _warn(self, of: str, message: str) -> None:
+        if of not in self._warned:
+            self._warned.add(of)
+            warnings.warn(message, stacklevel=7)
