@@ -311,11 +311,9 @@ def test_angles_go_around():
     states, actions, effects = f.walk(f.copies_mapping(1), 200)
     turned = np.column_stack([(states[:, 0] + 0.5) % 1.0, states[:, 1]])
     next_states = np.column_stack([(turned[:, 0] + effects[:, 0]) % 1.0, states[:, 1] + effects[:, 1]])
-    shifted = dataclasses.replace(
-        source,
-        states=source.states + [2.0, 0.0],
-        next_states=source.next_states + [2.0, 0.0],
-    )
+    half_a_turn = np.array([2.0, 0.0])
+    states_on, next_states_on = source.states + half_a_turn, source.next_states + half_a_turn
+    shifted = dataclasses.replace(source, states=states_on, next_states=next_states_on)
     transfer = COMBREL(shifted, "factored", use="prior")
     task = dataclasses.replace(f.target_task(2, 3), periodic=(True, False))
     transfer.bind(task, rng)
