@@ -3,17 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from sb3_combrel import COMBREL, TIMBREL
+from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel.experiments.misleading_sources import MISLEADING
 from sb3_combrel.experiments.suite_tasks import Task
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.transfer.base import Transfer
 
-#: From the name on the command line to a function of (file with source instances).
-TRANSFERS: dict[str, Callable[[Path], Transfer]] = {
-    "COMBREL": COMBREL,
-    "TIMBREL-random": partial(TIMBREL, mapping="random"),
+
+def _misled(change: Callable[[SourceInstances], SourceInstances]) -> Callable[[SourceInstances, str], Transfer]:
+    return lambda source, task: COMBREL(change(source))
+
+
+def _oracle(n_axes: int) -> FactoredMapping:
+    """Make the mapping between Mountain Cars: one car of the source for each axis, pushed by the actions along it."""
+    copies = []
+    for axis in range(n_axes):
+        state: list[int | None] = [None] * (2 * n_axes)
+        state[axis], state[n_axes + axis] = 0, 1
+        # Actions of the target: Neutral, then to either side along each axis.
+        actions = [0] * (1 + 2 * n_axes)
+        actions[1 + 2 * axis], actions[2 + 2 * axis] = 1, 2
+        copies.append(InterTaskMapping(tuple(state), tuple(actions)))
+    return FactoredMapping(tuple(copies))
+
+
+#: The mapping that a person would choose, by task.
+ORACLES = {"MountainCar4D": _oracle(2), "MountainCar4D-60": _oracle(2), "MountainCar6D": _oracle(3)}
+
+#: From the name on the command line to a function of (source instances, name of the task).
+TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
+    "COMBREL": lambda source, task: COMBREL(source),
+    "COMBREL-instances": lambda source, task: COMBREL(source, "injective", use="instances"),
+    "TIMBREL-random": lambda source, task: TIMBREL(source, "random"),
+    "random": lambda source, task: TIMBREL(source, "random", mappings="factored", use="prior"),
+    "oracle": lambda source, task: TIMBREL(source, ORACLES[task], use="prior"),
+    **{f"COMBREL@{name}": _misled(change) for name, change in MISLEADING.items()},
 }
 
 
@@ -27,7 +53,7 @@ def make_transfer(name: str, task: Task, source: Path) -> Transfer:
     :raises ValueError: if the name is unknown, or the task has no source task
     """
     check_transfer(name, task)
-    return TRANSFERS[name](source)
+    return TRANSFERS[name](SourceInstances.load(source), task.name)
 
 
 def check_transfer(name: str, task: Task) -> None:
@@ -40,3 +66,5 @@ def check_transfer(name: str, task: Task) -> None:
         raise ValueError(f"transfer must be one of {', '.join(TRANSFERS)}, got {name!r}")
     if task.source is None:
         raise ValueError(f"transfer={name}: the task {task.name} has no source task")
+    if name == "oracle" and task.name not in ORACLES:
+        raise ValueError(f"transfer=oracle: nobody knows the mapping of {task.name}; known are {', '.join(ORACLES)}")

@@ -34,6 +34,9 @@ MIN_CHANGE = 0.5
 # would make the states beside them look good for ever. Only once an episode has ended or rewards have differed: until then
 # nothing says where to go, and to know how states change is not to know what is there.
 ON_GRID = 0.5
+# As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, twice the weight
+# is demanded: a broad kernel knows soon how states change, and would never find a small goal.
+EXPLORED, CHECKED_EVERY = 0.9, 50
 
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
@@ -129,6 +132,7 @@ class LocalLinear(Model):
         self._prior_version = -1
         # Whether an outcome has told states apart.
         self._informed, self._first_reward = False, np.nan
+        self._threshold, self._demand = self.exploration_threshold, 1.0
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
         self._all_actions = np.arange(self.n_actions)
         self._make_prediction(1)
@@ -173,9 +177,10 @@ class LocalLinear(Model):
             self._plain_scratch,
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
-        if len(emptied) + len(informed) == 0:
+        forgotten = self._demand_more()
+        if len(emptied) + len(informed) + len(forgotten) == 0:
             return changed
-        return np.unique(np.concatenate([emptied, informed, changed]))
+        return np.unique(np.concatenate([emptied, informed, forgotten, changed]))
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
         """Where a new instance goes, and the pairs that have none left once another has made room."""
@@ -240,10 +245,24 @@ class LocalLinear(Model):
             return NO_PAIRS
         self._first_reward = reward if np.isnan(self._first_reward) else self._first_reward
         self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
-        return self.lower_threshold(self.exploration_threshold) if self._informed else NO_PAIRS
+        if not self._informed:
+            return NO_PAIRS
+        self._demand = 1.0
+        return self.lower_threshold(self._threshold)
+
+    def _demand_more(self) -> np.ndarray:
+        """Demand more weight of what is known while no outcome has told states apart; the pairs that are no longer known."""
+        if self._informed or self.n_instances % CHECKED_EVERY or self.known.mean() < EXPLORED:
+            return NO_PAIRS
+        self._demand *= 2.0
+        self.exploration_threshold = self._demand * self._threshold
+        forgotten = np.flatnonzero(self.known & (self.own_weight < self._threshold_on_grid()))
+        self.known[forgotten] = False
+        return forgotten
 
     def lower_threshold(self, threshold: float) -> np.ndarray:
-        self.exploration_threshold = threshold
+        self._threshold = threshold
+        self.exploration_threshold = self._demand * threshold
         newly_known = np.flatnonzero(~self.known & (self.own_weight >= self._threshold_on_grid()))
         self.known[newly_known] = True
         return newly_known
@@ -320,7 +339,12 @@ class LocalLinear(Model):
         return self._prediction, given
 
     def get_state(self) -> dict[str, np.ndarray]:
-        return {**super().get_state(), "reach": self.fits.reach.copy(), "limit": self.fits.limit.astype(np.float64)}
+        return {
+            **super().get_state(),
+            "reach": self.fits.reach.copy(),
+            "limit": self.fits.limit.astype(np.float64),
+            "demand": np.array([self._demand]),
+        }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Compute sums and fits from the instances; pairs that were known stay known."""
@@ -329,6 +353,8 @@ class LocalLinear(Model):
         fits = self.fits
         for row in state["instances"]:
             self._inform(row[-3], row[-2] > 0.5)
+        self._demand = float(state["demand"][0])
+        self.exploration_threshold = self._demand * self._threshold
         fits.reach[:], fits.limit[:] = state["reach"], state["limit"]
         fits.known[:] = state["known"] > 0.5
         self._set_fits(fits._replace(target=np.empty_like(instances.effect)))

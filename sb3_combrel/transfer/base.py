@@ -36,6 +36,7 @@ class TargetTask:
     :param action_names: names of the actions, for display
     :param periodic: which state variables are periodic, so that 0 and 1 are the same unit coordinate: one bool for each,
         None for none
+    :param takes_prior: whether the target's model takes a prior (``use="prior"``)
     """
 
     scaling: StateScaling
@@ -47,6 +48,7 @@ class TargetTask:
     state_names: tuple[str, ...]
     action_names: tuple[str, ...]
     periodic: Sequence[bool] | None = None
+    takes_prior: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "periodic", periodic_flags(self.periodic, self.n_variables))

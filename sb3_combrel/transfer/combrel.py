@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
@@ -43,15 +45,16 @@ class COMBREL(MappingTransfer):
     ``FittedRMax(degree=1)``.
 
     :param source: source instances, a path to them, or a list of several, among which is selected as well
-    :param mappings: "injective" (each source variable is mapped to by one target variable, the other target variables are
-        left unmapped), "surjective", "all", "balanced", these with "signed_" before them (variables may be mirrored as
-        well), "paper_mountain_car", "paper_icub"; "factored" and "signed_factored" (with ``use="prior"`` only): the target's
-        variables are divided among copies of the source, or of some of its variables, each moved by a source action of its
-        own, and variables that stay; a ``FactoredMapping``; a list of mappings or a ``MappingSet``. Where every target
-        variable is mapped, as in "surjective", translated instances lie on diagonals of the target's space and help much
-        less: 12 episodes of MountainCar4D (breadth 0.1, 6 seeds) took 3,207 +- 55 steps with "injective", 3,803 +- 239 with
-        "all", 4,752 +- 239 with "signed_injective", 4,655 +- 184 with "signed_all", and 15,669 +- 327 with "surjective". The
-        sets named after the paper's experiments leave two of the four target variables unmapped.
+    :param mappings: None: "factored" with ``use="prior"``, "injective" without it; or a set. "injective" (each source
+        variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
+        "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
+        "factored" and "signed_factored" (with ``use="prior"`` only): the target's variables are divided among copies of the
+        source, or of some of its variables, each moved by a source action of its own, and variables that stay; a
+        ``FactoredMapping``; a list of mappings or a ``MappingSet``. Where every target variable is mapped, as in
+        "surjective", translated instances lie on diagonals of the target's space and help much less: 12 episodes of
+        MountainCar4D (``degree=0``, breadth 0.1, 6 seeds) took 3,207 +- 55 steps with "injective", 3,803 +- 239 with "all",
+        4,752 +- 239 with "signed_injective", 4,655 +- 184 with "signed_all", and 15,669 +- 327 with "surjective". The sets
+        named after the paper's experiments leave two of the four target variables unmapped.
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
     :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the
         nearest whatever their action, each judged by the source action that the mapping has for *its* action. So whole
@@ -85,8 +88,9 @@ class COMBREL(MappingTransfer):
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
         from the data, that of starts in proportion to how many variables a mapping compares. The paper names none.
-    :param use: "instances": translated instances fill what the target's own lack; or "prior", see above. Then of the arguments
-        after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and ``source_breadth`` have a meaning
+    :param use: None: "prior" where the target's model takes one (``FittedRMax(degree=1)``) unless ``mappings`` are given that
+        are not factored; "instances": translated instances fill what the target's own lack; or "prior", see above. Then of
+        the arguments after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and ``source_breadth`` have a meaning
     :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
@@ -95,7 +99,7 @@ class COMBREL(MappingTransfer):
     def __init__(
         self,
         source: SourceLike,
-        mappings: MappingsLike = "injective",
+        mappings: MappingsLike | None = None,
         *,
         n_neighbors: int = 3,
         neighbors: str = "action",
@@ -111,7 +115,7 @@ class COMBREL(MappingTransfer):
         relevance: bool = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
-        use: str = "instances",
+        use: str | None = None,
         source_breadth: float = DEFAULT_SOURCE_BREADTH,
     ):
         check_count("n_neighbors", n_neighbors)
@@ -130,6 +134,12 @@ class COMBREL(MappingTransfer):
             raise ValueError(f'choice must be "best" or "drawn", got {choice!r}')
         if measured not in ("online", "first_episode"):
             raise ValueError(f'measured must be "online" or "first_episode", got {measured!r}')
+        # With neither given both depend on the target's model, and are decided when it is known.
+        self._decides = mappings is None and use is None
+        if use is None:
+            use = "prior" if mappings is not None and is_factored(mappings) else "instances"
+        if mappings is None:
+            mappings = "factored" if use == "prior" else "injective"
         super().__init__(
             source,
             mappings,
@@ -151,7 +161,27 @@ class COMBREL(MappingTransfer):
         self.min_compliance = min_compliance
         self.min_evidence = min_evidence
 
+    @classmethod
+    def paper(cls, source: SourceLike, mappings: MappingsLike = "injective", **arguments: Any) -> COMBREL:
+        """
+        COMBREL as the paper has it: instances of the mapping that complies best with the transitions of the first episode.
+
+        :param source: as of the class; ``mappings``: the same
+        :param arguments: others of the class, which come before the paper's
+        """
+        as_published = dict(
+            use="instances", measured="first_episode", n_neighbors=3, min_compliance=0.0, min_evidence=0.0, breadth_decay=1.0
+        )
+        return cls(source, mappings, **{**as_published, **arguments})
+
+    def arguments(self) -> dict[str, Any]:
+        given = super().arguments()
+        return {**given, "mappings": None, "use": None} if self._decides else given
+
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        if self._decides:
+            self.use, self.mappings = ("prior", "factored") if task.takes_prior else ("instances", "injective")
+            self._decides = False
         super().bind(task, rng)
         if self.use == "prior":
             return
