@@ -118,11 +118,13 @@ class FittedRMaxPolicy(BasePolicy):
         :param path: path of the file
         :param device: where its tensors go
         """
-        saved = th.load(path, map_location=get_device(device), weights_only=False)
+        place = get_device(device)
+        # As SB3 does: observation spaces are pickled.
+        saved = th.load(path, map_location=place, weights_only=False)
         # Files of version 0.1.0, which had the kernel average only, do not say the degree.
         policy = cls(**{"degree": 0, **saved["data"]})
         policy.load_state_dict(saved["state_dict"])
-        return policy.to(device)
+        return policy.to(place)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
