@@ -307,7 +307,9 @@ class LocalLinear(Model):
         instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self.instances = instances
         fits = self.fits
-        fits.reach[:], fits.limit[:] = state["reach"], state["limit"]
+        # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
+        fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)
+        fits.limit[:] = np.clip(state["limit"], fits.limit, np.iinfo(np.int32).max)
         fits.known[:] = state["known"] > 0.5
         self._set_fits(fits._replace(target=np.empty_like(instances.effect)))
         if len(self.renew_prior()) == 0:
