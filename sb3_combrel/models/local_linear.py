@@ -31,7 +31,8 @@ MIN_CHANGE = 0.5
 
 # Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
 # values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
-# would make the states beside them look good for ever.
+# would make the states beside them look good for ever. Only once an episode has ended or rewards have differed: until then
+# nothing says where to go, and to know how states change is not to know what is there.
 ON_GRID = 0.5
 
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
@@ -126,6 +127,8 @@ class LocalLinear(Model):
         )
         self._plain_near = tuple(self._near)
         self._prior_version = -1
+        # Whether an outcome has told states apart.
+        self._informed, self._first_reward = False, np.nan
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
         self._all_actions = np.arange(self.n_actions)
         self._make_prediction(1)
@@ -157,6 +160,7 @@ class LocalLinear(Model):
             has changed enough; the others may wait (see :meth:`outdated`)
         """
         slot, emptied = self._slot_for(state, action)
+        informed = self._inform(reward, terminated)
         min_change = 0.0 if self._giver is None else MIN_CHANGE * self.exploration_threshold
         n_changed = _enter.call(
             self._plain_instances,
@@ -169,7 +173,9 @@ class LocalLinear(Model):
             self._plain_scratch,
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
-        return changed if len(emptied) == 0 else np.union1d(emptied, changed)
+        if len(emptied) + len(informed) == 0:
+            return changed
+        return np.unique(np.concatenate([emptied, informed, changed]))
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
         """Where a new instance goes, and the pairs that have none left once another has made room."""
@@ -226,7 +232,21 @@ class LocalLinear(Model):
                 fits.effect_range[0, action], fits.effect_range[1, action] = effects.min(axis=0), effects.max(axis=0)
 
     def _threshold_on_grid(self) -> float:
-        return ON_GRID * self.exploration_threshold
+        return (ON_GRID if self._informed else 1.0) * self.exploration_threshold
+
+    def _inform(self, reward: float, terminated: bool) -> np.ndarray:
+        """Note an outcome; the pairs that become known because it is the first that differs."""
+        if self._informed:
+            return NO_PAIRS
+        self._first_reward = reward if np.isnan(self._first_reward) else self._first_reward
+        self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
+        return self.lower_threshold(self.exploration_threshold) if self._informed else NO_PAIRS
+
+    def lower_threshold(self, threshold: float) -> np.ndarray:
+        self.exploration_threshold = threshold
+        newly_known = np.flatnonzero(~self.known & (self.own_weight >= self._threshold_on_grid()))
+        self.known[newly_known] = True
+        return newly_known
 
     def end_episode(self) -> np.ndarray:
         """Fit all pairs again that have had instances since the last time."""
@@ -307,6 +327,8 @@ class LocalLinear(Model):
         instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self.instances = instances
         fits = self.fits
+        for row in state["instances"]:
+            self._inform(row[-3], row[-2] > 0.5)
         # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
         fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)
         fits.limit[:] = np.clip(state["limit"], fits.limit, np.iinfo(np.int32).max)
