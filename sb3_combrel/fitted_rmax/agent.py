@@ -361,7 +361,7 @@ class FittedRMaxAgent:
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
             self.planner.restore(state["values"])
             self._set_corrections(CorrectionArrays.of_rows(state["corrections"]))
-            self.visits.counts[:] = state["visits"]
+            self.visits.counts[:] = np.clip(state["visits"], 0, np.iinfo(np.int32).max)
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

@@ -353,9 +353,11 @@ class LocalLinear(Model):
         fits = self.fits
         for row in state["instances"]:
             self._inform(row[-3], row[-2] > 0.5)
-        self._demand = float(state["demand"][0])
+        self._demand = max(1.0, float(state["demand"][0]))
         self.exploration_threshold = self._demand * self._threshold
-        fits.reach[:], fits.limit[:] = state["reach"], state["limit"]
+        # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
+        fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)
+        fits.limit[:] = np.clip(state["limit"], fits.limit, np.iinfo(np.int32).max)
         fits.known[:] = state["known"] > 0.5
         self._set_fits(fits._replace(target=np.empty_like(instances.effect)))
         if len(self.renew_prior()) == 0:

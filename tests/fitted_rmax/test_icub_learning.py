@@ -58,7 +58,7 @@ def test_time_limits_lower_the_threshold_of_the_model():
     np.testing.assert_array_equal(agent.mdp.arrays.modelled, agent.model.known)
     agent.n_truncated = 10**6
     end_episodes(agent, 1)
-    min_weight = agent.settings.min_weight
+    min_weight = agent.model_settings.min_weight
     assert (agent.model.known == (agent.model.own_weight >= min_weight)).all(), "in the end any instance that counts suffices"
 
 

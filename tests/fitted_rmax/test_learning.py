@@ -39,6 +39,7 @@ def mountain_car_2d(seed, n_episodes):
         n_episodes,
         seed,
         dict(start="fixed"),
+        degree=0,
         model_breadth=1 / 16,
         resolution=4,
         min_fraction=0.01,

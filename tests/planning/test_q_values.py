@@ -20,6 +20,7 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     agent = make_agent(
         n_variables,
         N_ACTIONS,
+        degree=0,
         model_breadth=kernel["breadth"],
         min_weight=kernel["min_weight"],
         min_fraction=kernel["min_fraction"],
