@@ -16,16 +16,11 @@ from helpers.naive_fitted_rmax import Instance
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel.models.base import ModelSettings
-from sb3_combrel.models.local_linear import LocalLinear
-from sb3_combrel.planning.grid import StateGrid
-from sb3_combrel.planning.mdp import FiniteMDP
-
 SMALL_GRIDS = [((3,), 1), ((2, 2), 0), ((1, 1, 1), 0), ((3,), 0, (True,)), ((2, 2), 1, (False, True))]
 
 
 class NaiveReplacement:
-    """The definition with ``max_instances``: the nearest instance of the action goes, and pairs that have none left with it."""
+    """The definition with ``max_instances``: the nearest instance of the action is replaced."""
 
     def __init__(self, naive, max_instances):
         self.naive, self.max_instances = naive, max_instances
@@ -39,12 +34,22 @@ class NaiveReplacement:
         naive.put(number, Instance(state, action, reward, next_state, terminated, naive.grid.periodic))
 
     def remove(self, action, number):
-        naive = self.naive
+        """A narrow kernel that has lost more than half of its instances becomes as broad as is allowed, and narrows again."""
+        naive, n = self.naive, self.naive.n_neighbors
         for point in range(naive.n_points):
-            if [n for _, n in naive.counted(action, point)] == [number]:
+            counted = [i for _, i in naive.counted(action, point)]
+            if number not in counted:
+                continue
+            n_left, is_broad = len(counted) - 1, naive.reach[action, point] >= naive.full_reach
+            if n_left > 0 and (2 * n_left >= n or is_broad):
+                continue
+            others = [squared for squared, i in naive.distances(naive.points[point], action) if i != number]
+            within = [squared for squared in others if squared <= naive.full_reach]
+            naive.reach[action, point] = within[n - 1] if len(within) >= n else naive.full_reach
+            n_left = sum(squared <= naive.reach[action, point] for squared in within)
+            naive.limit[action, point] = max(n + n // 2, 2 * n_left if n_left > n + n // 4 else 0)
+            if n_left == 0:
                 naive.known[action, point], naive.total[action, point] = False, 0.0
-                naive.reach[action, point] = naive.full_reach
-                naive.limit[action, point] = naive.n_neighbors + naive.n_neighbors // 2
         naive.instances[action][number].state = np.full(naive.d, np.inf)
 
 
@@ -100,28 +105,67 @@ def test_sums_and_rows_stay_right_where_many_instances_have_the_same_state(n_sta
 
 def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_again():
     kernel = dict(breadth=0.1, min_weight=0.05, n_neighbors=2, outcome_breadth=0.05)
-    model = make_linear_model(((3,), 0), kernel, max_instances=3, n_actions=1)
+    model = make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
     point = 4  # at 0.5
 
     def add(at):
         model.update_rows(model.add(np.array([at]), 0, -1.0, np.array([at + 0.1]), False))
 
-    for _ in range(3):
+    for _ in range(4):
         add(0.5)
-    assert model.known[point] and model.mdp.arrays.modelled[point]
-    for at in (0.95, 0.95, 0.95, 0.95):
+    assert model.known[point] and model.mdp.arrays.modelled[point] and model.fits.reach[point] == 0.0
+    # One after the other is replaced by one farther away.
+    for at in (0.9, 0.1, 0.45, 0.56, 0.3):
         add(at)
-    # The nearest to 0.95 were those at 0.5, then the first at 0.95.
-    assert model.known[point]
-    model_all_away = [0.7, 0.9, 0.72, 0.92, 0.1, 0.88]
-    for at in model_all_away:
+        assert model.known[point], "an instance within reach is left"
+    add(0.72)
+    np.testing.assert_allclose(np.sort(model.instances.state[0, :4, 0]), [0.1, 0.3, 0.72, 0.9])
+    assert not model.known[point] and not model.mdp.arrays.modelled[point]
+    assert model.own_weight[point] == 0.0 and (model.fits.sums[point] == 0.0).all()
+    add(0.51)
+    assert model.known[point] and model.mdp.arrays.modelled[point], "the narrow kernel of former times is forgotten"
+
+
+def test_a_narrow_kernel_becomes_broad_again_when_its_instances_have_gone():
+    kernel = dict(breadth=0.4, min_weight=0.05, n_neighbors=4, outcome_breadth=0.05)
+    model, naive = linear_model_and_definition(((2,), 0), kernel, max_instances=8, n_actions=1)
+    expected, point = NaiveReplacement(naive, 8), 2  # at 0.5
+
+    def add(at):
+        learn_linear(model, expected, [(np.array([at]), 0, -at, np.array([at + 0.1 * at]), False)])
+
+    for at in np.linspace(0.48, 0.52, 8):
         add(at)
-    while model.known[point]:
-        nearest = model.instances.state[0, : model.instances.size[0], 0]
-        assert np.abs(nearest - 0.5).min() < 0.2
-        add(float(nearest[np.abs(nearest - 0.5).argmin()] + 0.3))
-    assert not model.mdp.arrays.modelled[point] and model.own_weight[point] == 0.0
-    assert (model.fits.sums[point] == 0.0).all()
-    for at in (0.51, 0.49):
+    narrow = model.fits.reach[point]
+    assert narrow < 1e-3
+    for at in (0.95, 0.05, 0.72, 0.28, 0.61, 0.39):
         add(at)
-    assert model.known[point], "a narrow kernel of former times is forgotten"
+        assert model.fits.reach[point] == narrow
+    add(0.555)
+    assert model.known[point] and model.fits.reach[point] > 10.0 * narrow
+    assert_same_sums(model, naive)
+    finish_episode(model)
+    assert_same_fits(model, naive)
+
+
+def test_rewards_are_those_of_the_instances_left_however_little_these_weigh():
+    kernel = dict(breadth=0.5, min_weight=0.01, n_neighbors=8, outcome_breadth=0.05)
+    model, naive = linear_model_and_definition(((2,), 0), kernel, max_instances=2, n_actions=1)
+    expected, point = NaiveReplacement(naive, 2), 2  # at 0.5
+    for at, reward in ((0.5, 100.0), (0.0, -3.0), (0.6, 50.0), (0.7, 20.0), (0.85, 10.0), (0.98, -1.0)):
+        learn_linear(model, expected, [(np.array([at]), 0, reward, np.array([at + 0.05]), False)])
+    finish_episode(model)
+    assert_same_fits(model, naive)
+    assert model.fits.row[point, 1] == pytest.approx(-1.0, abs=0.01), "0.98 is a little nearer than 0"
+
+
+@pytest.mark.parametrize("outcome_breadth", [1e-3, 1e-2])
+def test_rewards_far_from_all_instances_are_numbers_however_narrow_their_kernel_is(outcome_breadth):
+    kernel = dict(breadth=0.5, min_weight=0.05, n_neighbors=8, outcome_breadth=outcome_breadth)
+    model = make_linear_model(((3,), 0), kernel, n_actions=1)
+    for reward in (-1.0, -2.0, -3.0):
+        model.update_rows(model.add(np.array([0.0]), 0, reward, np.array([0.05]), False))
+    finish_episode(model)
+    assert model.known[4]
+    np.testing.assert_allclose(model.fits.row[model.known], [[0.05, -2.0, 0.0]] * model.known.sum(), atol=1e-12)
+    assert model.predict_at(np.array([0.5]))[0].reward[0] == pytest.approx(-2.0)
