@@ -31,6 +31,11 @@ PRIOR_OUTCOME_WEIGHT = 0.1
 # and its row is written again when the prediction has moved by the second; in parts of the size of the action's effects.
 MAX_UNEXPLAINED = 0.2
 TOLERANCE = 0.1
+# The narrower weight of an instance is no less than this: where all are far away their mean is still a quotient.
+LEAST_WEIGHT = 1e-200
+# Narrower weights differ by many orders of magnitude. To subtract a large one leaves nothing but rounding of small ones: where
+# less than this is left, and what was subtracted was no small part of it, the sums are computed anew.
+MUCH_ROUNDED = 1e-6
 # A variable that hardly ever changes is measured by this part of a cell.
 LEAST_SCALE = 0.02
 
@@ -189,7 +194,7 @@ def count_instance(fits, pair, distance, products, reward, terminated, kernel, s
     weight = sign * np.exp(distance * fits.scale[pair])
     sums = fits.sums[pair]
     add_products(sums, weight, products)
-    near = sign * np.exp(distance * kernel.outcome_scale)
+    near = sign * max(LEAST_WEIGHT, np.exp(distance * kernel.outcome_scale))
     outcome = fits.outcome[pair]
     outcome[0] += near
     outcome[1] += near * reward
@@ -237,9 +242,10 @@ def contradiction(fits, pair, instances, action, slot, state, shares):
 
 
 @inner
-def recount(instances, fits, pair, action, kernel, scratch):
+def recount(instances, fits, pair, action, kernel, left_out, scratch):
     """Compute a pair's sums anew from the instances that count, in their order.
 
+    :param left_out: number of an instance that does not count; -1 for none
     :param scratch: ``at`` is where the pair's point is
     :return: how many they are, and the sum of their weights (of breadth ``model_breadth``)
     """
@@ -257,7 +263,7 @@ def recount(instances, fits, pair, action, kernel, scratch):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
             distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
-            if distance > reach:
+            if distance > reach or i == left_out:
                 continue
             bring_near(instances.state[action, i], scratch.at, instances.periodic, scratch.state)
             products_of(scratch.state, fits.target[action, i], products)
@@ -278,8 +284,11 @@ def measure_blocks(instances, action, at):
 
 
 @inner
-def narrow(instances, fits, pair, action, kernel, scratch):
-    """Let only the ``n_neighbors`` nearest instances of a pair count, and those as near as the last of them."""
+def narrow(instances, fits, pair, action, kernel, left_out, scratch):
+    """Let only the ``n_neighbors`` nearest instances of a pair count, and those as near as the last of them.
+
+    :param left_out: as in :func:`recount`
+    """
     reach = fits.reach[pair]
     n_blocks = measure_blocks(instances, action, scratch.at)
     nearest = scratch.nearest
@@ -290,7 +299,7 @@ def narrow(instances, fits, pair, action, kernel, scratch):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
             distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
-            if distance > reach:
+            if distance > reach or i == left_out:
                 continue
             k = length if length < kernel.n_neighbors else length - 1
             if length == kernel.n_neighbors:
@@ -305,7 +314,7 @@ def narrow(instances, fits, pair, action, kernel, scratch):
             if length == kernel.n_neighbors:
                 reach = nearest[length - 1]
     fits.reach[pair] = reach
-    recount(instances, fits, pair, action, kernel, scratch)
+    recount(instances, fits, pair, action, kernel, left_out, scratch)
     # Many instances at one state: to look for narrower kernels again and again would be in vain.
     n, n_counted = kernel.n_neighbors, fits.n_counted[pair]
     fits.limit[pair] = max(n + n // 2, 2 * n_counted if n_counted > n + n // 4 else 0)
@@ -363,7 +372,7 @@ def narrow_and_refit(instances, fits, pair, action, kernel, grid, scratch):
     """:func:`refit` with a narrower kernel if too many instances count."""
     if fits.n_counted[pair] > fits.limit[pair]:
         unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
-        narrow(instances, fits, pair, action, kernel, scratch)
+        narrow(instances, fits, pair, action, kernel, np.int64(-1), scratch)
     return refit(fits, pair, action, grid, scratch, TOLERANCE)
 
 
@@ -435,11 +444,33 @@ def enter_plain(instances, fits, grid, kernel, thresholds, transition, prior, sc
     return enter(instances, fits, grid, Kernel(*kernel), thresholds, transition, prior, FitScratch(*scratch))
 
 
+@part
+def count_without(instances, fits, pair, action, slot, kernel, scratch):
+    """Bring a pair that has lost an instance in order; whether its row is to be updated.
+
+    A narrow kernel with less than half of ``n_neighbors`` left is as broad again as these allow.
+
+    :param slot: the instance that is gone; ``scratch.at`` is where the pair's point is
+    """
+    if fits.n_counted[pair] > 0 and (2 * fits.n_counted[pair] >= kernel.n_neighbors or fits.reach[pair] >= kernel.reach):
+        return False
+    fits.reach[pair] = kernel.reach
+    narrow(instances, fits, pair, action, kernel, slot, scratch)
+    if fits.n_counted[pair] == 0:
+        fits.sums[pair, :] = 0.0
+        fits.outcome[pair, :] = 0.0
+        fits.total[pair] = 0.0
+        fits.known[pair] = False
+    fits.unexplained[pair] = np.inf
+    return True
+
+
 @compiled
 def leave(instances, fits, grid, kernel, action, slot, scratch):
     """Take an instance out of the sums of the pairs for which it counts; another is about to be entered in its place.
 
-    :return: how many pairs have none left; their points are moved to the front of ``scratch.point``
+    :return: of how many pairs the rows are to be updated at once, as they have no instances left, or others than before;
+        their points are moved to the front of ``scratch.point``
     """
     n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
@@ -451,22 +482,24 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     n_found = points_within(
         instances.state[action, slot], fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch
     )
-    emptied = 0
+    changed = 0
     for f in range(n_found):
         pair = first_pair + scratch.point[f]
         unit_coordinates_of(scratch.point[f], grid, scratch.at)
         bring_near(instances.state[action, slot], scratch.at, grid.periodic, state)
         products_of(state, fits.target[action, slot], products)
-        count_instance(fits, pair, scratch.distance[f], products, reward, terminated, kernel, -1.0)
+        shares = count_instance(fits, pair, scratch.distance[f], products, reward, terminated, kernel, -1.0)
         fits.n_counted[pair] -= 1
-        if fits.n_counted[pair] <= 0:
-            fits.sums[pair, :] = 0.0
-            fits.outcome[pair, :] = 0.0
-            fits.total[pair] = 0.0
-            fits.known[pair] = False
-            scratch.point[emptied] = scratch.point[f]
-            emptied += 1
-    return emptied
+        if count_without(instances, fits, pair, action, slot, kernel, scratch):
+            scratch.point[changed] = scratch.point[f]
+            changed += 1
+            continue
+        if fits.outcome[pair, 0] < MUCH_ROUNDED and not 0.0 <= -shares[1] <= 0.1:
+            recount(instances, fits, pair, action, kernel, slot, scratch)
+        # The fit is no longer that of the instances that are left.
+        shares = min(1.0, abs(shares[0])), min(1.0, abs(shares[1]))
+        fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, state, shares)
+    return changed
 
 
 @compiled
@@ -506,7 +539,7 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
     for pair in range(len(fits.total)):
         action = pair // n_points
         unit_coordinates_of(pair - action * n_points, grid, scratch.at)
-        total = recount(instances, fits, pair, action, kernel, scratch)
+        total = recount(instances, fits, pair, action, kernel, np.int64(-1), scratch)
         fits.total[pair] = total
         if total >= threshold:
             fits.known[pair] = True

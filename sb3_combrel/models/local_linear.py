@@ -58,7 +58,7 @@ class LocalLinear(Model):
     On the grid, the sums of each pair's regression are kept: an instance is added to those of all pairs that it reaches, and
     the regression is solved again only where the instances since the last time contradict it. When a pair has half as many
     again as ``n_neighbors`` its kernel narrows, and the sums are computed anew. With ``max_instances``, the nearest instance
-    of the same action is replaced.
+    of the same action is replaced; a pair that has less than half of ``n_neighbors`` left by that gets a broader kernel again.
 
     With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and pairs
     that it claims to know are modelled before their own instances suffice.
@@ -163,7 +163,7 @@ class LocalLinear(Model):
         :return: the pairs whose predictions have moved, but with a transfer method only known ones and those whose weight
             has changed enough; the others may wait (see :meth:`outdated`)
         """
-        slot, emptied = self._slot_for(state, action)
+        slot, left = self._slot_for(state, action)
         informed = self._inform(reward, terminated)
         min_change = 0.0 if self._giver is None else MIN_CHANGE * self.exploration_threshold
         n_changed = _enter.call(
@@ -178,12 +178,12 @@ class LocalLinear(Model):
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
         forgotten = self._demand_more()
-        if len(emptied) + len(informed) + len(forgotten) == 0:
+        if len(left) + len(informed) + len(forgotten) == 0:
             return changed
-        return np.unique(np.concatenate([emptied, informed, forgotten, changed]))
+        return np.unique(np.concatenate([left, informed, forgotten, changed]))
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
-        """Where a new instance goes, and the pairs that have none left once another has made room."""
+        """Where a new instance goes, and the pairs whose rows are to be updated because another has made room."""
         instances = self._instances
         size = int(instances.size[action])
         if self.settings.max_instances is not None and size >= self.settings.max_instances:

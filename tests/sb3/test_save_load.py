@@ -13,7 +13,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_combrel import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
-ARGUMENTS = ("degree", "min_fraction", "model_breadth", "resolution", "max_backups", "gamma", "max_value", "num_timesteps", "seed")
+ARGUMENTS = (
+    "degree",
+    "min_fraction",
+    "model_breadth",
+    "resolution",
+    "max_backups",
+    "gamma",
+    "max_value",
+    "num_timesteps",
+    "seed",
+)
 
 
 # What each model has of its pairs, by the degree.

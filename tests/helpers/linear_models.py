@@ -1,0 +1,136 @@
+"""Local linear models, and what they are compared with: kernels, the definition in plain loops, a prior, linear dynamics."""
+
+import numpy as np
+
+from helpers.kernel_models import N_ACTIONS, assert_same_row, make_grid, row_of, without_staying
+from helpers.naive_local_linear import NaiveLocalLinear
+from sb3_combrel.common.prior import PriorPredictions
+from sb3_combrel.models.base import ModelSettings
+from sb3_combrel.models.local_linear import LocalLinear
+from sb3_combrel.planning.mdp import FiniteMDP
+
+LINEAR_KERNELS = [
+    dict(breadth=0.3, min_weight=0.01, n_neighbors=5, outcome_breadth=0.05),
+    dict(breadth=0.5, min_weight=0.05, n_neighbors=4, outcome_breadth=0.1),
+    dict(breadth=0.8, min_weight=0.3, n_neighbors=12, outcome_breadth=2.0),
+    dict(breadth=0.2, min_weight=0.05, n_neighbors=2, outcome_breadth=0.05),
+]
+
+
+def make_linear_model(grid, kernel, *, gamma=1.0, max_instances=None, prior=None, threshold=1.0, n_actions=N_ACTIONS):
+    """A model on a finite MDP of its own; ``grid`` as in ``kernel_models.GRIDS``."""
+    settings = ModelSettings(
+        model_breadth=kernel["breadth"],
+        min_weight=kernel["min_weight"],
+        min_fraction=0.1,
+        exploration_threshold=threshold,
+        max_instances=max_instances,
+        n_neighbors=kernel["n_neighbors"],
+        outcome_breadth=kernel["outcome_breadth"],
+    )
+    return LocalLinear(FiniteMDP(make_grid(grid), n_actions, gamma), settings, prior)
+
+
+def linear_model_and_definition(grid, kernel, *, threshold=1.0, prior=None, **kwargs):
+    model = make_linear_model(grid, kernel, threshold=threshold, prior=prior, **kwargs)
+    naive = NaiveLocalLinear(
+        grid, kernel, model.n_actions, threshold=threshold, prior=None if prior is None else prior.as_naive(threshold)
+    )
+    return model, naive
+
+
+def learn_linear(model, naive, transitions):
+    """Add transitions to a model, whose rows are kept up to date, and to the definition."""
+    for transition in transitions:
+        model.update_rows(model.add(*transition))
+        naive.add(*transition)
+
+
+def finish_episode(model):
+    model.update_rows(model.end_episode())
+
+
+def assert_same_sums(model, naive):
+    """The sums of all pairs are those of the instances within the reach of each."""
+    reach, n_counted = (array.reshape(naive.known.shape) for array in (model.fits.reach, model.fits.n_counted))
+    np.testing.assert_allclose(reach, naive.reach, rtol=1e-12)
+    for action in range(naive.n_actions):
+        for point in range(naive.n_points):
+            pair = action * naive.n_points + point
+            sums, outcome = naive.sums(action, point)
+            assert n_counted[action, point] == len(naive.counted(action, point))
+            np.testing.assert_allclose(model.fits.sums[pair], sums, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(model.fits.outcome[pair], outcome, rtol=1e-9, atol=1e-9)
+
+
+def assert_same_fits(model, naive, gamma=1.0):
+    """All modelled pairs, and none else, have the prediction and the row of the definition.
+
+    :return: how many these are
+    """
+    n_modelled = 0
+    for action in range(naive.n_actions):
+        for point in range(naive.n_points):
+            pair = action * naive.n_points + point
+            modelled = naive.known[action, point] or naive.claimed(action, point)
+            assert model.mdp.arrays.modelled[pair] == modelled
+            if not modelled:
+                assert row_of(model.mdp, point, action) == {}
+                continue
+            expected = naive.at_pair(action, point)
+            np.testing.assert_allclose(
+                model.fits.row[pair], [*expected.effect, expected.reward, expected.end], rtol=1e-7, atol=1e-8
+            )
+            reward, successors = without_staying(*naive.row(action, point), point, gamma)
+            # A geometric series magnifies rounding.
+            np.testing.assert_allclose(model.mdp.arrays.reward[pair], reward, rtol=1e-5, atol=1e-7)
+            assert_same_row(row_of(model.mdp, point, action), successors)
+            n_modelled += 1
+    return n_modelled
+
+
+class StubPrior:
+    """A transfer method with ``use="prior"``, from functions of state and action.
+
+    :param effect: function of (state, action)
+    :param claims: function of (state, action): whether to claim to know
+    """
+
+    use = "prior"
+
+    def __init__(self, effect, claims=lambda state, action: True, reward=-1.0, end=0.0):
+        self.effect, self.claims, self.reward, self.end = effect, claims, reward, end
+        self.version = 0
+
+    def prior(self, states, actions):
+        asked = list(zip(states, actions, strict=True))
+        n, d = states.shape
+        return PriorPredictions(
+            effect=np.array([self.effect(state, int(action)) for state, action in asked]).reshape(n, d),
+            reward=np.full(n, self.reward),
+            end=np.full(n, self.end),
+            weight=np.array([100.0 if self.claims(state, int(action)) else 0.0 for state, action in asked]),
+        )
+
+    def prior_version(self):
+        return self.version
+
+    def as_naive(self, threshold):
+        """The same as a function for the definition."""
+        return lambda state, action: (self.effect(state, action), self.reward, self.end, bool(self.claims(state, action)))
+
+
+class LinearDynamics:
+    """One matrix an action: the effect is ``offset[action] + state @ matrix[action]``, small enough to stay near the box."""
+
+    def __init__(self, seed, d, n_actions=N_ACTIONS, size=0.1):
+        rng = np.random.default_rng(seed)
+        self.matrix = rng.uniform(-size, size, (n_actions, d, d))
+        self.offset = rng.uniform(-size, size, (n_actions, d))
+
+    def effect(self, state, action):
+        return self.offset[action] + state @ self.matrix[action]
+
+    def transitions(self, states, reward=-1.0):
+        """One transition of each action from each of some states."""
+        return [(s, a, reward, s + self.effect(s, a), False) for s in states for a in range(len(self.matrix))]

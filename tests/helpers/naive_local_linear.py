@@ -1,0 +1,209 @@
+"""The local linear model again, written from its definition in plain loops and NumPy: slow, and independent of the package.
+
+Nothing is incremental but what the definition itself says has a history: how far the instances of a pair may be, which only
+narrows; what is known, which stays known; and the range of the effects that were seen.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from helpers.naive_fitted_rmax import Instance, NaiveGrid, apart
+
+# Figures of the definition, as the documentation states them.
+LAST_WEIGHT = 0.05
+NARROWEST = 0.02
+RIDGE = 0.01
+EXPLAINED_WEIGHT = 0.5
+PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
+ON_GRID = 0.5
+
+
+class Predicted(NamedTuple):
+    """Of one action at one state; ``weight``: sum of exp(-d^2 / breadth^2) over the instances behind it."""
+
+    effect: np.ndarray
+    reward: float
+    end: float
+    weight: float
+
+
+def squared_distance(at, state, periodic):
+    total = 0.0
+    for d in apart(at, state, periodic):
+        total += d * d
+    return total
+
+
+def ridge_regression(weights, states, effects, ridge):
+    """Intercept and slopes, by least squares: the ridge as further rows, beneath data whose means are subtracted."""
+    weights, states, effects = (np.asarray(array, dtype=float) for array in (weights, states, effects))
+    d = states.shape[1]
+    mean_state, mean_effect = np.average(states, axis=0, weights=weights), np.average(effects, axis=0, weights=weights)
+    root = np.sqrt(weights)[:, None]
+    rows = np.vstack([root * (states - mean_state), math.sqrt(ridge) * np.eye(d)])
+    right = np.vstack([root * (effects - mean_effect), np.zeros((d, effects.shape[1]))])
+    slopes = np.linalg.lstsq(rows, right, rcond=None)[0]
+    return mean_effect - mean_state @ slopes, slopes
+
+
+class NaiveLocalLinear:
+    """
+    The model of a task, action by action.
+
+    :param grid: (resolution by variable, margin[, periodic])
+    :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``
+    :param threshold: weight that makes an exact state known
+    :param prior: function of (state, action) that returns effect, reward, end and whether it claims to know; None for none
+    """
+
+    def __init__(self, grid, kernel, n_actions, *, threshold=1.0, prior=None):
+        self.grid = NaiveGrid(*grid[:2], grid[2] if len(grid) > 2 else None)
+        self.points = [self.grid.unit(point) for point in range(len(self.grid.coordinates))]
+        self.n_points, self.n_actions, self.d = len(self.points), n_actions, len(grid[0])
+        self.breadth, self.n_neighbors = kernel["breadth"], kernel["n_neighbors"]
+        self.outcome_breadth = min(self.breadth, kernel["outcome_breadth"])
+        self.full_reach = -math.log(kernel["min_weight"]) * self.breadth**2
+        self.threshold = threshold
+        self.prior = prior
+        self.instances = [[] for _ in range(n_actions)]
+        self.seen_effects = [[] for _ in range(n_actions)]
+        shape = n_actions, self.n_points
+        self.reach = np.full(shape, self.full_reach)
+        self.limit = np.full(shape, self.n_neighbors + self.n_neighbors // 2)
+        self.total = np.zeros(shape)
+        self.known = np.zeros(shape, dtype=bool)
+
+    # ---------------------------------------------------------------- the prior
+
+    def prior_at(self, state, action):
+        return (np.zeros(self.d), 0.0, 0.0, False) if self.prior is None else self.prior(state, action)
+
+    def target(self, instance):
+        return instance.effect - self.prior_at(instance.state, instance.action)[0]
+
+    def effect_range(self, action):
+        """Least and largest effects: those that were seen, and those that the prior predicts on the grid."""
+        effects = list(self.seen_effects[action])
+        if self.prior is not None:
+            effects += [self.prior_at(point, action)[0] for point in self.points]
+        return (np.min(effects, axis=0), np.max(effects, axis=0)) if effects else None
+
+    # ---------------------------------------------------------------- any state
+
+    def distances(self, at, action):
+        """(squared distance, number) of all instances of an action, the nearest first; of equal ones the lower number."""
+        return sorted((squared_distance(at, i.state, self.grid.periodic), n) for n, i in enumerate(self.instances[action]))
+
+    def narrowed(self, farthest):
+        """The breadth of a kernel at whose full list the last squared distance is ``farthest``."""
+        if farthest >= self.full_reach:
+            return self.breadth
+        return min(self.breadth, max(NARROWEST * self.breadth, math.sqrt(farthest / -math.log(LAST_WEIGHT))))
+
+    def predicted(self, at, action, counted, breadth):
+        """
+        Predict from the instances that count.
+
+        :param counted: (squared distance, number) of these
+        :param breadth: of the kernel of the fit
+        """
+        of_prior, prior_reward, prior_end, claimed = self.prior_at(at, action)
+        low, high = self.effect_range(action) or (-np.inf, np.inf)
+        if not counted:
+            return Predicted(np.clip(of_prior, low, high), prior_reward, prior_end, 0.0)
+        instances = [self.instances[action][number] for _, number in counted]
+        # Periodic variables by as many periods away as bring them nearest.
+        states = np.array([at + np.array(apart(i.state, at, self.grid.periodic)) for i in instances])
+        targets = np.array([self.target(i) for i in instances])
+        squared = np.array([d for d, _ in counted])
+        weights, near = np.exp(-squared / breadth**2), np.exp(-squared / self.outcome_breadth**2)
+        intercept, slopes = ridge_regression(weights, states, targets, RIDGE * breadth**2)
+        left_over = near @ (targets - intercept - states @ slopes) / (near.sum() + EXPLAINED_WEIGHT)
+        share = weights.sum() / (weights.sum() + PRIOR_WEIGHT) if claimed else 1.0
+        effect = np.clip(of_prior + share * (intercept + at @ slopes + left_over), low, high)
+        reward, end = self.outcome(squared, instances, prior_reward, prior_end, claimed)
+        return Predicted(effect, reward, end, float(np.exp(-squared / self.breadth**2).sum()))
+
+    def outcome(self, squared, instances, prior_reward, prior_end, claimed):
+        """Averages by the narrower kernel, seen from the nearest instance, where weights would be too small for a quotient."""
+        near = np.exp(-(squared - squared.min()) / self.outcome_breadth**2)
+        rewards, ends = np.array([i.reward for i in instances]), np.array([float(i.terminated) for i in instances])
+        if claimed:
+            closest = math.exp(-squared.min() / self.outcome_breadth**2)
+            total = closest * near.sum() + PRIOR_OUTCOME_WEIGHT
+            reward = (closest * near @ rewards + PRIOR_OUTCOME_WEIGHT * prior_reward) / total
+            return reward, (closest * near @ ends + PRIOR_OUTCOME_WEIGHT * prior_end) / total
+        return near @ rewards / near.sum(), near @ ends / near.sum()
+
+    def at_state(self, state, action):
+        """Predict at an exact state, from its nearest instances within reach."""
+        counted = [entry for entry in self.distances(state, action) if entry[0] <= self.full_reach][: self.n_neighbors]
+        full = len(counted) == self.n_neighbors
+        return self.predicted(state, action, counted, self.narrowed(counted[-1][0]) if full else self.breadth)
+
+    # ----------------------------------------------------------------- the grid
+
+    def claimed(self, action, point):
+        return self.prior_at(self.points[point], action)[3]
+
+    def counted(self, action, point):
+        """(squared distance, number) of the instances that count for a pair."""
+        return [entry for entry in self.distances(self.points[point], action) if entry[0] <= self.reach[action, point]]
+
+    def at_pair(self, action, point):
+        counted, breadth = self.counted(action, point), self.narrowed(self.reach[action, point])
+        return self.predicted(self.points[point], action, counted, breadth)
+
+    def sums(self, action, point):
+        """Of a pair: the weighted sums of 1, x, x x^T, e, x e^T; and of narrower weights, of these times reward, end, x, e."""
+        at, breadth = self.points[point], self.narrowed(self.reach[action, point])
+        one, x, xx, e, xe = 0.0, *(np.zeros(n) for n in (self.d, (self.d, self.d), self.d, (self.d, self.d)))
+        outcome = np.zeros(3 + 2 * self.d)
+        for squared, number in self.counted(action, point):
+            instance = self.instances[action][number]
+            state, target = at + np.array(apart(instance.state, at, self.grid.periodic)), self.target(instance)
+            w = math.exp(-squared / breadth**2)
+            one, x, e = one + w, x + w * state, e + w * target
+            xx, xe = xx + w * np.outer(state, state), xe + w * np.outer(state, target)
+            near = math.exp(-squared / self.outcome_breadth**2)
+            outcome += near * np.concatenate([[1.0, instance.reward, float(instance.terminated)], state, target])
+        return np.concatenate([[one], x, xx[np.tril_indices(self.d)], e, xe.reshape(-1)]), outcome
+
+    def row(self, action, point):
+        """(R, {successor: probability}) of a pair, staying included and undiscounted."""
+        found = self.at_pair(action, point)
+        corners = self.grid.corners(self.points[point] + found.effect) if found.end < 1.0 else {}
+        return found.reward, {to: (1.0 - found.end) * part for to, part in corners.items()}
+
+    # ----------------------------------------------------------------- learning
+
+    def add(self, state, action, reward, next_state, terminated):
+        """Add an instance; the kernels of pairs that have too many by it narrow."""
+        self.put(len(self.instances[action]), Instance(state, action, reward, next_state, terminated, self.grid.periodic))
+
+    def put(self, number, instance):
+        action = instance.action
+        self.instances[action][number : number + 1] = [instance]
+        self.seen_effects[action].append(instance.effect)
+        for point, at in enumerate(self.points):
+            squared = squared_distance(at, instance.state, self.grid.periodic)
+            if squared > self.reach[action, point]:
+                continue
+            if not self.known[action, point]:
+                self.total[action, point] += math.exp(-squared / self.breadth**2)
+                self.known[action, point] = self.total[action, point] >= ON_GRID * self.threshold
+            if self.known[action, point] or self.claimed(action, point):
+                self.narrow(action, point)
+
+    def narrow(self, action, point):
+        """Let only the nearest instances of a pair count if there are more than its limit."""
+        counted = self.counted(action, point)
+        if len(counted) <= self.limit[action, point]:
+            return
+        n = self.n_neighbors
+        self.reach[action, point] = counted[n - 1][0]
+        left = len(self.counted(action, point))
+        # Many at one and the same distance: the limit is twice as many.
+        self.limit[action, point] = max(n + n // 2, 2 * left if left > n + n // 4 else 0)

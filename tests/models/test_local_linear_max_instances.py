@@ -1,0 +1,171 @@
+"""The local linear model with ``max_instances``: which instance is replaced, and what remains of it."""
+
+import numpy as np
+import pytest
+from helpers.kernel_models import N_ACTIONS, random_transitions
+from helpers.linear_models import (
+    LINEAR_KERNELS,
+    assert_same_fits,
+    assert_same_sums,
+    finish_episode,
+    learn_linear,
+    linear_model_and_definition,
+    make_linear_model,
+)
+from helpers.naive_fitted_rmax import Instance
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+SMALL_GRIDS = [((3,), 1), ((2, 2), 0), ((1, 1, 1), 0), ((3,), 0, (True,)), ((2, 2), 1, (False, True))]
+
+
+class NaiveReplacement:
+    """The definition with ``max_instances``: the nearest instance of the action is replaced."""
+
+    def __init__(self, naive, max_instances):
+        self.naive, self.max_instances = naive, max_instances
+
+    def add(self, state, action, reward, next_state, terminated):
+        naive = self.naive
+        number = len(naive.instances[action])
+        if number == self.max_instances:
+            number = naive.distances(state, action)[0][1]
+            self.remove(action, number)
+        naive.put(number, Instance(state, action, reward, next_state, terminated, naive.grid.periodic))
+
+    def remove(self, action, number):
+        """A narrow kernel that has lost more than half of its instances becomes as broad as is allowed, and narrows again."""
+        naive, n = self.naive, self.naive.n_neighbors
+        for point in range(naive.n_points):
+            counted = [i for _, i in naive.counted(action, point)]
+            if number not in counted:
+                continue
+            n_left, is_broad = len(counted) - 1, naive.reach[action, point] >= naive.full_reach
+            if n_left > 0 and (2 * n_left >= n or is_broad):
+                continue
+            others = [squared for squared, i in naive.distances(naive.points[point], action) if i != number]
+            within = [squared for squared in others if squared <= naive.full_reach]
+            naive.reach[action, point] = within[n - 1] if len(within) >= n else naive.full_reach
+            n_left = sum(squared <= naive.reach[action, point] for squared in within)
+            naive.limit[action, point] = max(n + n // 2, 2 * n_left if n_left > n + n // 4 else 0)
+            if n_left == 0:
+                naive.known[action, point], naive.total[action, point] = False, 0.0
+        naive.instances[action][number].state = np.full(naive.d, np.inf)
+
+
+@settings(deadline=None, derandomize=True, max_examples=15)
+@given(
+    st.sampled_from(SMALL_GRIDS),
+    st.sampled_from(LINEAR_KERNELS),
+    st.integers(0, 10**6),
+    st.integers(1, 15),
+    st.sampled_from([0.3, 1.0]),
+)
+def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_everywhere(
+    grid, kernel, seed, max_instances, threshold
+):
+    model, naive = linear_model_and_definition(grid, kernel, max_instances=max_instances, threshold=threshold)
+    expected = NaiveReplacement(naive, max_instances)
+    for transition in random_transitions(seed, len(grid[0]), 5 * max_instances + 10):
+        learn_linear(model, expected, [transition])
+        np.testing.assert_array_equal(model.known.reshape(N_ACTIONS, -1), naive.known)
+        np.testing.assert_array_equal(model.mdp.arrays.modelled, model.known)
+        assert model.instances.size.tolist() == [len(some) for some in naive.instances]
+    for action, some in enumerate(naive.instances):
+        for slot, instance in enumerate(some):
+            np.testing.assert_array_equal(model.instances.state[action, slot], instance.state)
+            np.testing.assert_allclose(model.instances.effect[action, slot], instance.effect, atol=1e-12)
+    assert_same_sums(model, naive)
+    finish_episode(model)
+    assert_same_fits(model, naive)
+
+
+@pytest.mark.parametrize("grid", SMALL_GRIDS, ids=str)
+def test_sums_and_rows_stay_right_over_hundreds_of_replacements(grid):
+    model, naive = linear_model_and_definition(grid, LINEAR_KERNELS[1], max_instances=12)
+    learn_linear(model, NaiveReplacement(naive, 12), random_transitions(4, len(grid[0]), 700))
+    assert_same_sums(model, naive)
+    finish_episode(model)
+    assert assert_same_fits(model, naive) > 0
+
+
+@pytest.mark.parametrize("n_states", [1, 3])
+def test_sums_and_rows_stay_right_where_many_instances_have_the_same_state(n_states):
+    rng = np.random.default_rng(n_states)
+    states = rng.random((n_states, 2))
+    model, naive = linear_model_and_definition(((2, 2), 0), LINEAR_KERNELS[1], max_instances=20)
+    expected = NaiveReplacement(naive, 20)
+    for _ in range(400):
+        state = states[rng.integers(n_states)]
+        learn_linear(model, expected, [(state, 0, rng.normal(), state + 0.1 * rng.normal(size=2), rng.random() < 0.2)])
+    assert_same_sums(model, naive)
+    finish_episode(model)
+    assert assert_same_fits(model, naive) > 0
+
+
+def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_again():
+    kernel = dict(breadth=0.1, min_weight=0.05, n_neighbors=2, outcome_breadth=0.05)
+    model = make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
+    point = 4  # at 0.5
+
+    def add(at):
+        model.update_rows(model.add(np.array([at]), 0, -1.0, np.array([at + 0.1]), False))
+
+    for _ in range(4):
+        add(0.5)
+    assert model.known[point] and model.mdp.arrays.modelled[point] and model.fits.reach[point] == 0.0
+    # One after the other is replaced by one farther away.
+    for at in (0.9, 0.1, 0.45, 0.56, 0.3):
+        add(at)
+        assert model.known[point], "an instance within reach is left"
+    add(0.72)
+    np.testing.assert_allclose(np.sort(model.instances.state[0, :4, 0]), [0.1, 0.3, 0.72, 0.9])
+    assert not model.known[point] and not model.mdp.arrays.modelled[point]
+    assert model.own_weight[point] == 0.0 and (model.fits.sums[point] == 0.0).all()
+    add(0.51)
+    assert model.known[point] and model.mdp.arrays.modelled[point], "the narrow kernel of former times is forgotten"
+
+
+def test_a_narrow_kernel_becomes_broad_again_when_its_instances_have_gone():
+    kernel = dict(breadth=0.4, min_weight=0.05, n_neighbors=4, outcome_breadth=0.05)
+    model, naive = linear_model_and_definition(((2,), 0), kernel, max_instances=8, n_actions=1)
+    expected, point = NaiveReplacement(naive, 8), 2  # at 0.5
+
+    def add(at):
+        learn_linear(model, expected, [(np.array([at]), 0, -at, np.array([at + 0.1 * at]), False)])
+
+    for at in np.linspace(0.48, 0.52, 8):
+        add(at)
+    narrow = model.fits.reach[point]
+    assert narrow < 1e-3
+    for at in (0.95, 0.05, 0.72, 0.28, 0.61, 0.39):
+        add(at)
+        assert model.fits.reach[point] == narrow
+    add(0.555)
+    assert model.known[point] and model.fits.reach[point] > 10.0 * narrow
+    assert_same_sums(model, naive)
+    finish_episode(model)
+    assert_same_fits(model, naive)
+
+
+def test_rewards_are_those_of_the_instances_left_however_little_these_weigh():
+    kernel = dict(breadth=0.5, min_weight=0.01, n_neighbors=8, outcome_breadth=0.05)
+    model, naive = linear_model_and_definition(((2,), 0), kernel, max_instances=2, n_actions=1)
+    expected, point = NaiveReplacement(naive, 2), 2  # at 0.5
+    for at, reward in ((0.5, 100.0), (0.0, -3.0), (0.6, 50.0), (0.7, 20.0), (0.85, 10.0), (0.98, -1.0)):
+        learn_linear(model, expected, [(np.array([at]), 0, reward, np.array([at + 0.05]), False)])
+    finish_episode(model)
+    assert_same_fits(model, naive)
+    assert model.fits.row[point, 1] == pytest.approx(-1.0, abs=0.01), "0.98 is a little nearer than 0"
+
+
+@pytest.mark.parametrize("outcome_breadth", [1e-3, 1e-2])
+def test_rewards_far_from_all_instances_are_numbers_however_narrow_their_kernel_is(outcome_breadth):
+    kernel = dict(breadth=0.5, min_weight=0.05, n_neighbors=8, outcome_breadth=outcome_breadth)
+    model = make_linear_model(((3,), 0), kernel, n_actions=1)
+    for reward in (-1.0, -2.0, -3.0):
+        model.update_rows(model.add(np.array([0.0]), 0, reward, np.array([0.05]), False))
+    finish_episode(model)
+    assert model.known[4]
+    np.testing.assert_allclose(model.fits.row[model.known], [[0.05, -2.0, 0.0]] * model.known.sum(), atol=1e-12)
+    assert model.predict_at(np.array([0.5]))[0].reward[0] == pytest.approx(-2.0)
