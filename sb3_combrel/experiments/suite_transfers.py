@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, SourceInstances
 from sb3_combrel.experiments.misleading_sources import MISLEADING
+from sb3_combrel.experiments.mountain_car import factored_mapping
 from sb3_combrel.experiments.suite_tasks import Task
-from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -16,21 +16,12 @@ def _misled(change: Callable[[SourceInstances], SourceInstances]) -> Callable[[S
     return lambda source, task: COMBREL(change(source))
 
 
-def _oracle(n_axes: int) -> FactoredMapping:
-    """Make the mapping between Mountain Cars: one car of the source for each axis, pushed by the actions along it."""
-    copies = []
-    for axis in range(n_axes):
-        state: list[int | None] = [None] * (2 * n_axes)
-        state[axis], state[n_axes + axis] = 0, 1
-        # Actions of the target: Neutral, then to either side along each axis.
-        actions = [0] * (1 + 2 * n_axes)
-        actions[1 + 2 * axis], actions[2 + 2 * axis] = 1, 2
-        copies.append(InterTaskMapping(tuple(state), tuple(actions)))
-    return FactoredMapping(tuple(copies))
-
-
 #: The mapping that a person would choose, by task.
-ORACLES = {"MountainCar4D": _oracle(2), "MountainCar4D-60": _oracle(2), "MountainCar6D": _oracle(3)}
+ORACLES = {
+    "MountainCar4D": factored_mapping(2),
+    "MountainCar4D-60": factored_mapping(2),
+    "MountainCar6D": factored_mapping(3),
+}
 
 #: From the name on the command line to a function of (source instances, name of the task).
 TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
