@@ -44,8 +44,11 @@ def end_episodes(agent, n):
         agent.end_episode(truncated=True)
 
 
-def test_time_limits_lower_the_threshold_of_the_model():
-    agent = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(400).agent
+# What part of the weight at exact states a grid point needs, once rewards have differed (see models.local_linear).
+@pytest.mark.parametrize(("degree", "part"), [(0, 1.0), (1, 0.5)])
+def test_time_limits_lower_the_threshold_of_the_model(degree, part):
+    agent = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, degree=degree, seed=0).learn(400).agent
+    assert len(np.unique(agent.get_state()["instances"][:, -3])) > 1, "rewards have differed"
     known = agent.model.known.copy()
     end_episodes(agent, DECAY_AFTER_EPISODES - agent.n_truncated)
     np.testing.assert_array_equal(agent.model.known, known)
@@ -53,7 +56,7 @@ def test_time_limits_lower_the_threshold_of_the_model():
     end_episodes(agent, 40)
     threshold = agent.statistics()["model/threshold"]
     assert threshold == pytest.approx(0.98**40)
-    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= threshold))
+    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= part * threshold))
     assert agent.model.known.sum() > known.sum()
     np.testing.assert_array_equal(agent.mdp.arrays.modelled, agent.model.known)
     agent.n_truncated = 10**6
@@ -62,8 +65,11 @@ def test_time_limits_lower_the_threshold_of_the_model():
     assert (agent.model.known == (agent.model.own_weight >= min_weight)).all(), "in the end any instance that counts suffices"
 
 
-def test_the_lowered_threshold_is_saved(tmp_path):
-    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(50)
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("n_steps", [50, 400])
+def test_the_lowered_threshold_is_saved(degree, n_steps, tmp_path):
+    """Before and after the ball has been struck for the first time."""
+    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, degree=degree, seed=0).learn(n_steps)
     end_episodes(model.agent, DECAY_AFTER_EPISODES + 3)
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model")

@@ -90,18 +90,20 @@ def test_mountain_car_v0_is_solved_with_default_parameters(seed):
     assert returns_in_evaluation("MountainCar-v0", 3000, seed).mean() >= -110
 
 
+CART_POLE = dict(bounds=CART_POLE_BOUNDS, gamma=0.99, max_value=100)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_cart_pole_is_solved(seed):
+def test_cart_pole_is_solved_by_the_kernel_average(seed):
     """Solved is 475. A pole falls anywhere alike: with wide bounds for the position, its instances count farther along it."""
-    returns = returns_in_evaluation(
-        "CartPole-v1",
-        4000,
-        seed,
-        bounds=CART_POLE_BOUNDS,
-        gamma=0.99,
-        max_value=100,
-        exploration_threshold=0.5,
-        resolution=4,
-    )
-    assert returns.mean() >= 475
+    settings = dict(degree=0, exploration_threshold=0.5, resolution=4)
+    assert returns_in_evaluation("CartPole-v1", 4000, seed, **CART_POLE, **settings).mean() >= 475
+
+
+@pytest.mark.slow
+def test_cart_pole_is_learned_with_default_parameters():
+    """Four of five seeds solve it."""
+    means = np.array([returns_in_evaluation("CartPole-v1", 4000, seed, **CART_POLE).mean() for seed in SEEDS])
+    assert (means >= 400).all()
+    assert (means >= 475).sum() >= 4
