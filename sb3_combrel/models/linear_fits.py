@@ -540,8 +540,9 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
         action = pair // n_points
         unit_coordinates_of(pair - action * n_points, grid, scratch.at)
         total = recount(instances, fits, pair, action, kernel, np.int64(-1), scratch)
-        fits.total[pair] = total
-        if total >= threshold:
+        # What a narrower kernel leaves out has counted.
+        fits.total[pair] = max(fits.total[pair], total)
+        if fits.total[pair] >= threshold:
             fits.known[pair] = True
         fits.unexplained[pair] = np.inf
         if fits.n_counted[pair] > 0 and (fits.known[pair] or fits.claimed[pair]):
