@@ -134,7 +134,7 @@ def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, flo
         "from sb3_combrel.experiments import bench\n"
         f"case = bench.CASES[{number}]\n"
         "bench.learn(bench.CASES[0], 1, seed=1)\n"
-        "if case.transfers: bench.learn(case, 1, seed=1)\n"
+        "bench.learn(case, 1, seed=1)\n"
         "before = bench.resident_memory()\n"
         f"steps, seconds = bench.learn(case, max(1, round({fraction} * case.n_episodes)), {seed})\n"
         "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"
