@@ -1,4 +1,4 @@
-"""Every test that takes ``make`` runs without transfer, with TIMBREL and with COMBREL; some of it with the kernel average too."""
+"""Tests that take ``make`` run without transfer, with TIMBREL and COMBREL; some of it with the kernel average too."""
 
 import pytest
 from helpers.walk import METHODS, small
