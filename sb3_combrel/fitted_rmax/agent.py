@@ -251,7 +251,11 @@ class FittedRMaxAgent:
             self._plan(AT_EPISODE_END * self.max_backups)
 
     def complete(self) -> None:
-        """Bring the model up to date with all transitions, as at an episode's end: what is then saved is what is predicted with."""
+        """
+        Bring the model up to date with all transitions, as at an episode's end.
+
+        What is then saved is what is predicted with.
+        """
         with self._lock:
             pairs = self.model.end_episode()
             if len(pairs):

@@ -44,7 +44,9 @@ def steps(method):
     taken = []
     for seed in SEEDS:
         env = make_vec_env("combrel/MountainCar4D-v0", seed=seed, env_kwargs=dict(max_episode_steps=2000))
-        model = FittedRMax(env, transfer=transfer(seed), degree=0, model_breadth=0.1, resolution=3, min_fraction=0.1, seed=seed)
+        model = FittedRMax(
+            env, transfer=transfer(seed), degree=0, model_breadth=0.1, resolution=3, min_fraction=0.1, seed=seed
+        )
         model.learn(10**6, callback=StopTrainingOnMaxEpisodes(N_EPISODES))
         taken.append(model.num_timesteps)
     return np.array(taken)
