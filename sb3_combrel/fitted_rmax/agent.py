@@ -85,7 +85,6 @@ class FittedRMaxAgent:
         self._lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
         if transfer is not None:
-            transfer.check_degree(1 if self.model_class.takes_prior else 0)
             self.target = self._target_task(transfer)
         self._build()
         if transfer is not None:
@@ -102,7 +101,6 @@ class FittedRMaxAgent:
             state_names=tuple(self.task.state_names),
             action_names=tuple(self.task.action_names),
             periodic=self.periodic,
-            takes_prior=self.model_class.takes_prior,
         )
         transfer.bind(target, self.rng)
         return target
@@ -253,7 +251,11 @@ class FittedRMaxAgent:
             self._plan(AT_EPISODE_END * self.max_backups)
 
     def complete(self) -> None:
-        """Bring the model up to date with all transitions: what is saved is then what is predicted with."""
+        """
+        Bring the model up to date with all transitions, as at an episode's end.
+
+        What is then saved is what is predicted with.
+        """
         with self._lock:
             pairs = self.model.end_episode()
             if len(pairs):

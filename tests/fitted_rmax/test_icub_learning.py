@@ -17,24 +17,34 @@ def lengths(env_id, n_episodes, seed, **kwargs):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("settings", [dict(degree=0, model_breadth=0.1), dict(model_breadth=0.1), {}], ids=str)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_torso_is_learned_within_thirty_episodes(seed):
+def test_the_torso_is_learned_within_thirty_episodes(seed, settings):
     """The shortest plan has 25 commands."""
-    assert np.median(lengths(TORSO, 30, seed, model_breadth=0.1)[-5:]) <= 27
+    assert np.median(lengths(TORSO, 30, seed, **settings)[-5:]) <= 27
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_arm_is_learned_within_sixty_episodes(seed):
+def test_the_arm_is_learned_within_sixty_episodes_by_the_kernel_average(seed):
     """The shortest plans have 27 to 29 commands."""
-    assert np.median(lengths(ARM, 60, seed, model_breadth=0.2)[-5:]) <= 32
+    assert np.median(lengths(ARM, 60, seed, degree=0, model_breadth=0.2)[-5:]) <= 29
 
 
 @pytest.mark.slow
-def test_exploration_ends_though_the_kernel_is_narrow():
+@pytest.mark.parametrize(("settings", "most"), [(dict(model_breadth=0.2), 35), ({}, 45)], ids=str)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_arm_is_learned_within_sixty_episodes(seed, settings, most):
+    """In fewer steps than by the kernel average; but with some seeds the local linear model settles for longer plans."""
+    assert np.median(lengths(ARM, 60, seed, **settings)[-5:]) <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [0, 1])
+def test_exploration_ends_though_the_kernel_is_narrow(degree):
     """What is within reach cannot all become known with the full threshold: 300 episodes of 400 steps were not enough."""
     with pytest.warns(UserWarning, match="coarse"):
-        steps = lengths(ARM, 150, 1, model_breadth=0.05)
+        steps = lengths(ARM, 150, 1, model_breadth=0.05, degree=degree)
     assert np.median(steps[-10:]) <= 45
 
 

@@ -60,6 +60,22 @@ def test_the_goal_of_mountain_car_4d_is_found_in_the_first_episode():
     assert mountain_car_4d(0, 1)[0] < 1100
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_mountain_car_2d_is_learned_within_ten_episodes_with_default_parameters(seed):
+    """The shortest plan has 103 steps."""
+    lengths = lengths_of_episodes("combrel/MountainCar2D-v0", 20, seed, dict(start="fixed"))
+    assert lengths[:10].mean() <= 135
+    assert lengths[10:].mean() <= 106
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_mountain_car_4d_is_learned_within_twelve_episodes_with_default_parameters(seed):
+    """The shortest plans have some 180 steps."""
+    lengths = lengths_of_episodes("combrel/MountainCar4D-v0", 12, seed)
+    assert lengths[0] <= 700
+    assert lengths.sum() <= 3300
+
+
 @pytest.mark.slow
 def test_mountain_car_2d_is_learned_as_fast_as_by_the_original():
     """Its authors' program: 163 to 166 steps over the first ten episodes, 115 to 120 from then on."""

@@ -1,4 +1,4 @@
-"""Tests that take ``make`` run without transfer, with TIMBREL and COMBREL; some of it with the kernel average too."""
+"""Every test that takes ``make`` runs without transfer, with TIMBREL and with COMBREL, and twice with the kernel average."""
 
 import pytest
 from helpers.walk import METHODS, small

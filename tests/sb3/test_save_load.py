@@ -167,13 +167,27 @@ def test_random_numbers_go_on_where_they_were_unless_a_seed_is_given(make, tmp_p
 
 
 def test_pairs_that_are_known_by_history_alone_are_saved(tmp_path):
-    model = small(min_fraction=0.6, model_breadth=0.5, resolution=1)
+    """A nearer instance shortens the list of a kernel average."""
+    model = small(degree=0, min_fraction=0.6, model_breadth=0.5, resolution=1)
     for state, next_state in [(0.1, 0.2), (0.1, 0.2), (0.45, 0.95)]:
         model.agent.update(np.array([state, 0.5]), 0, -1.0, np.array([next_state, 0.5]), False)
     agent_model = model.agent.model
     assert (agent_model.known & (agent_model.own_weight < 1.0)).any(), "the case that this test is about"
     model.save(tmp_path / "model")
     np.testing.assert_array_equal(FittedRMax.load(tmp_path / "model").agent.model.known, agent_model.known)
+
+
+def test_grid_points_that_are_known_from_visits_alone_are_saved_and_so_are_the_visits(tmp_path):
+    model = small().learn(60)
+    agent_model, visits = model.agent.model, model.agent.visits.counts
+    some = np.flatnonzero(~agent_model.known & (agent_model.own_weight > 0.0))[:3]
+    np.testing.assert_array_equal(agent_model.accept(some), some)
+    assert (agent_model.own_weight[some] < agent_model.exploration_threshold).all(), "the case that this test is about"
+    visits[:] = np.arange(len(visits))
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model").agent
+    np.testing.assert_array_equal(loaded.model.known, agent_model.known)
+    np.testing.assert_array_equal(loaded.visits.counts, visits)
 
 
 def test_a_full_model_with_a_cap_on_instances_survives_saving(make, tmp_path):

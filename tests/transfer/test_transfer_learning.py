@@ -4,8 +4,8 @@ Random mappings save two thirds of the steps as well: whatever makes unknown pai
 them. What selection is worth is what it saves beyond that, so random mappings are the control, drawn state by state from the
 same set and with the same settings.
 
-All with the kernel average, as in the paper. The local linear model takes hardly more steps without transfer than the kernel
-average with it.
+All with the kernel average, as in the paper. The local linear model needs so few steps without transfer that such rates say
+nothing of it.
 """
 
 from functools import cache
