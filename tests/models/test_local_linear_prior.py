@@ -116,7 +116,9 @@ def test_what_an_exact_prior_claims_is_modelled_exactly_from_the_start_and_nothi
             np.testing.assert_allclose(
                 model.fits.row[action * len(points) : (action + 1) * len(points), :2], expected, atol=1e-12
             )
-            np.testing.assert_allclose(model.predict_at(state)[0].effect[action, 0], dynamics.effect(state, action), atol=1e-12)
+            np.testing.assert_allclose(
+                model.predict_at(state)[0].effect[action, 0], dynamics.effect(state, action), atol=1e-12
+            )
             assert model.predict_at(state)[0].modelled[action]
     for action, size in enumerate(model.instances.size):
         np.testing.assert_allclose(model.fits.target[action, :size], 0.0, atol=1e-15)
