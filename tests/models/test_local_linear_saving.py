@@ -1,4 +1,4 @@
-"""What the local linear model saves and restores: at an episode's end the same to the last bit, and so is what it learns on."""
+"""What the local linear model saves and restores: at an episode's end the same to the last bit, as is what it learns on."""
 
 import numpy as np
 import pytest
