@@ -85,6 +85,7 @@ class FittedRMaxAgent:
         self._lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
         if transfer is not None:
+            transfer.check_degree(1 if self.model_class.takes_prior else 0)
             self.target = self._target_task(transfer)
         self._build()
         if transfer is not None:
@@ -101,6 +102,7 @@ class FittedRMaxAgent:
             state_names=tuple(self.task.state_names),
             action_names=tuple(self.task.action_names),
             periodic=self.periodic,
+            takes_prior=self.model_class.takes_prior,
         )
         transfer.bind(target, self.rng)
         return target

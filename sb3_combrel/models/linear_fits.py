@@ -61,8 +61,8 @@ class LinearFits(NamedTuple):
     :param target: float64, shape (n_actions, capacity, n_variables): effect of each instance less the prior's
     :param prior: float64, shape (n_pairs, n_variables + 2): effect, reward and probability of termination that the prior
         predicts; 0 without one
-    :param effect_range: float64, shape (3, n_actions, n_variables): least and largest effect that was seen or is predicted
-        by the prior; and the sum of the sizes of those that were seen
+    :param effect_range: float64, shape (3, n_actions, n_variables): least and largest effect of the instances and of the
+        prior on the grid; and the sum of the sizes of those of the instances
     :param effect_scale: float64, shape (n_actions, n_variables): what a difference of effects is measured by
     """
 

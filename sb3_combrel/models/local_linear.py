@@ -189,6 +189,7 @@ class LocalLinear(Model):
         if self.settings.max_instances is not None and size >= self.settings.max_instances:
             apart = differences(instances.state[action, :size], state, instances.periodic)
             slot = int((apart**2).sum(axis=1).argmin())
+            self._forget_range_of(action, slot)
             n = _leave.call(instances, self.fits, self.grid.arrays, self._kernel, action, slot, self._scratch)
             return slot, self._scratch.point[:n] + action * self.grid.n_points
         if size == instances.capacity:
@@ -221,7 +222,6 @@ class LocalLinear(Model):
     def _renew_targets(self) -> None:
         """Compute what the prior leaves over of each instance's effect, and the range of effects."""
         fits, instances, d = self.fits, self.instances, self.grid.n_variables
-        fits.effect_range[0], fits.effect_range[1], fits.effect_range[2] = np.inf, -np.inf, 0.0
         for action, size in enumerate(instances.size.tolist()):
             effects = instances.effect[action, :size]
             fits.target[action, :size] = effects
@@ -231,10 +231,22 @@ class LocalLinear(Model):
             fits.effect_scale[action] = np.maximum(2.0 * mean_size, LEAST_SCALE / self.grid.arrays.cells)
             if self._prior is not None and size:
                 fits.target[action, :size] -= self._prior_at(instances.state[action, :size], np.full(size, action))[0][:, :d]
-            of_grid = fits.prior[action * self.grid.n_points : (action + 1) * self.grid.n_points, :d]
-            effects = effects if self._prior is None else np.vstack([effects, of_grid])
-            if len(effects):
-                fits.effect_range[0, action], fits.effect_range[1, action] = effects.min(axis=0), effects.max(axis=0)
+            self._renew_range(action, effects)
+
+    def _renew_range(self, action: int, effects: np.ndarray) -> None:
+        """Compute the range of an action's effects from those of its instances, and of the prior."""
+        if self._prior is not None:
+            of_action = slice(action * self.grid.n_points, (action + 1) * self.grid.n_points)
+            effects = np.vstack([effects, self.fits.prior[of_action, : self.grid.n_variables]])
+        self.fits.effect_range[0, action] = effects.min(axis=0, initial=np.inf)
+        self.fits.effect_range[1, action] = effects.max(axis=0, initial=-np.inf)
+
+    def _forget_range_of(self, action: int, slot: int) -> None:
+        """Take an instance out of the range of effects: only what is there is there after loading, too."""
+        effects = self._instances.effect[action, : self._instances.size[action]]
+        low, high = self.fits.effect_range[:2, action]
+        if ((effects[slot] <= low) | (effects[slot] >= high)).any():
+            self._renew_range(action, np.delete(effects, slot, axis=0))
 
     def _threshold_on_grid(self) -> float:
         return (ON_GRID if self._informed else 1.0) * self.exploration_threshold

@@ -1,7 +1,7 @@
 """The local linear model again, written from its definition in plain loops and NumPy: slow, and independent of the package.
 
-Nothing is incremental but what the definition itself says has a history: how far the instances of a pair may be, which only
-narrows; what is known, which stays known; and the range of the effects that were seen.
+Nothing is incremental but what the definition itself says has a history: how far the instances of a pair may be, and what is
+known, which stays known.
 """
 
 import math
@@ -68,7 +68,6 @@ class NaiveLocalLinear:
         self.threshold = threshold
         self.prior = prior
         self.instances = [[] for _ in range(n_actions)]
-        self.seen_effects = [[] for _ in range(n_actions)]
         shape = n_actions, self.n_points
         self.reach = np.full(shape, self.full_reach)
         self.limit = np.full(shape, self.n_neighbors + self.n_neighbors // 2)
@@ -84,8 +83,8 @@ class NaiveLocalLinear:
         return instance.effect - self.prior_at(instance.state, instance.action)[0]
 
     def effect_range(self, action):
-        """Least and largest effects: those that were seen, and those that the prior predicts on the grid."""
-        effects = list(self.seen_effects[action])
+        """Least and largest effects: those of the instances, and those that the prior predicts on the grid."""
+        effects = [instance.effect for instance in self.instances[action]]
         if self.prior is not None:
             effects += [self.prior_at(point, action)[0] for point in self.points]
         return (np.min(effects, axis=0), np.max(effects, axis=0)) if effects else None
@@ -186,7 +185,6 @@ class NaiveLocalLinear:
     def put(self, number, instance):
         action = instance.action
         self.instances[action][number : number + 1] = [instance]
-        self.seen_effects[action].append(instance.effect)
         for point, at in enumerate(self.points):
             squared = squared_distance(at, instance.state, self.grid.periodic)
             if squared > self.reach[action, point]:

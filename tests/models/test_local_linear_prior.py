@@ -1,4 +1,4 @@
-"""The local linear model with a prior: what it claims is modelled at once, own instances are fitted to what is left over."""
+"""The local linear model with a prior: claims are modelled at once, and own instances are fitted to what is left over."""
 
 import numpy as np
 import pytest

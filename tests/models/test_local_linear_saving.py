@@ -1,4 +1,4 @@
-"""The local linear model saved and restored: at an episode's end the same to the last bit, and so is what it learns on."""
+"""What the local linear model saves and restores: at an episode's end the same to the last bit, as is what it learns on."""
 
 import numpy as np
 import pytest
@@ -81,10 +81,12 @@ def test_what_is_restored_with_a_prior_is_and_learns_the_same_to_the_last_bit(gr
     assert_restored(model, restored, transitions[60:])
 
 
-def test_what_is_restored_is_right_after_instances_were_replaced():
-    grid, kernel = ((2, 2), 0), LINEAR_KERNELS[1]
+@pytest.mark.parametrize("grid", [((2, 2), 0), ((2, 2), 1, (True, False))], ids=str)
+def test_what_is_restored_is_right_after_instances_were_replaced(grid):
+    kernel = LINEAR_KERNELS[1]
     model = make_linear_model(grid, kernel, max_instances=15)
     learn(model, random_transitions(9, 2, 200))
+    finish_episode(model)
     restored, naive = linear_model_and_definition(grid, kernel, max_instances=15)
     restored.set_state(model.get_state())
     for row in restored.instances.rows():
@@ -93,6 +95,12 @@ def test_what_is_restored_is_right_after_instances_were_replaced():
         getattr(naive, name)[:] = getattr(model.fits, name).reshape(naive.known.shape)
     assert_same_sums(restored, naive)
     assert assert_same_fits(restored, naive) > 0
+    # Sums from which others were subtracted are the same but for rounding.
+    np.testing.assert_array_equal(model.fits.effect_range[:2], restored.fits.effect_range[:2])
+    np.testing.assert_allclose(model.fits.row[model.known], restored.fits.row[model.known], rtol=1e-9, atol=1e-9)
+    state = np.array([0.3, 0.6])
+    for array, same in zip(model.predict_at(state)[0], restored.predict_at(state)[0], strict=True):
+        np.testing.assert_array_equal(array, same)
 
 
 def as_instance(row):
