@@ -159,7 +159,7 @@ class FittedRMaxAgent:
         if given is not None:
             assert self.transfer is not None
             self.transfer.note_use(given)
-        else:
+        elif self.model.accepts_visited:
             self._note_visit(state, prediction)
         visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)

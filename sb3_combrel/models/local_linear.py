@@ -67,6 +67,7 @@ class LocalLinear(Model):
     """
 
     takes_prior = True
+    accepts_visited = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
