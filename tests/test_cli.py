@@ -20,7 +20,7 @@ from sb3_combrel.experiments import demo
 from sb3_combrel.experiments.demo import OUTPUTS
 
 TINY = ("--seeds", "2", "--episodes", "2", "--max-episode-steps", "60")
-METHODS = ("no_transfer", "timbrel", "combrel")
+METHODS = ("no_transfer", "random_mapping", "timbrel", "combrel")
 
 
 def call(*args):
@@ -82,7 +82,7 @@ class TestDemo:
         assert [(row["method"], row["seed"], row["episode"]) for row in rows] == [
             (method, str(seed), str(episode))
             for seed in range(2)
-            for method in ("no transfer", "TIMBREL", "COMBREL")
+            for method in ("no transfer", "random mapping", "TIMBREL", "COMBREL")
             for episode in (1, 2)
         ]
         assert {(row["steps"], row["reached_goal"]) for row in rows} == {("60", "0")}
@@ -90,7 +90,7 @@ class TestDemo:
     def test_the_tables_are_shown_and_kept(self, first_call):
         folder, _, written = first_call
         tables = (folder / "tables.md").read_text()
-        for text in ("Steps to goal", "steps saved", "no transfer", "East<-Right", "x<-x, vx<-v"):
+        for text in ("Steps to goal", "steps saved", "no transfer", "East<-Right + Neutral", "(x, vx) + (y, vy)"):
             assert text in tables
             assert text in written
 
@@ -117,7 +117,7 @@ class TestDemo:
         before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")}
         status, written = run_tiny_demo(folder)
         assert status == 0
-        assert "6 of 6 runs were complete already" in written
+        assert "8 of 8 runs were complete already" in written
         assert {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")} == before
 
     def test_an_unfinished_run_is_done_again_with_the_same_result(self, folder, no_film):
@@ -128,15 +128,15 @@ class TestDemo:
         episodes.write_text("\n".join(episodes.read_text().splitlines()[:2]) + "\n2,3")
         status, written = run_tiny_demo(folder)
         assert status == 0
-        assert "5 of 6 runs were complete already" in written
+        assert "7 of 8 runs were complete already" in written
         assert (without_times(episodes), mappings.read_text()) == before
         assert len(list(folder.glob("tensorboard/combrel_seed1_*"))) == 1
 
     def test_more_runs_are_added_to_those_that_are_there(self, folder, no_film):
         status, written = run_tiny_demo(folder, "--seeds", "3")
         assert status == 0
-        assert "6 of 9 runs were complete already" in written
-        assert len(rows_of(folder / "results.csv")) == 18
+        assert "8 of 12 runs were complete already" in written
+        assert len(rows_of(folder / "results.csv")) == 24
 
     def test_results_of_other_settings_are_not_mixed_with_new_ones(self, folder):
         status, written = run_tiny_demo(folder, "--max-episode-steps", "50")
@@ -201,7 +201,7 @@ class TestDemo:
         assert 0 < len(finished) < 6
         status, written = run_tiny_demo(folder, "--episodes", "20")
         assert status == 0
-        assert "of 6 runs were complete already" in written
+        assert "of 8 runs were complete already" in written
         assert finished.items() <= {path: path.stat().st_mtime_ns for path in folder.glob("runs/*.zip")}.items()
 
 

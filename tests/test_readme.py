@@ -21,7 +21,7 @@ def test_the_examples_run(tmp_path, monkeypatch, capsys):
         exec(compile(short, "README.md", "exec"), names)
     assert (tmp_path / "source.npz").exists()
     assert (tmp_path / "car.zip").exists()
-    assert "<-" in capsys.readouterr().out, "the mappings used are not shown by name"
+    assert "East: Right on (x, vx)" in capsys.readouterr().out, "the mapping found is not shown by name"
 
 
 @pytest.mark.parametrize("file", re.findall(r"\]\((?!http)([^)]+)\)", README))
