@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,22 @@ from sb3_combrel.transfer.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior
+
+#: Arguments of COMBREL that have a meaning for transferred instances only.
+_OF_INSTANCES = (
+    "n_neighbors",
+    "neighbors",
+    "choice",
+    "neighbor_radius",
+    "measured",
+    "min_compliance",
+    "min_evidence",
+    "breadth",
+    "breadth_decay",
+    "relevance",
+    "relevance_fraction",
+    "bandwidths",
+)
 
 
 class COMBREL(MappingTransfer):
@@ -45,7 +62,7 @@ class COMBREL(MappingTransfer):
     ``FittedRMax(degree=1)``.
 
     :param source: source instances, a path to them, or a list of several, among which is selected as well
-    :param mappings: None: "factored" with ``use="prior"``, "injective" without it; or a set. "injective" (each source
+    :param mappings: None: "factored" with ``use="prior"``, "injective" with "instances"; or a set. "injective" (each source
         variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
         "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
         "factored" and "signed_factored" (with ``use="prior"`` only): the target's variables are divided among copies of the
@@ -88,9 +105,10 @@ class COMBREL(MappingTransfer):
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
         from the data, that of starts in proportion to how many variables a mapping compares. The paper names none.
-    :param use: None: "prior" where the target's model takes one (``FittedRMax(degree=1)``) unless ``mappings`` are given that
-        are not factored; "instances": translated instances fill what the target's own lack; or "prior", see above. Then of
-        the arguments after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and ``source_breadth`` have a meaning
+    :param use: "instances": translated instances fill what the target's own lack; "prior": see above. Then of the arguments
+        after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and ``source_breadth`` have a meaning. None:
+        "prior" with factored ``mappings``; "instances" with others, and where an argument that has a meaning for instances
+        only differs from its default; else "prior" where the target's model takes one (``FittedRMax(degree=1)``)
     :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
@@ -118,6 +136,7 @@ class COMBREL(MappingTransfer):
         use: str | None = None,
         source_breadth: float = DEFAULT_SOURCE_BREADTH,
     ):
+        of_instances = {name: value for name, value in locals().items() if name in _OF_INSTANCES}
         check_count("n_neighbors", n_neighbors)
         check_count("max_transitions", max_transitions)
         check_finite("min_compliance", min_compliance)
@@ -134,8 +153,8 @@ class COMBREL(MappingTransfer):
             raise ValueError(f'choice must be "best" or "drawn", got {choice!r}')
         if measured not in ("online", "first_episode"):
             raise ValueError(f'measured must be "online" or "first_episode", got {measured!r}')
-        # With neither given both depend on the target's model, and are decided when it is known.
-        self._decides = mappings is None and use is None
+        # With nothing given that says which, both depend on the target's model, and are decided when it is known.
+        self._decides = mappings is None and use is None and not _differ_from_defaults(of_instances)
         if use is None:
             use = "prior" if mappings is not None and is_factored(mappings) else "instances"
         if mappings is None:
@@ -231,3 +250,9 @@ class COMBREL(MappingTransfer):
             assert self.task is not None
             return self._prior.mean_compliance()[pairs // len(self.task.sample_states)]
         return self._compliance_selector.mean_compliance(pairs)
+
+
+def _differ_from_defaults(arguments: dict[str, Any]) -> bool:
+    """Return whether any of these arguments of COMBREL differs from its default."""
+    parameters = inspect.signature(COMBREL.__init__).parameters
+    return any(np.any(value != parameters[name].default) for name, value in arguments.items())

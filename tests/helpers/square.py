@@ -64,7 +64,7 @@ METHODS = {
     "TIMBREL": lambda: TIMBREL(square_source(), SAME),
     "TIMBREL random": lambda: TIMBREL(square_source(), "random"),
     "TIMBREL pool": lambda: TIMBREL(square_source(), "pool"),
-    "COMBREL": lambda: COMBREL(square_source()),
+    "COMBREL": lambda: COMBREL(square_source(), use="instances"),
     "COMBREL drawn": lambda: COMBREL(square_source(), choice="drawn"),
     "COMBREL by relevance": lambda: COMBREL(square_source(), relevance=True),
 }

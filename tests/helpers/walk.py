@@ -60,7 +60,7 @@ def walk_source(n=60):
 METHODS = {
     "none": lambda: None,
     "TIMBREL": lambda: TIMBREL(walk_source(), InterTaskMapping([0, 1], [0, 1])),
-    "COMBREL": lambda: COMBREL(walk_source()),
+    "COMBREL": lambda: COMBREL(walk_source(), use="instances"),
 }
 
 

@@ -14,7 +14,7 @@ VARIANTS = {
     **METHODS,
     "one mapping an action": lambda: TIMBREL(walk_source(), [MAPPING, InterTaskMapping([0, None], [1, 0])]),
     "pool": lambda: TIMBREL(walk_source(), "pool", mappings="all"),
-    "two sources": lambda: COMBREL([walk_source(40), walk_source(60)]),
+    "two sources": lambda: COMBREL([walk_source(40), walk_source(60)], use="instances"),
     "first episode": lambda: COMBREL(walk_source(), measured="first_episode"),
     "drawn": lambda: COMBREL(walk_source(), choice="drawn"),
     "set": lambda: COMBREL(walk_source(), MappingSet.injective(2, 2, 2, 2), n_neighbors=2),

@@ -15,5 +15,5 @@ def transfers():
         "TIMBREL": TIMBREL(source, InterTaskMapping((0, 1), (0, 1))),
         "random": TIMBREL(source, "random"),
         "pool": TIMBREL(source, "pool"),
-        "COMBREL": COMBREL(source),
+        "COMBREL": COMBREL(source, use="instances"),
     }

@@ -22,7 +22,7 @@ def bind(transfer, d=4, n_actions=5):
     [
         (lambda: COMBREL(SOURCE, use="model"), r'use must be "instances" or "prior", got \'model\''),
         (lambda: TIMBREL(SOURCE, use=None), "use must be"),
-        (lambda: COMBREL(SOURCE, "factored"), 'factored mappings need use="prior", got use="instances"'),
+        (lambda: COMBREL(SOURCE, "factored", use="instances"), 'factored mappings need use="prior", got use="instances"'),
         (lambda: TIMBREL(SOURCE, TWO), 'factored mappings need use="prior"'),
         (lambda: TIMBREL(SOURCE, {"copies": []}), 'factored mappings need use="prior"'),
         (lambda: TIMBREL(SOURCE, "random", mappings="signed_factored"), 'factored mappings need use="prior"'),

@@ -1,0 +1,110 @@
+"""Whether COMBREL transfers instances or a prior where the arguments do not say: the target's model decides."""
+
+import numpy as np
+import pytest
+from helpers.walk import Walk, same_parameters, small, walk_source
+
+from sb3_combrel import COMBREL, FactoredMapping, FittedRMax
+
+DECIDED = {0: ("instances", "injective"), 1: ("prior", "factored")}
+
+
+def decision(transfer):
+    return transfer.use, transfer.mappings
+
+
+@pytest.mark.parametrize("degree", DECIDED)
+def test_the_targets_model_decides(degree):
+    given = COMBREL(walk_source())
+    model = small(degree=degree, transfer=given)
+    assert decision(model.policy.transfer) == DECIDED[degree]
+    # What was given is a description, which serves models of the other degree as well.
+    assert (given.arguments()["use"], given.arguments()["mappings"]) == (None, None)
+    assert decision(small(degree=1 - degree, transfer=given).policy.transfer) == DECIDED[1 - degree]
+
+
+def test_without_a_degree_it_is_the_prior():
+    assert decision(small(transfer=COMBREL(walk_source())).policy.transfer) == DECIDED[1]
+
+
+@pytest.mark.parametrize("degree", DECIDED)
+@pytest.mark.parametrize("steps", [0, 60])
+def test_the_decision_is_saved(degree, steps, tmp_path):
+    model = small(degree=degree, transfer=COMBREL(walk_source()))
+    if steps:
+        model.learn(steps)
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert decision(loaded.policy.transfer) == DECIDED[degree]
+    arguments = loaded.policy.transfer.arguments()
+    assert (arguments["use"], arguments["mappings"]) == DECIDED[degree]
+    assert same_parameters(loaded, model)
+
+
+OF_INSTANCES = [
+    {"n_neighbors": 4},
+    {"neighbors": "state_action"},
+    {"choice": "drawn"},
+    {"neighbor_radius": 0.3},
+    {"measured": "first_episode"},
+    {"min_compliance": 0.5},
+    {"min_evidence": 0.0},
+    {"breadth": 0.2},
+    {"breadth_decay": 1.0},
+    {"relevance": True},
+    {"relevance_fraction": 0.3},
+    {"bandwidths": (0.1, 0.1, 1.0)},
+    {"bandwidths": np.array([0.1, 0.1, 1.0])},
+]
+
+
+@pytest.mark.parametrize("arguments", OF_INSTANCES, ids=str)
+def test_arguments_of_instances_mean_instances(arguments):
+    transfer = COMBREL(walk_source(), **arguments)
+    assert decision(transfer) == DECIDED[0] == (transfer.arguments()["use"], transfer.arguments()["mappings"])
+    assert decision(small(transfer=transfer).policy.transfer) == DECIDED[0]
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"max_transitions": 50}, {"transfer_terminals": False}, {"source_breadth": 0.2}, {"n_neighbors": 3}], ids=str
+)
+def test_arguments_of_both_and_defaults_leave_it_open(arguments):
+    for degree, decided in DECIDED.items():
+        assert decision(small(degree=degree, transfer=COMBREL(walk_source(), **arguments)).policy.transfer) == decided
+
+
+@pytest.mark.parametrize(
+    ("mappings", "use"),
+    [
+        ("injective", "instances"),
+        ("signed_all", "instances"),
+        ({"state": [0, 1], "action": [0, 1]}, "instances"),
+        ("factored", "prior"),
+        ("signed_factored", "prior"),
+        (FactoredMapping([{"state": [0, 1], "action": [0, 1]}]), "prior"),
+    ],
+    ids=str,
+)
+def test_mappings_say_what_is_transferred(mappings, use):
+    assert decision(COMBREL(walk_source(), mappings)) == (use, mappings)
+
+
+@pytest.mark.parametrize(("use", "mappings"), DECIDED.values())
+def test_each_use_has_a_set_of_its_own(use, mappings):
+    assert decision(COMBREL(walk_source(), use=use)) == (use, mappings)
+
+
+def test_a_prior_is_refused_where_the_targets_model_takes_none():
+    with pytest.raises(ValueError, match=r'COMBREL\(use="prior"\) needs .*FittedRMax\(degree=1\), got degree=0'):
+        FittedRMax(Walk(), degree=0, transfer=COMBREL(walk_source(), use="prior"))
+
+
+def test_the_papers_settings():
+    transfer = COMBREL.paper(walk_source())
+    assert decision(transfer) == DECIDED[0]
+    assert (transfer.measured, transfer.n_neighbors, transfer.breadth_decay) == ("first_episode", 3, 1.0)
+    assert (transfer.min_compliance, transfer.min_evidence) == (0.0, 0.0)
+    other = COMBREL.paper(walk_source(), "all", n_neighbors=5)
+    assert (other.use, other.mappings, other.n_neighbors, other.measured) == ("instances", "all", 5, "first_episode")
+    for degree in DECIDED:
+        assert small(degree=degree, transfer=transfer).policy.transfer.use == "instances"
