@@ -5,6 +5,7 @@
 # make icub    the arm of the iCub with and without transfer from its torso; tables and figure in icub_experiment/
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
+# make suite   the learner on all tasks, as in docs/results/learner.md (hours); SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
 # Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
@@ -16,6 +17,7 @@ BIN := $(VENV)/bin
 PYTEST_WORKERS ?= 2
 DEMO_ARGS ?=
 ICUB_ARGS ?=
+SUITE_ARGS ?=
 LINTED := sb3_combrel envs tests
 CONSTRAINTS ?= constraints.txt
 # The oldest Numba allowed has no wheel for Python 3.13.
@@ -28,7 +30,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard icub icub-figures icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard suite icub icub-figures icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -61,6 +63,10 @@ icub-breadths: $(VENV)/.installed-demo
 	mkdir -p docs/results
 	cp breadths_experiment/summary.csv docs/results/icub_breadths.csv
 	cp breadths_experiment/tables.md docs/results/icub_breadths.md
+
+# A later call goes on with what is there.
+suite: $(VENV)/.installed-demo
+	$(BIN)/python -m sb3_combrel.experiments.suite --output suite_output $(SUITE_ARGS)
 
 # ICUB_ARGS="--task arm --look primitives", for instance.
 icub-video: $(VENV)/.installed-all gl

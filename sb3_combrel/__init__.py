@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sb3_combrel._moved import keep_old_names
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
-from sb3_combrel.mappings import InterTaskMapping, MappingSet
+from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
 from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
@@ -16,4 +16,4 @@ keep_old_names()
 register_fitted_rmax(FittedRMax)
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["COMBREL", "TIMBREL", "FittedRMax", "InterTaskMapping", "MappingSet", "SourceInstances"]
+__all__ = ["COMBREL", "TIMBREL", "FactoredMapping", "FittedRMax", "InterTaskMapping", "MappingSet", "SourceInstances"]

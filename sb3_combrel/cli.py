@@ -15,7 +15,7 @@ def demo(
     seeds: int = 10,
     episodes: int = 12,
     max_episode_steps: int = 2000,
-    model_breadth: float = 0.1,
+    model_breadth: float | None = None,
     workers: int | None = None,
     fresh: bool = False,
 ) -> None:
@@ -28,7 +28,7 @@ def demo(
     :param seeds: runs of each method
     :param episodes: episodes of each run
     :param max_episode_steps: steps after which an episode is cut off
-    :param model_breadth: breadth of the learner's kernel; with 0.4 there is little for transfer to gain
+    :param model_breadth: breadth of the learner's kernel; by default the learner's own
     :param workers: processes at a time; one a core by default
     :param fresh: delete earlier results in the folder first
     """

@@ -33,7 +33,7 @@ N_INSTANCES = 1000
 MAX_EPISODE_STEPS = 400
 
 #: A hit by the first command returns 99. The paper's breadth (Table 3) is 0.1; with 0.2 the arm is learnt in fewer steps.
-LEARNER: dict[str, Any] = {"model_breadth": 0.2, "max_value": 100.0}
+LEARNER: dict[str, Any] = {"degree": 0, "model_breadth": 0.2, "max_value": 100.0}
 #: How COMBREL is set here; see the class for what each argument is.
 TRANSFER: dict[str, Any] = {"neighbor_radius": 0.6, "breadth": 0.4, "breadth_decay": 1.0, "max_transitions": 20_000}
 #: Of all signed injective mappings many have about the same compliance. If only the best is used, its errors determine all

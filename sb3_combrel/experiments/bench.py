@@ -32,7 +32,7 @@ class Case(NamedTuple):
     transfers: bool = False
 
 
-_BROAD: dict[str, Any] = dict(model_breadth=0.4, resolution=3, min_fraction=0.1)
+_BROAD: dict[str, Any] = dict(degree=0, model_breadth=0.4, resolution=3, min_fraction=0.1)
 _NARROW: dict[str, Any] = dict(_BROAD, model_breadth=0.1)
 _SHORT: dict[str, Any] = dict(max_episode_steps=2000)
 CASES = (
@@ -40,7 +40,7 @@ CASES = (
         "Mountain Car 2D, breadth 1/16, resolution 4",
         "combrel/MountainCar2D-v0",
         dict(start="fixed"),
-        dict(model_breadth=1 / 16, resolution=4, min_fraction=0.01),
+        dict(degree=0, model_breadth=1 / 16, resolution=4, min_fraction=0.01),
         50,
     ),
     Case("Mountain Car 4D, breadth 0.4, resolution 3", "combrel/MountainCar4D-v0", {}, _BROAD, 200),
@@ -49,11 +49,14 @@ CASES = (
         "Mountain Car 4D, breadth 0.2, resolution 3",
         "combrel/MountainCar4D-v0",
         {},
-        dict(model_breadth=0.2, resolution=3, min_fraction=0.1),
+        dict(degree=0, model_breadth=0.2, resolution=3, min_fraction=0.1),
         60,
     ),
     Case("Mountain Car 4D, breadth 0.1, resolution 3", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12),
     Case("the same with COMBREL", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12, transfers=True),
+    Case("Mountain Car 4D, local linear, resolution 3", "combrel/MountainCar4D-v0", _SHORT, {}, 12),
+    Case("the same with COMBREL as prior", "combrel/MountainCar4D-v0", _SHORT, {}, 12, transfers=True),
+    Case("Mountain Car 6D, local linear, resolution 2", "combrel/MountainCar6D-v0", _SHORT, {}, 8),
 )
 COMPARED_EPISODES = 200
 
@@ -131,7 +134,7 @@ def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, flo
         "from sb3_combrel.experiments import bench\n"
         f"case = bench.CASES[{number}]\n"
         "bench.learn(bench.CASES[0], 1, seed=1)\n"
-        "if case.transfers: bench.learn(case, 1, seed=1)\n"
+        "bench.learn(case, 1, seed=1)\n"
         "before = bench.resident_memory()\n"
         f"steps, seconds = bench.learn(case, max(1, round({fraction} * case.n_episodes)), {seed})\n"
         "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"

@@ -27,7 +27,7 @@ from sb3_combrel.experiments.warm_up import warm_up
 
 BREADTHS = (0.05, 0.1, 0.2)
 #: A hit by the first command returns 99. The resolution is the default one.
-LEARNER: dict[str, Any] = {"max_value": 100.0}
+LEARNER: dict[str, Any] = {"degree": 0, "max_value": 100.0}
 #: Commands in which a task counts as learnt; the shortest plans that were found have 25 and 27.
 LEARNT = {SOURCE_ID: 27, TARGET_ID: 32}
 

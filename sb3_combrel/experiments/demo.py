@@ -40,13 +40,13 @@ def run_demo(
     n_seeds: int,
     n_episodes: int,
     max_episode_steps: int,
-    model_breadth: float = mountain_car.LEARNER["model_breadth"],
+    model_breadth: float | None = None,
     workers: int | None = None,
     fresh: bool = False,
     console: Console | None = None,
 ) -> None:
     """
-    Learn the target task without transfer, with TIMBREL and with COMBREL, and report the results.
+    Learn the target task without transfer, with a random mapping, with TIMBREL and with COMBREL, and report the results.
 
     Runs that an earlier call has completed in the same folder are kept.
 
@@ -54,7 +54,7 @@ def run_demo(
     :param n_seeds: runs of each method
     :param n_episodes: episodes of each run
     :param max_episode_steps: steps after which an episode is cut off
-    :param model_breadth: breadth of the learner's kernel
+    :param model_breadth: breadth of the learner's kernel; None for the learner's own
     :param workers: processes at a time; None for one a core
     :param fresh: delete the results in the folder first
     :param console: where to write; None for the standard output
@@ -65,10 +65,10 @@ def run_demo(
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    if not model_breadth > 0.0:
+    if model_breadth is not None and not model_breadth > 0.0:
         raise ValueError(f"model_breadth must be positive, got {model_breadth}")
     console = console or Console()
-    learner = {**mountain_car.LEARNER, "model_breadth": model_breadth}
+    learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
     prepare_folder(output, _settings(learner, max_episode_steps), fresh)
     source = _source(output / SOURCE, console)
     runs = [

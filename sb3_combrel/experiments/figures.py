@@ -32,16 +32,18 @@ def draw_learning_curves(steps: Mapping[str, np.ndarray], path: Path, title: str
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    highest = 0.0
     for (method, samples), colour, marker in zip(steps.items(), COLOURS, MARKERS, strict=False):
         episodes = np.arange(1, samples.shape[1] + 1)
         mean, low, high = mean_of_runs(samples)
+        highest = max(highest, float(np.minimum(high, cap).max()))
         axes.plot(episodes, mean, color=colour, marker=marker, markersize=5, label=f"{method} ({len(samples)} runs)")
         # No run can need more steps than the cap, nor fewer than none.
         axes.fill_between(episodes, np.maximum(low, 0), np.minimum(high, cap), color=colour, alpha=0.2, linewidth=0)
     axes.set_xlabel("episode")
     axes.set_ylabel(f"steps to goal (at most {cap})")
     axes.set_title(title)
-    axes.set_ylim(0, 1.05 * cap)
+    axes.set_ylim(0, 1.05 * highest)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.transfer.base import Transfer
 
 SOURCE_ID = "combrel/MountainCar2D-v0"
 TARGET_ID = "combrel/MountainCar4D-v0"
 N_INSTANCES = 1000
 
-LEARNER: dict[str, Any] = {"model_breadth": 0.1, "resolution": 3, "min_fraction": 0.1}
+# All defaults.
+LEARNER: dict[str, Any] = {}
 
-NO_TRANSFER = "no transfer"
+NO_TRANSFER, RANDOM = "no transfer", "random mapping"
 
 
 def intuitive_mapping() -> list[InterTaskMapping]:
@@ -28,15 +29,33 @@ def intuitive_mapping() -> list[InterTaskMapping]:
     return [along_x, along_x, along_x, along_y, along_y]
 
 
+def factored_mapping(n_axes: int) -> FactoredMapping:
+    """
+    Return the mapping that a person would choose with ``use="prior"``: for each axis a car of the source.
+
+    :param n_axes: 2 or 3, of the target
+    """
+    copies = []
+    for axis in range(n_axes):
+        state: list[int | None] = [None] * (2 * n_axes)
+        state[axis], state[n_axes + axis] = 0, 1
+        # Actions of the target: Neutral, then to either side along each axis.
+        actions = [0] * (1 + 2 * n_axes)
+        actions[1 + 2 * axis], actions[2 + 2 * axis] = 1, 2
+        copies.append(InterTaskMapping(tuple(state), tuple(actions)))
+    return FactoredMapping(tuple(copies))
+
+
 def methods(source: SourceInstances) -> dict[str, Transfer | None]:
     """
-    Make the transfer methods that are compared, by name.
+    Make the transfer methods that are compared, by name: none, with a random mapping, with the right one, and COMBREL.
 
     :param source: instances of the source task
     """
     return {
         NO_TRANSFER: None,
-        "TIMBREL": TIMBREL(source, mapping=intuitive_mapping()),
+        RANDOM: TIMBREL(source, mapping="random", mappings="factored", use="prior"),
+        "TIMBREL": TIMBREL(source, mapping=factored_mapping(2), use="prior"),
         "COMBREL": COMBREL(source),
     }
 

@@ -85,6 +85,7 @@ class FittedRMaxAgent:
         self._lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
         if transfer is not None:
+            transfer.check_degree(1 if self.model_class.takes_prior else 0)
             self.target = self._target_task(transfer)
         self._build()
         if transfer is not None:
@@ -101,6 +102,7 @@ class FittedRMaxAgent:
             state_names=tuple(self.task.state_names),
             action_names=tuple(self.task.action_names),
             periodic=self.periodic,
+            takes_prior=self.model_class.takes_prior,
         )
         transfer.bind(target, self.rng)
         return target
@@ -157,7 +159,7 @@ class FittedRMaxAgent:
         if given is not None:
             assert self.transfer is not None
             self.transfer.note_use(given)
-        else:
+        elif self.model.accepts_visited:
             self._note_visit(state, prediction)
         visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)
@@ -251,7 +253,11 @@ class FittedRMaxAgent:
             self._plan(AT_EPISODE_END * self.max_backups)
 
     def complete(self) -> None:
-        """Bring the model up to date with all transitions, as at an episode's end: what is then saved is what is predicted with."""
+        """
+        Bring the model up to date with all transitions, as at an episode's end.
+
+        What is then saved is what is predicted with.
+        """
         with self._lock:
             pairs = self.model.end_episode()
             if len(pairs):
@@ -359,7 +365,7 @@ class FittedRMaxAgent:
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
             self.planner.restore(state["values"])
             self._set_corrections(CorrectionArrays.of_rows(state["corrections"]))
-            self.visits.counts[:] = state["visits"]
+            self.visits.counts[:] = np.clip(state["visits"], 0, np.iinfo(np.int32).max)
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

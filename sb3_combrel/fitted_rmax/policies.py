@@ -5,13 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_device
 
 from sb3_combrel.common.observations import ObservationScaler
 from sb3_combrel.common.scaling import StateScaling
@@ -40,6 +41,8 @@ MOVED_TO_AGENT = {
     "state_names": "task.state_names",
     "action_names": "task.action_names",
 }
+
+SelfFittedRMaxPolicy = TypeVar("SelfFittedRMaxPolicy", bound="FittedRMaxPolicy")
 
 
 class FittedRMaxPolicy(BasePolicy):
@@ -101,9 +104,27 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
-        parameters = {**spaces_of_both, **self._settings, "transfer": describe_transfer(self.transfer)}
+        # The degree is said in any case: see ``load``.
+        settings = {**self._settings, "degree": self.agent.settings.degree}
+        parameters = {**spaces_of_both, **settings, "transfer": describe_transfer(self.transfer)}
         # A class is pickled by its name, and imported by who reads it: only one of the user's own has to be.
         return parameters if self._model_class is None else {**parameters, "model_class": self._model_class}
+
+    @classmethod
+    def load(cls: type[SelfFittedRMaxPolicy], path: str, device: th.device | str = "auto") -> SelfFittedRMaxPolicy:
+        """
+        Load a policy that was saved by itself, by ``policy.save(path)``.
+
+        :param path: path of the file
+        :param device: where its tensors go
+        """
+        place = get_device(device)
+        # As SB3 does: observation spaces are pickled.
+        saved = th.load(path, map_location=place, weights_only=False)
+        # Files of version 0.1.0, which had the kernel average only, do not say the degree.
+        policy = cls(**{"degree": 0, **saved["data"]})
+        policy.load_state_dict(saved["state_dict"])
+        return policy.to(place)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
@@ -186,8 +207,9 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         expected = self.agent.get_state()
-        # Files of version 0.1.0 do not have it.
-        state_dict.setdefault(prefix + "visits", th.as_tensor(expected["visits"] * 0.0))
+        if self.agent.settings.degree == 0:
+            # Version 0.1.0, which had the kernel average only, did not count them.
+            state_dict.setdefault(prefix + "visits", th.zeros(expected["visits"].shape, dtype=th.float64))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+
 from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.models.base import Model, ModelSettings
@@ -51,7 +53,7 @@ class FittedRMaxSettings:
     periodic: Sequence[bool] | None = None
 
     def __post_init__(self) -> None:
-        if self.degree not in (0, 1) or isinstance(self.degree, bool):
+        if not isinstance(self.degree, int | np.integer) or isinstance(self.degree, bool) or self.degree not in (0, 1):
             raise ValueError(f"degree must be 0 (kernel average) or 1 (local linear), got {self.degree!r}")
         if self.model_breadth is not None:
             check_positive("model_breadth", self.model_breadth)

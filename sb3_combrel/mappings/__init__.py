@@ -6,6 +6,7 @@ from sb3_combrel.mappings.action_mappings import (
     BalancedActionMappings,
     ListedActionMappings,
 )
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, InterTaskMapping, MappingNames
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.mappings.members import Candidates
@@ -17,6 +18,7 @@ __all__ = [
     "AllActionMappings",
     "BalancedActionMappings",
     "Candidates",
+    "FactoredMapping",
     "InterTaskMapping",
     "ListedActionMappings",
     "MappingNames",

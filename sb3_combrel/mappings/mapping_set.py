@@ -223,7 +223,8 @@ class MappingSet:
         unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
         if unsigned not in constructors:
             names = [*constructors, *(f"signed_{each}" for each in constructors), "paper_mountain_car", "paper_icub"]
-            raise ValueError(f"mappings must be one of {', '.join(names)}, got {name!r}")
+            factored = 'with use="prior" also factored, signed_factored'
+            raise ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
         numbers = (n_source_variables, n_target_variables, n_source_actions, n_target_actions)
         return constructors[unsigned](*numbers, signs=signs or unsigned != name)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import permutations
+from itertools import combinations, permutations
 from math import comb, perm
 
 import numpy as np
@@ -45,6 +45,30 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
         keep = (used > 0).sum(axis=1) + (n_target - 1 - position) >= different
         rows = rows[keep & (used <= 1).all(axis=1)] if once else rows[keep]
     return rows
+
+
+def copies_of_source(n_source: int, n_target: int) -> Ints:
+    """
+    Every way to make a copy of the source, or of some of its variables, of different target variables.
+
+    :param n_source: number of source variables
+    :param n_target: number of target variables
+    :return: source variable of each target variable, -1 for those that are not in the copy; one copy a row, those with more
+        variables first, shape (n, n_target)
+    :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` copies
+    """
+    check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
+    check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
+    largest = min(n_source, n_target)
+    _check_state_mappings(sum(comb(n_source, k) * perm(n_target, k) for k in range(1, largest + 1)))
+    rows = []
+    for size in range(largest, 0, -1):
+        for used in combinations(range(n_source), size):
+            for taken in permutations(range(n_target), size):
+                row = np.full(n_target, UNMAPPED, dtype=np.int64)
+                row[list(taken)] = used
+                rows.append(row)
+    return np.array(rows)
 
 
 def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:

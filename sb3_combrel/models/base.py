@@ -91,6 +91,8 @@ class Model(ABC):
 
     #: Whether a transfer method may give the mean that the target's own instances are fitted to (``use="prior"``).
     takes_prior: ClassVar[bool] = False
+    #: Whether grid points beside which all has been known often enough count as known (see ``planning.visits``).
+    accepts_visited: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp = mdp

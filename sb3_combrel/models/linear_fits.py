@@ -417,11 +417,10 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
             products_of(state, fits.target[action, slot], products)
         shares = count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
         fits.n_counted[pair] += 1
-        if not fits.known[pair]:
-            fits.total[pair] += np.exp(distance * kernel.scale)
-            if fits.total[pair] >= threshold:
-                fits.known[pair] = True
-                fits.unexplained[pair] = np.inf
+        fits.total[pair] += np.exp(distance * kernel.scale)
+        if not fits.known[pair] and fits.total[pair] >= threshold:
+            fits.known[pair] = True
+            fits.unexplained[pair] = np.inf
         if fits.known[pair] or fits.claimed[pair]:
             fits.unexplained[pair] += contradiction(fits, pair, instances, action, slot, state, shares)
             if fits.unexplained[pair] <= MAX_UNEXPLAINED and fits.n_counted[pair] <= fits.limit[pair]:

@@ -31,8 +31,12 @@ MIN_CHANGE = 0.5
 
 # Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
 # values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
-# would make the states beside them look good for ever.
+# would make the states beside them look good for ever. Only once an episode has ended or rewards have differed: until then
+# nothing says where to go, and to know how states change is not to know what is there.
 ON_GRID = 0.5
+# As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, twice the weight
+# is demanded: a broad kernel knows soon how states change, and would never find a small goal.
+EXPLORED, CHECKED_EVERY = 0.9, 50
 
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
@@ -63,6 +67,7 @@ class LocalLinear(Model):
     """
 
     takes_prior = True
+    accepts_visited = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
@@ -126,6 +131,9 @@ class LocalLinear(Model):
         )
         self._plain_near = tuple(self._near)
         self._prior_version = -1
+        # Whether an outcome has told states apart.
+        self._informed, self._first_reward = False, np.nan
+        self._threshold, self._demand = self.exploration_threshold, 1.0
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
         self._all_actions = np.arange(self.n_actions)
         self._make_prediction(1)
@@ -157,6 +165,7 @@ class LocalLinear(Model):
             has changed enough; the others may wait (see :meth:`outdated`)
         """
         slot, left = self._slot_for(state, action)
+        informed = self._inform(reward, terminated)
         min_change = 0.0 if self._giver is None else MIN_CHANGE * self.exploration_threshold
         n_changed = _enter.call(
             self._plain_instances,
@@ -169,7 +178,10 @@ class LocalLinear(Model):
             self._plain_scratch,
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
-        return changed if len(left) == 0 else np.union1d(left, changed)
+        forgotten = self._demand_more()
+        if len(left) + len(informed) + len(forgotten) == 0:
+            return changed
+        return np.unique(np.concatenate([left, informed, forgotten, changed]))
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
         """Where a new instance goes, and the pairs whose rows are to be updated because another has made room."""
@@ -238,7 +250,35 @@ class LocalLinear(Model):
             self._renew_range(action, np.delete(effects, slot, axis=0))
 
     def _threshold_on_grid(self) -> float:
-        return ON_GRID * self.exploration_threshold
+        return (ON_GRID if self._informed else 1.0) * self.exploration_threshold
+
+    def _inform(self, reward: float, terminated: bool) -> np.ndarray:
+        """Note an outcome; the pairs that become known because it is the first that differs."""
+        if self._informed:
+            return NO_PAIRS
+        self._first_reward = reward if np.isnan(self._first_reward) else self._first_reward
+        self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
+        if not self._informed:
+            return NO_PAIRS
+        self._demand = 1.0
+        return self.lower_threshold(self._threshold)
+
+    def _demand_more(self) -> np.ndarray:
+        """Demand more weight of what is known while no outcome has told states apart; the pairs that are no longer known."""
+        if self._informed or self.n_instances % CHECKED_EVERY or self.known.mean() < EXPLORED:
+            return NO_PAIRS
+        self._demand *= 2.0
+        self.exploration_threshold = self._demand * self._threshold
+        forgotten = np.flatnonzero(self.known & (self.own_weight < self._threshold_on_grid()))
+        self.known[forgotten] = False
+        return forgotten
+
+    def lower_threshold(self, threshold: float) -> np.ndarray:
+        self._threshold = threshold
+        self.exploration_threshold = self._demand * threshold
+        newly_known = np.flatnonzero(~self.known & (self.own_weight >= self._threshold_on_grid()))
+        self.known[newly_known] = True
+        return newly_known
 
     def end_episode(self) -> np.ndarray:
         """Fit all pairs again that have had instances since the last time."""
@@ -312,14 +352,25 @@ class LocalLinear(Model):
         return self._prediction, given
 
     def get_state(self) -> dict[str, np.ndarray]:
-        return {**super().get_state(), "reach": self.fits.reach.copy(), "limit": self.fits.limit.astype(np.float64)}
+        return {
+            **super().get_state(),
+            "reach": self.fits.reach.copy(),
+            "limit": self.fits.limit.astype(np.float64),
+            "demand": np.array([self._demand]),
+        }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Compute sums and fits from the instances; pairs that were known stay known."""
         instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self.instances = instances
         fits = self.fits
-        fits.reach[:], fits.limit[:] = state["reach"], state["limit"]
+        for row in state["instances"]:
+            self._inform(row[-3], row[-2] > 0.5)
+        self._demand = max(1.0, float(state["demand"][0]))
+        self.exploration_threshold = self._demand * self._threshold
+        # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
+        fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)
+        fits.limit[:] = np.clip(state["limit"], fits.limit, np.iinfo(np.int32).max)
         fits.known[:] = state["known"] > 0.5
         self._set_fits(fits._replace(target=np.empty_like(instances.effect)))
         if len(self.renew_prior()) == 0:

@@ -14,6 +14,7 @@ from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 
 if TYPE_CHECKING:
+    from sb3_combrel.common.prior import PriorPredictions
     from sb3_combrel.common.transferred import TransferredInstances
 
 
@@ -35,6 +36,7 @@ class TargetTask:
     :param action_names: names of the actions, for display
     :param periodic: which state variables are periodic, so that 0 and 1 are the same unit coordinate: one bool for each,
         None for none
+    :param takes_prior: whether the target's model takes a prior (``use="prior"``)
     """
 
     scaling: StateScaling
@@ -46,6 +48,7 @@ class TargetTask:
     state_names: tuple[str, ...]
     action_names: tuple[str, ...]
     periodic: Sequence[bool] | None = None
+    takes_prior: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "periodic", periodic_flags(self.periodic, self.n_variables))
@@ -137,6 +140,41 @@ class Transfer(ABC):
         :return: True: everywhere; False: nowhere; or bool, shape (n_actions, n_points). By default everywhere
         """
         return True
+
+    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
+        """
+        Predict states and actions of the target; asked only if :attr:`use` is "prior".
+
+        It must depend on nothing but its arguments while :meth:`prior_version` stays the same.
+
+        :param states: unit coordinates, shape (n, n_variables)
+        :param actions: int64, shape (n,)
+        :return: good until the next call
+        :raises NotImplementedError: if the method has no prior
+        """
+        raise NotImplementedError(f'{type(self).__name__} has use="prior", but no method prior(states, actions)')
+
+    def prior_version(self) -> int:
+        """
+        Return a number that grows whenever what :meth:`prior` returns may have changed.
+
+        All pairs of the sample and all of the target's own instances are then asked for again: a few dozen times in a run, not
+        at every step.
+        """
+        return 0
+
+    def check_degree(self, degree: int) -> None:
+        """
+        Check that a model of this degree can take what is transferred.
+
+        :param degree: 0 for a kernel average, 1 for a local linear model
+        :raises ValueError: if it cannot
+        """
+        if self.use == "prior" and degree < 1:
+            raise ValueError(
+                f'{type(self).__name__}(use="prior") needs the local linear model, FittedRMax(degree=1), got degree={degree}; '
+                'or use="instances"'
+            )
 
     def note_use(self, transferred: TransferredInstances) -> None:  # noqa: B027 - a method may well ignore it
         """

@@ -10,12 +10,13 @@ import numpy as np
 
 from sb3_combrel.common.instances import Instances, along_curve
 from sb3_combrel.common.periodic import differences
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 
 SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances | str | os.PathLike[str]]
-MappingsLike = str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
+MappingsLike = str | InterTaskMapping | FactoredMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
 
 # Compliance is stored with every candidate, for thousands of transitions.
@@ -94,6 +95,8 @@ class Candidates:
     """
 
     def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask, whole: bool = False):
+        if isinstance(mappings, FactoredMapping):
+            raise ValueError(f'factored mappings need use="prior", got mappings={mappings!r}')
         self.task = task
         self.whole = whole
         self.sources = load_sources(source)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
@@ -15,7 +17,10 @@ from sb3_combrel.transfer.mapping_transfer import (
     RENAMED_ARGUMENTS,
     MappingTransfer,
 )
+from sb3_combrel.transfer.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
+from sb3_combrel.transfer.source_prior import SourcePrior
 
 
 class COMBREL(MappingTransfer):
@@ -32,12 +37,22 @@ class COMBREL(MappingTransfer):
     (Section 5.1). Its Table 2 contradicts it, where two mappings with the same source action for an action have different
     shares. ``neighbors="state_action"`` is the other reading.
 
+    With ``use="prior"`` the source's own local linear model, seen through a mapping, is the prior of the target's model: the
+    target's own instances are fitted to what it leaves over. Compliance is then that of the source's predictions with the
+    target's transitions, and one mapping is chosen for all states, or with sets that are not factored one for each target
+    action: after 10 transitions, and again whenever there are 1.4 times as many. What the prior claims to know without the
+    target's own instances is said in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs
+    ``FittedRMax(degree=1)``.
+
     :param source: source instances, a path to them, or a list of several, among which is selected as well
-    :param mappings: "injective" (each source variable is mapped to by one target variable, the other target variables are
-        left unmapped), "surjective", "all", "balanced", these with "signed_" before them (variables may be mirrored as
-        well), "paper_mountain_car", "paper_icub", a list of mappings or a ``MappingSet``. Where every target variable is
-        mapped, as in "surjective", translated instances lie on diagonals of the target's space and help much less: 12
-        episodes of MountainCar4D (breadth 0.1, 6 seeds) took 3,207 +- 55 steps with "injective", 3,803 +- 239 with "all",
+    :param mappings: None: "factored" with ``use="prior"``, "injective" without it; or a set. "injective" (each source
+        variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
+        "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
+        "factored" and "signed_factored" (with ``use="prior"`` only): the target's variables are divided among copies of the
+        source, or of some of its variables, each moved by a source action of its own, and variables that stay; a
+        ``FactoredMapping``; a list of mappings or a ``MappingSet``. Where every target variable is mapped, as in
+        "surjective", translated instances lie on diagonals of the target's space and help much less: 12 episodes of
+        MountainCar4D (``degree=0``, breadth 0.1, 6 seeds) took 3,207 +- 55 steps with "injective", 3,803 +- 239 with "all",
         4,752 +- 239 with "signed_injective", 4,655 +- 184 with "signed_all", and 15,669 +- 327 with "surjective". The sets
         named after the paper's experiments leave two of the four target variables unmapped.
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
@@ -73,6 +88,10 @@ class COMBREL(MappingTransfer):
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
         from the data, that of starts in proportion to how many variables a mapping compares. The paper names none.
+    :param use: None: "prior" where the target's model takes one (``FittedRMax(degree=1)``) unless ``mappings`` are given that
+        are not factored; "instances": translated instances fill what the target's own lack; or "prior", see above. Then of
+        the arguments after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and ``source_breadth`` have a meaning
+    :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
@@ -80,7 +99,7 @@ class COMBREL(MappingTransfer):
     def __init__(
         self,
         source: SourceLike,
-        mappings: MappingsLike = "injective",
+        mappings: MappingsLike | None = None,
         *,
         n_neighbors: int = 3,
         neighbors: str = "action",
@@ -96,6 +115,8 @@ class COMBREL(MappingTransfer):
         relevance: bool = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
+        use: str | None = None,
+        source_breadth: float = DEFAULT_SOURCE_BREADTH,
     ):
         check_count("n_neighbors", n_neighbors)
         check_count("max_transitions", max_transitions)
@@ -113,6 +134,12 @@ class COMBREL(MappingTransfer):
             raise ValueError(f'choice must be "best" or "drawn", got {choice!r}')
         if measured not in ("online", "first_episode"):
             raise ValueError(f'measured must be "online" or "first_episode", got {measured!r}')
+        # With neither given both depend on the target's model, and are decided when it is known.
+        self._decides = mappings is None and use is None
+        if use is None:
+            use = "prior" if mappings is not None and is_factored(mappings) else "instances"
+        if mappings is None:
+            mappings = "factored" if use == "prior" else "injective"
         super().__init__(
             source,
             mappings,
@@ -122,6 +149,8 @@ class COMBREL(MappingTransfer):
             relevance=relevance,
             relevance_fraction=relevance_fraction,
             bandwidths=bandwidths,
+            use=use,
+            source_breadth=source_breadth,
         )
         self.n_neighbors = n_neighbors
         self.neighbors = neighbors
@@ -132,10 +161,45 @@ class COMBREL(MappingTransfer):
         self.min_compliance = min_compliance
         self.min_evidence = min_evidence
 
+    @classmethod
+    def paper(cls, source: SourceLike, mappings: MappingsLike = "injective", **arguments: Any) -> COMBREL:
+        """
+        COMBREL as the paper has it: instances of the mapping that complies best with the transitions of the first episode.
+
+        :param source: as of the class; ``mappings``: the same
+        :param arguments: others of the class, which come before the paper's
+        """
+        as_published = dict(
+            use="instances", measured="first_episode", n_neighbors=3, min_compliance=0.0, min_evidence=0.0, breadth_decay=1.0
+        )
+        return cls(source, mappings, **{**as_published, **arguments})
+
+    def arguments(self) -> dict[str, Any]:
+        given = super().arguments()
+        return {**given, "mappings": None, "use": None} if self._decides else given
+
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        if self._decides:
+            self.use, self.mappings = ("prior", "factored") if task.takes_prior else ("instances", "injective")
+            self._decides = False
         super().bind(task, rng)
+        if self.use == "prior":
+            return
         # Nothing is selected before the first transition, so nothing is returned for any state of the sample.
         self._all_changed = False
+
+    def _make_prior(self, task: TargetTask) -> SourcePrior:
+        given = is_factored(self.mappings) and not isinstance(self.mappings, str)
+        return make_prior(
+            self.source,
+            self.mappings,
+            task,
+            breadth=float(self.source_breadth),
+            given=given,
+            drawn=None,
+            max_transitions=self.max_transitions,
+            transfer_terminals=self.transfer_terminals,
+        )
 
     def _whole_mappings(self) -> bool:
         return self.neighbors == "state_action"
@@ -163,4 +227,7 @@ class COMBREL(MappingTransfer):
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
         :return: float64, shape (n,); NaN where nothing is chosen
         """
+        if self.use == "prior":
+            assert self.task is not None
+            return self._prior.mean_compliance()[pairs // len(self.task.sample_states)]
         return self._compliance_selector.mean_compliance(pairs)

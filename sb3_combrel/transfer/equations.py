@@ -335,3 +335,45 @@ def transferred_instances(
         total += weights[j]
     numbers = np.array(chosen if total >= rules.threshold else [], dtype=np.int64)
     return numbers, weights[numbers]
+
+
+def running_scales(effects: Floats) -> Floats:
+    """Compute what squared errors are compared with when the source's own model is judged (``use="prior"``; no equation).
+
+    Of each variable the square of the mean size of its effects so far. The mean of their squares would be that of a few
+    large ones, such as those of a car that hits the wall, beside which nothing else counts.
+
+    :param effects: of the target's transitions, in the order in which they came, shape (t, d)
+    :return: at each transition, shape (t, d)
+    """
+    so_far = np.cumsum(np.abs(effects), axis=0) / np.arange(1, len(effects) + 1)[:, None]
+    return so_far**2
+
+
+def prediction_compliances(effects: Floats, predicted: Floats, scales: Floats) -> Floats:
+    """Compute the compliance of target transitions with what a source's model predicts of them through one mapping.
+
+    The outcome's factor of Eq. 2, with one prediction in place of a weighted mean over instances, and a scale for each
+    variable. Being a product over variables, it factorises over the copies of a factored mapping: each copy has the
+    compliance of its own variables, whatever moves the others.
+
+    :param effects: s'_i - s_i, shape (t, d), of the variables that count; ``predicted`` and ``scales``: the same shape
+    :return: values in [0, 1], shape (t,); 1 where all is predicted exactly
+    """
+    return np.exp(-((effects - predicted) ** 2 / scales).sum(axis=1))
+
+
+def division_score(of_parts: Sequence[Floats], actions: Ints, n_in_copies: int, min_gain: float) -> float:
+    """Score a division of the target's variables into copies of the source and variables that stay, by its compliance.
+
+    The logarithm of the product of all parts' mean compliances, that of each target action counted as often as there are
+    transitions with it.
+
+    :param of_parts: of each copy, with its best source action for each target action, and of each variable that stays
+        (predicted not to change), :func:`prediction_compliances`, shape (t,)
+    :param actions: target action of each transition, shape (t,)
+    :param n_in_copies: number of variables that are in a copy
+    :param min_gain: by what factor a copy must comply better, for each of its variables, than that they stay
+    """
+    parts = [part[actions == action] for part in of_parts for action in np.unique(actions)]
+    return float(sum(len(part) * np.log(part.mean()) for part in parts) - n_in_copies * len(actions) * np.log(min_gain))

@@ -12,16 +12,20 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_positive
 from sb3_combrel.common.periodic import differences
+from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike
 from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
 from sb3_combrel.transfer.selectors import Ranges, Selector
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
+from sb3_combrel.transfer.source_prior import SourcePrior
 from sb3_combrel.transfer.translation import Translator
 
 DEFAULT_BREADTH = 0.3
@@ -51,6 +55,8 @@ class MappingTransfer(Transfer):
     :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance
     :param relevance_fraction: mu of Eq. 4
     :param bandwidths: (start, outcome, reward) of compliance and relevance; None: from the data
+    :param use: "instances" or "prior": translated instances, or the source's own model seen through the mappings
+    :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
     """
 
     renamed_arguments = RENAMED_ARGUMENTS
@@ -66,7 +72,16 @@ class MappingTransfer(Transfer):
         relevance: bool,
         relevance_fraction: float,
         bandwidths: tuple[float, float, float] | None,
+        use: str = "instances",
+        source_breadth: float = DEFAULT_SOURCE_BREADTH,
     ):
+        if use not in ("instances", "prior"):
+            raise ValueError(f'use must be "instances" or "prior", got {use!r}')
+        if use == "instances" and is_factored(mappings):
+            raise ValueError(f'factored mappings need use="prior", got use="instances" with {mappings!r}')
+        if use == "prior" and relevance:
+            raise ValueError('relevance must be False with use="prior": no instances are transferred, got True')
+        check_positive("source_breadth", source_breadth)
         check_positive("breadth", breadth)
         check_positive("breadth_decay", breadth_decay, max=1.0)
         check_positive("relevance_fraction", relevance_fraction, max=1.0)
@@ -85,6 +100,8 @@ class MappingTransfer(Transfer):
         self.relevance = bool(relevance)
         self.relevance_fraction = relevance_fraction
         self.bandwidths = bandwidths
+        self.use = use
+        self.source_breadth = source_breadth
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not there otherwise.
@@ -97,11 +114,14 @@ class MappingTransfer(Transfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
+        self._periodic = np.array(task.periodic)
+        self._wraps = bool(self._periodic.any())
+        if self.use == "prior":
+            self._prior = self._make_prior(task)
+            return
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         self._choose_bandwidths()
         self._transitions = RecordedTransitions(task.n_variables)
-        self._periodic = np.array(task.periodic)
-        self._wraps = bool(self._periodic.any())
         self._translator = Translator(
             self.candidates,
             task,
@@ -134,23 +154,39 @@ class MappingTransfer(Transfer):
     def _make_selector(self, task: TargetTask) -> Selector:
         """Make the selector for the target task that the method was just bound to."""
 
+    @abstractmethod
+    def _make_prior(self, task: TargetTask) -> SourcePrior:
+        """Make the prior of the target task that the method was just bound to."""
+
     @property
     def sources(self) -> list[SourceInstances]:
         """The source tasks' instances, once bound."""
-        return self.candidates.sources
+        return list(self._prior.copies.sources) if self.use == "prior" else self.candidates.sources
 
     # ------------------------------------------------------------------ asking
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        if self.use == "prior":
+            return TransferredInstances.empty(len(actions), states.shape[1])
         self._last_selected = self._selector.select(states, actions, own_weight)
         return self._translator(states, own_weight, self._last_selected)
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         assert self.task is not None
+        if self.use == "prior":
+            return TransferredInstances.empty(len(actions), self.task.n_variables)
         selected = self._selector.select_at_sample(points, actions, own_weight)
         return self._translator(self.task.sample_states[points], own_weight, selected)
 
+    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
+        return self._prior.predict(states, actions)
+
+    def prior_version(self) -> int:
+        return self._prior.version
+
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        if self.use == "prior":
+            return False
         if self._all_changed:
             self._all_changed = False
             return True
@@ -162,10 +198,13 @@ class MappingTransfer(Transfer):
     # --------------------------------------------------------------- observing
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
+        if self.use == "prior":
+            self._prior.observe(state, action, reward, effect, terminated)
+            return
         selector = self._selector
         selector.before_transition()
         if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
-            effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
             selector.add_transition(self._transitions.add(state, action, reward, effect))
             n_used = selector.n_used()
             if self.relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
@@ -178,6 +217,9 @@ class MappingTransfer(Transfer):
         Where transferred instances reach the threshold everywhere, wrongly, nothing is optimistic and nothing would ever
         be explored.
         """
+        if self.use == "prior":
+            self._prior.end_episode(truncated)
+            return
         if truncated and self.breadth_decay < 1.0:
             self._translator.set_breadth(self._translator.rules.breadth * self.breadth_decay)
             self._all_changed = True
@@ -185,6 +227,8 @@ class MappingTransfer(Transfer):
             self._renew_relevance(self._selector.n_used())
 
     def note_use(self, transferred: TransferredInstances) -> None:
+        if self.use == "prior":
+            return
         first, _ = self._last_selected
         for candidate, n in zip(first.tolist(), transferred.length[: len(first)].tolist(), strict=True):
             if n > 0 and self._selector.selects_one:
@@ -201,16 +245,30 @@ class MappingTransfer(Transfer):
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""
+        if self.use == "prior":
+            parts = self._prior.candidate(candidate)
+            assert self.task is not None
+            return f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
         return self.candidates.describe(candidate)
+
+    def describe_prior(self) -> str:
+        """
+        Say what the source is taken for: "East: Right on (x, vx), Neutral on (y, vy); West: ..."; with ``use="prior"``.
+
+        :raises ValueError: with ``use="instances"``
+        """
+        if self.use != "prior":
+            raise ValueError(f'use must be "prior" for describe_prior, got {self.use!r}')
+        return self._prior.describe()
 
     def candidate(self, number: int) -> Candidate:
         """Return a candidate's parts, by name."""
-        return self.candidates.parts(number)
+        return self._prior.candidate(number) if self.use == "prior" else self.candidates.parts(number)
 
     @property
     def makes_choices(self) -> bool:
         """Whether :meth:`choices` ever names a candidate."""
-        return self._selector.makes_choices
+        return self.use == "prior" or self._selector.makes_choices
 
     def choices(self) -> np.ndarray:
         """
@@ -218,21 +276,26 @@ class MappingTransfer(Transfer):
 
         :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
         """
+        if self.use == "prior":
+            assert self.task is not None
+            return np.repeat(self._prior.choices(), len(self.task.sample_states))
         return self._selector.choices()
 
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions of all sources, each name once."""
-        return self.candidates.source_action_names()
+        return self._prior.source_action_names() if self.use == "prior" else self.candidates.source_action_names()
 
     def uses(self) -> dict[int, int]:
         """Return for how many of the agent's steps and actions each candidate's instances were used."""
-        return dict(self._uses)
+        return self._prior.uses() if self.use == "prior" else dict(self._uses)
 
     def mapping_counts(self) -> list[tuple[str, int]]:
         """Return how often each candidate's instances were used, the most used first, by name."""
-        return [(self.describe(candidate), n) for candidate, n in self._uses.most_common()]
+        return [(self.describe(candidate), n) for candidate, n in Counter(self.uses()).most_common()]
 
     def statistics(self) -> dict[str, float]:
+        if self.use == "prior":
+            return self._prior.statistics()
         return {
             "transfer/instances_used": self._instances_used,
             "transfer/uses": sum(self._uses.values()),
@@ -249,6 +312,8 @@ class MappingTransfer(Transfer):
         return {**super().arguments(), "source": self.sources if len(self.sources) > 1 else self.sources[0]}
 
     def get_state(self) -> dict[str, np.ndarray]:
+        if self.use == "prior":
+            return self._prior.get_state()
         uses = np.zeros(len(self.candidates))
         uses[list(self._uses)] = list(self._uses.values())
         return {
@@ -261,6 +326,9 @@ class MappingTransfer(Transfer):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         assert self.task is not None
+        if self.use == "prior":
+            self._prior.set_state(state)
+            return
         d = self.task.n_variables
         self._translator.set_breadth(float(state["breadth"][0]))
         for row in state["transitions"]:

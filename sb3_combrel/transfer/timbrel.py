@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
@@ -16,8 +17,11 @@ from sb3_combrel.transfer.mapping_transfer import (
     RENAMED_ARGUMENTS,
     MappingTransfer,
 )
+from sb3_combrel.transfer.prior_sets import make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
 from sb3_combrel.transfer.selectors import FixedSelector, PooledSelector, RandomSelector, Selector
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
+from sb3_combrel.transfer.source_prior import SourcePrior
 
 
 class TIMBREL(MappingTransfer):
@@ -28,12 +32,17 @@ class TIMBREL(MappingTransfer):
     nearest translated instances come first, until they and the target's own reach the threshold that makes a
     state-action pair known; if they cannot, nothing is transferred. A pair whose own instances suffice uses none.
 
+    With ``use="prior"`` the source's own local linear model, seen through the mapping, is the prior of the target's model: the
+    target's own instances are fitted to what it leaves over. What it claims to know without them is said in
+    :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs ``FittedRMax(degree=1)``.
+
     :param source: source instances, a path to them, or a list of several
     :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of
         ``mappings`` drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever
         it is asked for, elsewhere with each transition; or "pool" for the translations by all of ``mappings`` in one pool
-        (Figure 3)
-    :param mappings: the set that "random" and "pool" draw from: "injective", "surjective", "all", "balanced", the
+        (Figure 3). With ``use="prior"`` also a ``FactoredMapping``; and "random" is drawn once, for the whole run
+    :param mappings: the set that "random" and "pool" draw from: "factored" and "signed_factored" (``use="prior"`` only: of
+        as many variables as possible, in as few copies as possible), "injective", "surjective", "all", "balanced", the
         paper's sets, a list of mappings or a ``MappingSet``
     :param breadth: kernel breadth of transferred instances, in unit coordinates. The paper names none; it needs to be
         wide enough for 1000 instances to cover the source.
@@ -45,6 +54,9 @@ class TIMBREL(MappingTransfer):
         finds it harmful.
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of relevance; None: from the data
+    :param use: "instances": translated instances fill what the target's own lack; or "prior", see above. ``breadth``,
+        ``breadth_decay``, relevance and its arguments have no meaning then
+    :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
     """
 
@@ -52,7 +64,7 @@ class TIMBREL(MappingTransfer):
     def __init__(
         self,
         source: SourceLike,
-        mapping: str | InterTaskMapping | Sequence[InterTaskMapping] | dict[str, Any] = "random",
+        mapping: str | InterTaskMapping | FactoredMapping | Sequence[InterTaskMapping] | dict[str, Any] = "random",
         *,
         mappings: MappingsLike = "injective",
         breadth: float = DEFAULT_BREADTH,
@@ -61,6 +73,8 @@ class TIMBREL(MappingTransfer):
         relevance: bool = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
+        use: str = "instances",
+        source_breadth: float = DEFAULT_SOURCE_BREADTH,
     ):
         if isinstance(mapping, str) and mapping not in ("random", "pool"):
             raise ValueError(f'mapping must be an InterTaskMapping, one for each action, "random" or "pool", got {mapping!r}')
@@ -73,14 +87,18 @@ class TIMBREL(MappingTransfer):
             relevance=relevance,
             relevance_fraction=relevance_fraction,
             bandwidths=bandwidths,
+            use=use,
+            source_breadth=source_breadth,
         )
+        if use == "prior" and isinstance(mapping, str) and mapping == "pool":
+            raise ValueError('mapping must be a mapping or "random" with use="prior", got "pool"')
         self.mapping = mapping
 
     def _make_selector(self, task: TargetTask) -> Selector:
         parts = self.candidates, task, self._transitions, self.rng
         if isinstance(self.mapping, str):
             return PooledSelector(*parts) if self.mapping == "pool" else RandomSelector(*parts)
-        n_given = 1 if isinstance(self.mapping, InterTaskMapping | dict) else len(self.mapping)
+        n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
         if n_given not in (1, task.n_actions):
             raise ValueError(
                 f"mapping must be one mapping or one for each of the {task.n_actions} target actions, got {n_given}"
@@ -88,3 +106,15 @@ class TIMBREL(MappingTransfer):
         given = self.candidates.sets[0]
         fixed = [self.candidates.find(a, given[a if n_given > 1 else 0]) for a in range(task.n_actions)]
         return FixedSelector(*parts, fixed=np.array(fixed, dtype=np.int64))
+
+    def _make_prior(self, task: TargetTask) -> SourcePrior:
+        return make_prior(
+            self.source,
+            self.mappings,
+            task,
+            breadth=float(self.source_breadth),
+            given=not isinstance(self.mapping, str),
+            drawn=self.rng if isinstance(self.mapping, str) else None,
+            max_transitions=0,
+            transfer_terminals=self.transfer_terminals,
+        )

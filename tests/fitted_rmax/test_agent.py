@@ -18,11 +18,17 @@ def method(request):
     return request.param
 
 
+@pytest.fixture(params=[0, 1])
+def degree(request):
+    """Of the local model."""
+    return request.param
+
+
 # ---------------------------------------------------------------------- learning
 
 
-def test_the_agent_learns_the_shortest_plan():
-    agent = square_agent()
+def test_the_agent_learns_the_shortest_plan(degree):
+    agent = square_agent(degree=degree)
     lengths = [len(actions) for actions in learn(agent, 25)]
     assert lengths[0] > FEWEST_STEPS
     assert lengths[-3:] == [FEWEST_STEPS] * 3
@@ -54,8 +60,8 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(method):
     assert runs[0] == runs[1] != runs[2]
 
 
-def test_an_agent_of_unknown_actions_tries_each_of_them():
-    agent = make_agent(2, 4, model_breadth=0.15, resolution=3)
+def test_an_agent_of_unknown_actions_tries_each_of_them(degree):
+    agent = make_agent(2, 4, degree=degree, model_breadth=0.15, resolution=3)
     assert {agent.act(START) for _ in range(100)} == {0, 1, 2, 3}, "ties are broken at random"
     assert agent.act(START, explore=False) == agent.act(START, explore=False)
     for action in (0, 1, 3):
@@ -70,10 +76,10 @@ def test_an_agent_of_unknown_actions_tries_each_of_them():
 
 # Without those whose random draws or order of relevance are renewed after loading (see FittedRMax.save).
 @pytest.mark.parametrize("method", sorted(METHODS.keys() - {"TIMBREL random", "COMBREL by relevance"}))
-def test_an_agent_learns_on_from_a_restored_state_as_the_original_bit_for_bit(method):
-    agent = square_agent(method)
+def test_an_agent_learns_on_from_a_restored_state_as_the_original_bit_for_bit(method, degree):
+    agent = square_agent(method, degree=degree)
     learn(agent, 4)
-    restored = square_agent(method, rng=123)
+    restored = square_agent(method, rng=123, degree=degree)
     restored.set_state(copy.deepcopy(agent.get_state()))
     assert_same_state(restored, agent)
     restored.reseed(agent.rng)
@@ -85,8 +91,8 @@ def test_an_agent_learns_on_from_a_restored_state_as_the_original_bit_for_bit(me
     assert_same_state(restored, agent)
 
 
-def test_set_state_forgets_what_was_learned_since(method):
-    agent, untouched = square_agent(method), square_agent(method)
+def test_set_state_forgets_what_was_learned_since(method, degree):
+    agent, untouched = square_agent(method, degree=degree), square_agent(method, degree=degree)
     at_first = copy.deepcopy(agent.get_state())
     learn(agent, 3)
     agent.set_state(at_first)
@@ -94,8 +100,8 @@ def test_set_state_forgets_what_was_learned_since(method):
     assert agent.statistics()["model/instances"] == 0
 
 
-def test_the_state_of_an_agent_is_not_the_agent_s_own_arrays(method):
-    agent = square_agent(method)
+def test_the_state_of_an_agent_is_not_the_agent_s_own_arrays(method, degree):
+    agent = square_agent(method, degree=degree)
     learn(agent, 2)
     state = agent.get_state()
     before = copy.deepcopy(state)
@@ -106,8 +112,8 @@ def test_the_state_of_an_agent_is_not_the_agent_s_own_arrays(method):
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda agent: pickle.loads(pickle.dumps(agent))], ids=["copy", "pickle"])
-def test_a_copied_agent_learns_as_the_original_and_apart_from_it(method, copied):
-    agent = square_agent(method)
+def test_a_copied_agent_learns_as_the_original_and_apart_from_it(method, copied, degree):
+    agent = square_agent(method, degree=degree)
     learn(agent, 2)
     first, second = copied(agent), copied(agent)
     before = copied(agent)
@@ -119,8 +125,8 @@ def test_a_copied_agent_learns_as_the_original_and_apart_from_it(method, copied)
 # ------------------------------------------------------- predictions leave no trace
 
 
-def test_predictions_in_between_change_nothing_that_is_learned_bit_for_bit(method):
-    agent, interrupted = square_agent(method), square_agent(method)
+def test_predictions_in_between_change_nothing_that_is_learned_bit_for_bit(method, degree):
+    agent, interrupted = square_agent(method, degree=degree), square_agent(method, degree=degree)
     memory, others = EpisodeMemory(), np.random.default_rng(5)
 
     def predict(state):
@@ -149,8 +155,8 @@ def test_sampled_actions_are_optimistic_first_and_random_among_the_best():
 # -------------------------------------------------------------------- statistics
 
 
-def test_statistics_are_those_of_model_and_planner(method):
-    agent = square_agent(method)
+def test_statistics_are_those_of_model_and_planner(method, degree):
+    agent = square_agent(method, degree=degree)
     n_steps = sum(map(len, learn(agent, 3)))
     figures = agent.statistics()
     known, modelled = agent.model.known, agent.mdp.arrays.modelled

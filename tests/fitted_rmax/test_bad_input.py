@@ -140,6 +140,23 @@ BAD_ARGUMENTS = [
     ("min_fraction", None),
     ("min_weight", 0.0),
     ("min_weight", 1.0),
+    ("degree", 2),
+    ("degree", -1),
+    ("degree", True),
+    ("degree", np.True_),
+    ("degree", 0.5),
+    ("degree", "linear"),
+    ("degree", None),
+    ("degree", [1]),
+    ("degree", np.array([1])),
+    ("n_neighbors", 1),
+    ("n_neighbors", 7.5),
+    ("n_neighbors", True),
+    ("n_neighbors", "all"),
+    ("outcome_breadth", 0.0),
+    ("outcome_breadth", -0.1),
+    ("outcome_breadth", np.nan),
+    ("outcome_breadth", None),
     ("exploration_threshold", 0.0),
     ("exploration_threshold", -1.0),
     ("resolution", 0),
@@ -178,7 +195,8 @@ def test_total_timesteps_must_be_at_least_1(steps):
         model.learn(steps)
 
 
-def test_arguments_may_be_numpy_numbers():
+@pytest.mark.parametrize("degree", [0, 1])
+def test_arguments_may_be_numpy_numbers(degree):
     model = FittedRMax(
         Scripted(),
         model_breadth=np.float32(0.2),
@@ -186,6 +204,9 @@ def test_arguments_may_be_numpy_numbers():
         gamma=np.float64(0.9),
         max_backups=np.int32(5),
         max_instances=np.int64(100),
+        degree=np.int64(degree),
+        n_neighbors=np.int32(8),
+        outcome_breadth=np.float32(0.1),
         seed=0,
     )
     model.learn(20)
@@ -207,12 +228,14 @@ def test_a_grid_that_does_not_fit_in_memory_is_refused_with_its_size_and_one_tha
         FittedRMax(Scripted(n_variables=4), resolution=[12, 12, 12, 12])
 
 
-def test_a_resolution_too_coarse_for_the_breadth_gives_a_warning_that_names_better_ones():
-    with pytest.warns(UserWarning, match=r"resolution=2 is coarse for model_breadth=0.05.*resolution=4 or model_breadth="):
-        FittedRMax(Scripted(), model_breadth=0.05, resolution=2)
+@pytest.mark.parametrize(("degree", "fine"), [(0, 4), (1, 5)])
+def test_a_resolution_too_coarse_for_the_breadth_gives_a_warning_that_names_better_ones(degree, fine):
+    better = rf"resolution=2 is coarse for model_breadth=0.05.*resolution={fine} or model_breadth="
+    with pytest.warns(UserWarning, match=better):
+        FittedRMax(Scripted(), model_breadth=0.05, resolution=2, degree=degree)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        FittedRMax(Scripted(), model_breadth=0.05, resolution=4)
+        FittedRMax(Scripted(), model_breadth=0.05, resolution=fine, degree=degree)
 
 
 @pytest.mark.parametrize(("reward", "max_value", "warns"), [(1.0, 3.0, True), (1.0, 12.0, False), (-1.0, 0.0, False)])

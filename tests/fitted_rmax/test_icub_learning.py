@@ -17,24 +17,34 @@ def lengths(env_id, n_episodes, seed, **kwargs):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("settings", [dict(degree=0, model_breadth=0.1), dict(model_breadth=0.1), {}], ids=str)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_torso_is_learned_within_thirty_episodes(seed):
+def test_the_torso_is_learned_within_thirty_episodes(seed, settings):
     """The shortest plan has 25 commands."""
-    assert np.median(lengths(TORSO, 30, seed, model_breadth=0.1)[-5:]) <= 27
+    assert np.median(lengths(TORSO, 30, seed, **settings)[-5:]) <= 27
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_arm_is_learned_within_sixty_episodes(seed):
+def test_the_arm_is_learned_within_sixty_episodes_by_the_kernel_average(seed):
     """The shortest plans have 27 to 29 commands."""
-    assert np.median(lengths(ARM, 60, seed, model_breadth=0.2)[-5:]) <= 32
+    assert np.median(lengths(ARM, 60, seed, degree=0, model_breadth=0.2)[-5:]) <= 29
 
 
 @pytest.mark.slow
-def test_exploration_ends_though_the_kernel_is_narrow():
+@pytest.mark.parametrize(("settings", "most"), [(dict(model_breadth=0.2), 35), ({}, 45)], ids=str)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_arm_is_learned_within_sixty_episodes(seed, settings, most):
+    """In fewer steps than by the kernel average; but with some seeds the local linear model settles for longer plans."""
+    assert np.median(lengths(ARM, 60, seed, **settings)[-5:]) <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [0, 1])
+def test_exploration_ends_though_the_kernel_is_narrow(degree):
     """What is within reach cannot all become known with the full threshold: 300 episodes of 400 steps were not enough."""
     with pytest.warns(UserWarning, match="coarse"):
-        steps = lengths(ARM, 150, 1, model_breadth=0.05)
+        steps = lengths(ARM, 150, 1, model_breadth=0.05, degree=degree)
     assert np.median(steps[-10:]) <= 45
 
 
@@ -44,8 +54,11 @@ def end_episodes(agent, n):
         agent.end_episode(truncated=True)
 
 
-def test_time_limits_lower_the_threshold_of_the_model():
-    agent = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(400).agent
+# What part of the weight at exact states a grid point needs, once rewards have differed (see models.local_linear).
+@pytest.mark.parametrize(("degree", "part"), [(0, 1.0), (1, 0.5)])
+def test_time_limits_lower_the_threshold_of_the_model(degree, part):
+    agent = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, degree=degree, seed=0).learn(400).agent
+    assert len(np.unique(agent.get_state()["instances"][:, -3])) > 1, "rewards have differed"
     known = agent.model.known.copy()
     end_episodes(agent, DECAY_AFTER_EPISODES - agent.n_truncated)
     np.testing.assert_array_equal(agent.model.known, known)
@@ -53,17 +66,20 @@ def test_time_limits_lower_the_threshold_of_the_model():
     end_episodes(agent, 40)
     threshold = agent.statistics()["model/threshold"]
     assert threshold == pytest.approx(0.98**40)
-    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= threshold))
+    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= part * threshold))
     assert agent.model.known.sum() > known.sum()
     np.testing.assert_array_equal(agent.mdp.arrays.modelled, agent.model.known)
     agent.n_truncated = 10**6
     end_episodes(agent, 1)
-    min_weight = agent.settings.min_weight
+    min_weight = agent.model_settings.min_weight
     assert (agent.model.known == (agent.model.own_weight >= min_weight)).all(), "in the end any instance that counts suffices"
 
 
-def test_the_lowered_threshold_is_saved(tmp_path):
-    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, seed=0).learn(50)
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("n_steps", [50, 400])
+def test_the_lowered_threshold_is_saved(degree, n_steps, tmp_path):
+    """Before and after the ball has been struck for the first time."""
+    model = FittedRMax(make_vec_env(TORSO), max_value=100.0, model_breadth=0.1, degree=degree, seed=0).learn(n_steps)
     end_episodes(model.agent, DECAY_AFTER_EPISODES + 3)
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model")

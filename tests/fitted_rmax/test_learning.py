@@ -39,6 +39,7 @@ def mountain_car_2d(seed, n_episodes):
         n_episodes,
         seed,
         dict(start="fixed"),
+        degree=0,
         model_breadth=1 / 16,
         resolution=4,
         min_fraction=0.01,
@@ -57,6 +58,22 @@ def test_mountain_car_2d_is_learned_within_ten_episodes():
 
 def test_the_goal_of_mountain_car_4d_is_found_in_the_first_episode():
     assert mountain_car_4d(0, 1)[0] < 1100
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_mountain_car_2d_is_learned_within_ten_episodes_with_default_parameters(seed):
+    """The shortest plan has 103 steps."""
+    lengths = lengths_of_episodes("combrel/MountainCar2D-v0", 20, seed, dict(start="fixed"))
+    assert lengths[:10].mean() <= 135
+    assert lengths[10:].mean() <= 106
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_mountain_car_4d_is_learned_within_twelve_episodes_with_default_parameters(seed):
+    """The shortest plans have some 180 steps."""
+    lengths = lengths_of_episodes("combrel/MountainCar4D-v0", 12, seed)
+    assert lengths[0] <= 700
+    assert lengths.sum() <= 3300
 
 
 @pytest.mark.slow
@@ -89,18 +106,20 @@ def test_mountain_car_v0_is_solved_with_default_parameters(seed):
     assert returns_in_evaluation("MountainCar-v0", 3000, seed).mean() >= -110
 
 
+CART_POLE = dict(bounds=CART_POLE_BOUNDS, gamma=0.99, max_value=100)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_cart_pole_is_solved(seed):
+def test_cart_pole_is_solved_by_the_kernel_average(seed):
     """Solved is 475. A pole falls anywhere alike: with wide bounds for the position, its instances count farther along it."""
-    returns = returns_in_evaluation(
-        "CartPole-v1",
-        4000,
-        seed,
-        bounds=CART_POLE_BOUNDS,
-        gamma=0.99,
-        max_value=100,
-        exploration_threshold=0.5,
-        resolution=4,
-    )
-    assert returns.mean() >= 475
+    settings = dict(degree=0, exploration_threshold=0.5, resolution=4)
+    assert returns_in_evaluation("CartPole-v1", 4000, seed, **CART_POLE, **settings).mean() >= 475
+
+
+@pytest.mark.slow
+def test_cart_pole_is_learned_with_default_parameters():
+    """Three of five seeds solve it, with 475 or more; the worst has 427."""
+    means = np.array([returns_in_evaluation("CartPole-v1", 4000, seed, **CART_POLE).mean() for seed in SEEDS])
+    assert (means >= 400).all()
+    assert means.mean() >= 460

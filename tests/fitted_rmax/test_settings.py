@@ -15,11 +15,20 @@ from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.models.kernel_average import KernelAverage
+from sb3_combrel.models.local_linear import LocalLinear
 
 BAD_SETTINGS = [
+    ("degree", 2),
+    ("degree", True),
+    ("degree", "linear"),
     ("model_breadth", -0.1),
     ("min_fraction", 1.1),
     ("min_weight", 1.0),
+    ("min_weight", 0.0),
+    ("n_neighbors", 1),
+    ("n_neighbors", 2.5),
+    ("outcome_breadth", 0.0),
     ("exploration_threshold", 0.0),
     ("max_value", np.nan),
     ("gamma", 1.5),
@@ -55,7 +64,7 @@ def test_settings_cannot_be_changed_afterwards():
 def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
     defaults = FittedRMaxSettings()
     of_fitted_rmax = inspect.signature(FittedRMax).parameters
-    assert len(FittedRMaxSettings.names()) == 12
+    assert len(FittedRMaxSettings.names()) == 15
     for name in FittedRMaxSettings.names():
         assert of_fitted_rmax[name].default == getattr(defaults, name), name
     # The policy hands on what it is given, and has no defaults of its own.
@@ -67,11 +76,47 @@ def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
     assert FittedRMaxAgent(defaults, task).model_settings == defaults.model_settings(1)
 
 
-@pytest.mark.parametrize(("n_variables", "breadth", "backups"), [(1, 0.09, 200), (2, 0.09, 100), (3, 0.15, 50), (4, 0.2, 25)])
-def test_breadth_and_backups_depend_on_the_number_of_variables_unless_given(n_variables, breadth, backups):
-    defaults, given = FittedRMaxSettings(), FittedRMaxSettings(model_breadth=0.3, max_backups=0)
+@pytest.mark.parametrize(
+    ("degree", "n_variables", "breadth", "backups"),
+    [
+        (0, 1, 0.09, 200),
+        (0, 2, 0.09, 100),
+        (0, 3, 0.15, 50),
+        (0, 4, 0.2, 25),
+        (0, 6, 0.2, 6),
+        (1, 1, 0.15, 800),
+        (1, 2, 0.15, 400),
+        (1, 3, 0.25, 200),
+        (1, 4, 0.4, 100),
+        (1, 5, 0.4, 50),
+        (1, 6, 0.5, 25),
+        (1, 7, 0.5, 12),
+    ],
+)
+def test_breadth_and_backups_depend_on_degree_and_number_of_variables_unless_given(degree, n_variables, breadth, backups):
+    defaults = FittedRMaxSettings(degree=degree)
+    given = FittedRMaxSettings(degree=degree, model_breadth=0.3, max_backups=0)
     assert (defaults.breadth_for(n_variables), defaults.backups_for(n_variables)) == (breadth, backups)
     assert (given.breadth_for(n_variables), given.backups_for(n_variables)) == (0.3, 0)
+    assert defaults.model_settings(n_variables).model_breadth == breadth
+
+
+@pytest.mark.parametrize(("n_variables", "n_neighbors"), [(1, 16), (2, 16), (3, 24), (4, 30), (5, 40), (6, 60), (9, 60)])
+def test_the_number_of_neighbors_depends_on_the_number_of_variables_unless_given(n_variables, n_neighbors):
+    assert FittedRMaxSettings().model_settings(n_variables).n_neighbors == n_neighbors
+    assert FittedRMaxSettings(n_neighbors=7).model_settings(n_variables).n_neighbors == 7
+
+
+@pytest.mark.parametrize(("degree", "min_weight"), [(0, 0.01), (1, 0.05)])
+def test_the_least_weight_that_counts_depends_on_the_degree_unless_given(degree, min_weight):
+    assert FittedRMaxSettings(degree=degree).model_settings(2).min_weight == min_weight
+    assert FittedRMaxSettings(degree=degree, min_weight=0.2).model_settings(2).min_weight == 0.2
+
+
+def test_the_degree_decides_which_model_is_learned():
+    assert type(make_agent(2, 4).model) is LocalLinear
+    assert type(make_agent(2, 4, degree=1).model) is LocalLinear
+    assert type(make_agent(2, 4, degree=0).model) is KernelAverage
 
 
 def test_a_task_has_names_for_its_variables_and_actions():

@@ -64,7 +64,7 @@ class TestResolve:
     @pytest.mark.parametrize(
         ("mappings", "message"),
         [
-            ("bijective", "one of injective, .*, signed_injective, .*, paper_mountain_car, paper_icub, got 'bijective'"),
+            ("bijective", "one of injective, .*, signed_injective, .*, paper_icub; .*factored.* got 'bijective'"),
             (3, "mappings must be a name, .* got 3"),
             ([], "at least one InterTaskMapping"),
             ([3], "each of the mappings must be"),

@@ -20,6 +20,7 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     agent = make_agent(
         n_variables,
         N_ACTIONS,
+        degree=0,
         model_breadth=kernel["breadth"],
         min_weight=kernel["min_weight"],
         min_fraction=kernel["min_fraction"],
@@ -201,9 +202,14 @@ def test_q_does_not_depend_on_the_states_asked_for_before():
 HERE, ELSEWHERE = np.array([0.3]), np.array([0.7])
 
 
-def line_agent(transfer=None):
-    """On a line, with actions 0 and 1."""
-    return make_agent(1, 2, transfer, model_breadth=0.05, resolution=4)
+@pytest.fixture(params=[0, 1])
+def line_agent(request):
+    """Makes an agent on a line, with actions 0 and 1."""
+
+    def make(transfer=None):
+        return make_agent(1, 2, transfer, degree=request.param, model_breadth=0.05, resolution=4)
+
+    return make
 
 
 def learn_to_move(agent):
@@ -221,7 +227,7 @@ def ends_anywhere(reward):
     return TIMBREL(source, InterTaskMapping([0], [0, 1]))
 
 
-def test_an_evaluation_prefers_known_actions_to_transferred_ones_that_look_better():
+def test_an_evaluation_prefers_known_actions_to_transferred_ones_that_look_better(line_agent):
     agent = line_agent(ends_anywhere(-1.0))
     agent.prepare()
     learn_to_move(agent)
@@ -231,14 +237,14 @@ def test_an_evaluation_prefers_known_actions_to_transferred_ones_that_look_bette
     assert agent.act(ELSEWHERE, explore=False) == 1, "where nothing is known, the best of what was transferred"
 
 
-def test_an_evaluation_takes_a_transferred_end_that_is_worth_as_much_as_optimism():
+def test_an_evaluation_takes_a_transferred_end_that_is_worth_as_much_as_optimism(line_agent):
     agent = line_agent(ends_anywhere(0.0))
     agent.prepare()
     assert agent.q_values(HERE)[1] == agent.planner.bounds[1] > agent.q_values(HERE)[0]
     assert agent.act(HERE, explore=False) == 1
 
 
-def test_an_evaluation_takes_a_known_end_that_is_worth_as_much_as_optimism():
+def test_an_evaluation_takes_a_known_end_that_is_worth_as_much_as_optimism(line_agent):
     agent = line_agent()
     learn_to_move(agent)
     assert agent.act(HERE, explore=False) == 0, "action 1 is optimistic: where it leads is not known"

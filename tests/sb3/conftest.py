@@ -1,20 +1,34 @@
-"""Every test that takes ``make`` runs without transfer, with TIMBREL and with COMBREL."""
+"""Every test that takes ``make`` runs without transfer, with TIMBREL and with COMBREL, and twice with the kernel average."""
 
 import pytest
 from helpers.walk import METHODS, small
 
+CASES = {**{name: (name, 1) for name in METHODS}, "none, degree 0": ("none", 0), "COMBREL, degree 0": ("COMBREL", 0)}
 
-@pytest.fixture(params=METHODS)
-def method(request):
-    """The name of a method."""
-    return request.param
+
+@pytest.fixture(params=CASES)
+def case(request):
+    """The name of a method, and the degree of the local model."""
+    return CASES[request.param]
 
 
 @pytest.fixture
-def make(method):
+def method(case):
+    """The name of a method."""
+    return case[0]
+
+
+@pytest.fixture
+def degree(case):
+    """The degree of the local model."""
+    return case[1]
+
+
+@pytest.fixture
+def make(method, degree):
     """Makes a model for the walk, or for the environment given."""
 
     def make(env=None, **kwargs):
-        return small(env, **{"transfer": METHODS[method]()} | kwargs)
+        return small(env, **{"transfer": METHODS[method](), "degree": degree} | kwargs)
 
     return make

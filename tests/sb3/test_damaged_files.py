@@ -234,7 +234,7 @@ def test_without_exact_match_what_is_not_given_stays_and_what_is_unknown_is_igno
         ({"net_arch": [64]}, "policy_kwargs must have names out of .*model_class.*, got 'net_arch'"),
         ({3: 4}, "policy_kwargs must have names out of .*, got 3"),
         ({"gamma": 0.9}, r"policy_kwargs must not have 'gamma': pass gamma=\.\.\. to FittedRMax itself"),
-        ({"model_class": "KernelAverage"}, "model_class must be a subclass of Model, got 'KernelAverage'"),
+        ({"model_class": "KernelAverage"}, "model_class must be a subclass of Model or None, got 'KernelAverage'"),
         ({"model_class": FittedRMaxPolicy}, "model_class must be a subclass of Model"),
         ({"state_names": 3}, "state_names must be"),
         ({"action_names": ["one"]}, "action_names must be 2 names"),

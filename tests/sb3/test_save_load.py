@@ -13,10 +13,48 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_combrel import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
-ARGUMENTS = ("min_fraction", "model_breadth", "resolution", "max_backups", "gamma", "max_value", "num_timesteps", "seed")
+ARGUMENTS = (
+    "degree",
+    "min_fraction",
+    "model_breadth",
+    "resolution",
+    "max_backups",
+    "gamma",
+    "max_value",
+    "num_timesteps",
+    "seed",
+)
 
 
-def test_save_and_load_keep_everything(make, method, tmp_path):
+# What each model has of its pairs, by the degree.
+OF_MODEL = {
+    0: ("entry", "total", "known", "last_total"),
+    1: ("sums", "outcome", "fit", "row", "reach", "scale", "n_counted", "limit", "total", "last_total", "known", "target"),
+}
+
+
+def assert_same_model(one, other):
+    """The models of two agents, and the finite MDPs made of them, are the same bit for bit."""
+    degree = one.settings.degree
+    ours, theirs = ((agent.model.fits if degree else agent.model.arrays) for agent in (one, other))
+    used = np.arange(one.model.instances.capacity) < one.model.instances.size[:, None]
+    # Only a transfer method is asked again for pairs whose weight has changed since.
+    unused = () if degree == 0 or one.transfer is not None else ("last_total",)
+    for name in sorted(set(OF_MODEL[degree]) - set(unused)):
+        mine, its = getattr(ours, name), getattr(theirs, name)
+        if name == "target":
+            mine, its = mine[used], its[:, : mine.shape[1]][used]
+        np.testing.assert_array_equal(mine, its, err_msg=name)
+    for name in ("modelled", "reward", "n_optimistic"):
+        np.testing.assert_array_equal(getattr(one.mdp.arrays, name), getattr(other.mdp.arrays, name), err_msg=name)
+    lists = [(one.mdp.arrays.rows, other.mdp.arrays.rows), *([] if degree else [(ours.lists, theirs.lists)])]
+    for mine, its in lists:
+        for pair in range(len(mine.start)):
+            for array, expected in zip(mine.entries(pair), its.entries(pair), strict=True):
+                np.testing.assert_array_equal(array, expected)
+
+
+def test_save_and_load_keep_everything(make, tmp_path):
     model = make(max_backups=3).learn(10**6, callback=StopTrainingOnMaxEpisodes(8))
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
@@ -31,21 +69,7 @@ def test_save_and_load_keep_everything(make, method, tmp_path):
     for observation in OBSERVATIONS:
         unit = model.policy.to_unit(observation)
         np.testing.assert_array_equal(loaded.agent.q_values(unit), model.agent.q_values(unit))
-    for array in ("entry", "total", "known", "last_total"):
-        np.testing.assert_array_equal(
-            getattr(loaded.agent.model.arrays, array), getattr(model.agent.model.arrays, array), err_msg=array
-        )
-    for array in ("modelled", "reward", "n_optimistic"):
-        np.testing.assert_array_equal(
-            getattr(loaded.agent.mdp.arrays, array), getattr(model.agent.mdp.arrays, array), err_msg=array
-        )
-    for ours, theirs in (
-        (loaded.agent.model.arrays.lists, model.agent.model.arrays.lists),
-        (loaded.agent.mdp.arrays.rows, model.agent.mdp.arrays.rows),
-    ):
-        for pair in range(len(ours.start)):
-            for mine, other in zip(ours.entries(pair), theirs.entries(pair), strict=True):
-                np.testing.assert_array_equal(mine, other)
+    assert_same_model(loaded.agent, model.agent)
     n = model.num_timesteps
     loaded.learn(50, reset_num_timesteps=False)
     assert loaded.num_timesteps == loaded.agent.model.n_instances == n + 50
@@ -143,13 +167,27 @@ def test_random_numbers_go_on_where_they_were_unless_a_seed_is_given(make, tmp_p
 
 
 def test_pairs_that_are_known_by_history_alone_are_saved(tmp_path):
-    model = small(min_fraction=0.6, model_breadth=0.5, resolution=1)
+    """A nearer instance shortens the list of a kernel average."""
+    model = small(degree=0, min_fraction=0.6, model_breadth=0.5, resolution=1)
     for state, next_state in [(0.1, 0.2), (0.1, 0.2), (0.45, 0.95)]:
         model.agent.update(np.array([state, 0.5]), 0, -1.0, np.array([next_state, 0.5]), False)
     agent_model = model.agent.model
     assert (agent_model.known & (agent_model.own_weight < 1.0)).any(), "the case that this test is about"
     model.save(tmp_path / "model")
     np.testing.assert_array_equal(FittedRMax.load(tmp_path / "model").agent.model.known, agent_model.known)
+
+
+def test_grid_points_that_are_known_from_visits_alone_are_saved_and_so_are_the_visits(tmp_path):
+    model = small().learn(60)
+    agent_model, visits = model.agent.model, model.agent.visits.counts
+    some = np.flatnonzero(~agent_model.known & (agent_model.own_weight > 0.0))[:3]
+    np.testing.assert_array_equal(agent_model.accept(some), some)
+    assert (agent_model.own_weight[some] < agent_model.exploration_threshold).all(), "the case that this test is about"
+    visits[:] = np.arange(len(visits))
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model").agent
+    np.testing.assert_array_equal(loaded.model.known, agent_model.known)
+    np.testing.assert_array_equal(loaded.visits.counts, visits)
 
 
 def test_a_full_model_with_a_cap_on_instances_survives_saving(make, tmp_path):

@@ -1,0 +1,62 @@
+"""Sources that mislead: what a transfer method must not lose by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from sb3_combrel.sources.source_instances import SourceInstances
+
+#: Standard deviation of the effects of ``noise``, in parts of the range of each variable.
+NOISE = 0.03
+
+
+def noise(source: SourceInstances) -> SourceInstances:
+    """Effects are random, of about the size that effects have."""
+    rng = np.random.default_rng(0)
+    scale = NOISE * (source.scaling.high - source.scaling.low)
+    after = source.states + scale * rng.standard_normal(source.states.shape)
+    return replace(source, next_states=np.clip(after, source.scaling.low, source.scaling.high))
+
+
+def shuffled(source: SourceInstances) -> SourceInstances:
+    """Each transition has the effect, the reward and the end of another one."""
+    order = np.random.default_rng(0).permutation(len(source))
+    effect = (source.next_states - source.states)[order]
+    after = np.clip(source.states + effect, source.scaling.low, source.scaling.high)
+    return replace(source, next_states=after, rewards=source.rewards[order], terminated=source.terminated[order])
+
+
+def mirrored(source: SourceInstances) -> SourceInstances:
+    """Every effect has the other sign."""
+    after = np.clip(2.0 * source.states - source.next_states, source.scaling.low, source.scaling.high)
+    return replace(source, next_states=after)
+
+
+def wrong_goal(source: SourceInstances) -> SourceInstances:
+    """The dynamics are right; episodes end where the first variable is low instead of where they do."""
+    low = np.quantile(source.next_states[:, 0], 0.1)
+    return replace(source, terminated=source.next_states[:, 0] <= low)
+
+
+def wrong_rewards(source: SourceInstances) -> SourceInstances:
+    """The dynamics are right, rewards have the other sign."""
+    return replace(source, rewards=-source.rewards)
+
+
+def few(source: SourceInstances) -> SourceInstances:
+    """Twenty instances only."""
+    return source.subset(20, seed=0)
+
+
+#: By name; each makes a misleading source of a good one.
+MISLEADING: dict[str, Callable[[SourceInstances], SourceInstances]] = {
+    "noise": noise,
+    "shuffled": shuffled,
+    "mirrored": mirrored,
+    "wrong-goal": wrong_goal,
+    "wrong-rewards": wrong_rewards,
+    "few": few,
+}

@@ -1,0 +1,133 @@
+"""Factored mappings: the target's variables divided among copies of the source, each moved by an action of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+
+
+@dataclass(frozen=True, repr=False)
+class FactoredMapping:
+    """
+    The target's variables divided among copies of the source, each moved by a source action of its own.
+
+    MountainCar4D is two cars of MountainCar2D: East is Right on (x, vx) and Neutral on (y, vy). Each copy is an
+    :class:`InterTaskMapping`: its mapped variables are those of the copy, its actions what each target action does to it.
+    What the target does is what all copies do at once: their displacements together, the mean of their rewards, and an end
+    where all of them end. A variable in no copy stays as it is.
+
+    A copy may leave out source variables. The source is then seen through the others alone: it is fitted to them, over all
+    that its instances have in those that are left out.
+
+    :param copies: inter-task mappings, or dicts of their arguments as in a YAML file
+    :raises ValueError: if there is no copy, if copies differ in their numbers of target variables or actions, or if two have
+        a target variable in common
+    """
+
+    copies: tuple[InterTaskMapping, ...]
+
+    def __post_init__(self) -> None:
+        if isinstance(self.copies, str | Mapping | InterTaskMapping) or not isinstance(self.copies, Iterable):
+            raise ValueError(f"copies must be a list of inter-task mappings, one a copy of the source, got {self.copies!r}")
+        copies = tuple(_copy(each) for each in self.copies)
+        if not copies:
+            raise ValueError("copies must hold at least one inter-task mapping, got none")
+        first = copies[0]
+        for each in copies:
+            if len(each.state) != len(first.state) or len(each.action) != len(first.action):
+                raise ValueError(
+                    f"copies must all have the same numbers of target variables and actions, got {first!r} and {each!r}"
+                )
+        shared = np.flatnonzero(np.sum([each.mapped for each in copies], axis=0) > 1)
+        if len(shared):
+            raise ValueError(f"copies must have no target variable in common, got variable {shared[0]} in two of {copies!r}")
+        object.__setattr__(self, "copies", tuple(sorted(copies, key=lambda each: int(each.mapped.argmax()))))
+
+    @property
+    def n_target_variables(self) -> int:
+        """Number of variables of the target task."""
+        return self.copies[0].n_target_variables
+
+    @property
+    def n_target_actions(self) -> int:
+        """Number of actions of the target task."""
+        return self.copies[0].n_target_actions
+
+    def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
+        """
+        Check every copy against the spaces of the two tasks.
+
+        :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
+        """
+        for each in self.copies:
+            each.check(
+                n_source_variables=n_source_variables,
+                n_target_variables=n_target_variables,
+                n_source_actions=n_source_actions,
+                n_target_actions=n_target_actions,
+            )
+
+    def with_names(
+        self,
+        source_variables: Iterable[str],
+        target_variables: Iterable[str],
+        source_actions: Iterable[str],
+        target_actions: Iterable[str],
+    ) -> FactoredMapping:
+        """The same mapping with names for ``repr``; see :meth:`InterTaskMapping.with_names`."""
+        names = tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions)
+        return FactoredMapping(tuple(each.with_names(*names) for each in self.copies))
+
+    def __repr__(self) -> str:
+        if any(each.names is None for each in self.copies):
+            return f"FactoredMapping({list(self.copies)!r})"
+        names = self.copies[0].names
+        assert names is not None
+        moves = [(describe_copy(each), [each.names.source_actions[u] for u in each.action]) for each in self.copies]  # type: ignore[union-attr]
+        return describe_actions(names.target_actions, moves)
+
+
+def describe_copy(copy: InterTaskMapping) -> str:
+    """
+    Name the target variables of a copy, in the order of the source's variables: "(x, vx)"; a mirrored one as "-x".
+
+    :param copy: with names
+    """
+    assert copy.names is not None
+    order = sorted((k, v) for v, k in enumerate(copy.state) if k is not None)
+    signs = copy.state_sign
+    return f"({', '.join(('-' if signs[v] < 0 else '') + copy.names.target_variables[v] for _, v in order)})"
+
+
+def describe_actions(target_actions: Sequence[str], moves: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """
+    Say what each target action does to each copy: "East: Right on (x, vx), Neutral on (y, vy); West: ...".
+
+    :param target_actions: names of the target actions
+    :param moves: of each copy its variables as text, and the name of its source action for each target action
+    """
+    lines = (
+        f"{name}: " + ", ".join(f"{actions[a]} on {variables}" for variables, actions in moves)
+        for a, name in enumerate(target_actions)
+    )
+    return "; ".join(lines)
+
+
+def _copy(copy: InterTaskMapping | Mapping[str, Any]) -> InterTaskMapping:
+    if isinstance(copy, InterTaskMapping):
+        return copy
+    if isinstance(copy, Mapping) and {"state", "action"} <= set(copy) <= {"state", "action", "sign"}:
+        return InterTaskMapping(**copy)
+    raise ValueError(
+        f"each of the copies must be an InterTaskMapping or a dict of state, action and (optional) sign, got {copy!r}"
+    )
+
+
+register_writer(FactoredMapping, lambda mapping: ("FactoredMapping", {"copies": list(mapping.copies)}))
+register_reader("FactoredMapping", FactoredMapping)

@@ -1,0 +1,111 @@
+"""Whether the target's own transitions bear out the ends and rewards that a source predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# A transition is predicted to end the episode above the first, and not to end it below the second: between them, at the
+# border of where episodes end, a kernel average decides nothing.
+ENDS, GOES_ON = 0.5, 0.1
+# So many steps in a row where an end is predicted, and none comes, contradict it once.
+STEPS_OF_A_VISIT = 10
+# So many episodes that ran into their time limit, and never an end where one is predicted.
+EPISODES_IN_VAIN = 3
+MIN_REWARDS = 10
+
+
+class Outcomes:
+    """
+    Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
+
+    *Ends.* An episode that ends where that is predicted confirms it. It is contradicted by an episode that ends where none is
+    predicted, and by each visit to where one is predicted that leaves without an end or stays for long. Visits are counted,
+    not steps: the border of where episodes end is blurred in a kernel average.
+
+    *Rewards.* Each transition confirms or contradicts the predicted reward, by whether it is off by more than half a standard
+    deviation of the source's rewards plus a tenth of their mean size.
+
+    Both are :attr:`doubted` once contradictions outnumber confirmations, for as long as they do. Ends that were never
+    confirmed nor contradicted are believed by half: a transition that may end is worth a visit, which settles it, so what the
+    source says of it is not taken for known; that others do not end is. That alone could go on for ever, where the source is
+    wrong about what leads to an end. So if ``EPISODES_IN_VAIN`` episodes have run into their time limit, never an end was
+    confirmed, and all rewards were alike, so that nothing but an end tells good states from bad ones, they are doubted.
+
+    :param rewards: of the source's instances, shape (n,)
+    :param threshold: weight from which on the source has data
+    """
+
+    def __init__(self, rewards: np.ndarray, threshold: float):
+        self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
+        self.threshold = threshold
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all transitions."""
+        self.confirmed = 0
+        self.contradicted = 0
+        self.rewards_right = 0
+        self.rewards_wrong = 0
+        self.in_vain = 0
+        self.steps_of_visit = 0
+        self.reward_range = (np.inf, -np.inf)
+
+    def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
+        """
+        Take in a transition of the target.
+
+        :param weight: of the source's data there
+        :param end: probability of termination that it predicts
+        :param reward: raw
+        """
+        self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
+        founded = weight >= self.threshold
+        if founded:
+            if abs(reward - predicted_reward) > self.tolerance:
+                self.rewards_wrong += 1
+            else:
+                self.rewards_right += 1
+        if terminated:
+            if end >= GOES_ON or self.steps_of_visit:
+                self.confirmed += 1
+            elif founded:
+                self.contradicted += 1
+            self.steps_of_visit = 0
+        elif (founded and end > ENDS) or (self.steps_of_visit and end >= GOES_ON):
+            self.steps_of_visit += 1
+            self.contradicted += self.steps_of_visit % STEPS_OF_A_VISIT == 0
+        else:
+            self._leave()
+
+    def end_episode(self, truncated: bool) -> None:
+        """Take in the end of an episode; ``truncated``: by its time limit."""
+        if truncated:
+            self._leave()
+            self.in_vain += self.confirmed == 0
+
+    def _leave(self) -> None:
+        self.contradicted += 0 < self.steps_of_visit < STEPS_OF_A_VISIT
+        self.steps_of_visit = 0
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the source's ends and rewards are not to be used."""
+        low, high = self.reward_range
+        nothing_found = self.confirmed == 0 and self.in_vain >= EPISODES_IN_VAIN and not high - low > 1e-9
+        rewards = self.rewards_right + self.rewards_wrong
+        return (
+            self.contradicted > self.confirmed
+            or (rewards >= MIN_REWARDS and self.rewards_wrong > self.rewards_right)
+            or nothing_found
+        )
+
+    def get_state(self) -> np.ndarray:
+        """What was counted, float64, shape (8,)."""
+        counts = self.confirmed, self.contradicted, self.rewards_right, self.rewards_wrong, self.in_vain, self.steps_of_visit
+        return np.array([*counts, *np.clip(self.reward_range, -1e300, 1e300)], dtype=np.float64)
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Take over what :meth:`get_state` returned."""
+        counts = [int(value) for value in state[:6]]
+        self.confirmed, self.contradicted, self.rewards_right, self.rewards_wrong, self.in_vain, self.steps_of_visit = counts
+        self.reward_range = float(state[6]), float(state[7])

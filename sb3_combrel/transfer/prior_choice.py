@@ -1,0 +1,194 @@
+"""Which copies of the source the target is made of, and which source action moves each: chosen by compliance, or drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.transfer.copies import Copies, CopySums
+
+# A mean compliance below this counts as this: one that is nothing must not outweigh all others.
+SMALLEST_COMPLIANCE = 1e-9
+# By this factor, for each of its variables, a copy must comply better than "they stay": each copy can choose among source
+# actions, and so complies a little better with noise.
+MIN_GAIN = 1.05
+# Divisions are searched subset by subset of the target's variables.
+MAX_FACTORED_VARIABLES = 12
+
+
+class Choice(NamedTuple):
+    """What each target action is made of.
+
+    :param copies: int64, shape (n_target_actions, n): copies that it moves, -1 for none
+    :param actions: int64, same shape: the source action that moves each, -1 where none has been chosen so far
+    """
+
+    copies: np.ndarray
+    actions: np.ndarray
+
+    def same(self, other: Choice | None) -> bool:
+        """Whether another choice is the same."""
+        return other is not None and all(np.array_equal(one, two) for one, two in zip(self, other, strict=True))
+
+
+Chooser = Callable[[CopySums], Choice]
+
+
+def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Find the source action of highest mean compliance for each copy and target action, each on its own.
+
+    :param allowed: bool, shape (n_copies, n_target_actions, most source actions): what may be chosen; None: everything
+    :return: the actions, int64, shape (n_copies, n_target_actions), -1 where none is allowed or no transition has the target
+        action; and their mean compliances
+    """
+    exists = np.arange(copies.most_actions) < copies.table.n_actions[:, None, None]
+    exists = np.broadcast_to(exists, sums.compliance.shape)
+    mean = sums.compliance / np.maximum(sums.n, 1.0)[:, None]
+    mean = np.where(exists if allowed is None else exists & allowed, mean, -1.0)
+    action = mean.argmax(axis=2)
+    best = mean.max(axis=2)
+    return np.where((best < 0.0) | (sums.n == 0.0), -1, action), np.maximum(best, 0.0)
+
+
+def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choice:
+    """
+    Choose for each target action one state mapping and source action: the pair of highest mean compliance.
+
+    :param copies: one for each state mapping
+    :param sums: over all target variables (``whole`` of :meth:`Copies.measure`)
+    :param allowed: see :func:`best_actions`
+    """
+    action, mean = best_actions(copies, sums, allowed)
+    mean = np.where(action < 0, -1.0, mean)
+    best = mean.argmax(axis=0)
+    chosen = action[best, np.arange(len(best))]
+    return Choice(np.where(chosen < 0, -1, best)[:, None], chosen[:, None])
+
+
+def choose_factored(copies: Copies, sums: CopySums) -> Choice:
+    """
+    Choose the division of the target's variables into copies and variables that stay, and each copy's source actions.
+
+    The division is the one for which the product of all mean compliances is highest: of its copies, each with its best
+    source action for each target action and over ``MIN_GAIN`` for each of its variables, and of "it stays" for the variables
+    in none. The mean of each target action counts as often as there are transitions with it.
+    """
+    action, mean = best_actions(copies, sums)
+    scores = np.log(np.maximum(mean, SMALLEST_COMPLIANCE)) @ sums.n
+    scores -= np.log(MIN_GAIN) * sums.n.sum() * (copies.state >= 0).sum(axis=1)
+    stay = sums.stay / np.maximum(sums.n, 1.0)[:, None]
+    stays = sums.n @ np.log(np.maximum(stay, SMALLEST_COMPLIANCE))
+    chosen = best_division(copies.state >= 0, scores, stays)
+    n_actions = len(sums.n)
+    return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), action[chosen].T.copy())
+
+
+def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) -> list[int]:
+    """
+    Find the disjoint copies whose scores, with those of the variables in none, add up to most.
+
+    By dynamic programming over the subsets of the variables that are divided already, of which only those matter that hold
+    all variables before some first one that they do not.
+
+    :param members: bool, shape (n_copies, n_variables): the variables of each copy
+    :param scores: shape (n_copies,); ``stays``: shape (n_variables,): of each variable in no copy
+    :return: the copies, by their first variable
+    """
+    n_variables = members.shape[1]
+    masks = members @ (1 << np.arange(n_variables))
+    # Of the copies of the same variables only the best can be chosen; the first of equal ones.
+    best: dict[int, int] = {}
+    for copy in np.argsort(-scores, kind="stable").tolist():
+        best.setdefault(int(masks[copy]), copy)
+    starting: list[list[tuple[int, int]]] = [[] for _ in range(n_variables)]
+    for mask, copy in best.items():
+        starting[(mask & -mask).bit_length() - 1].append((mask, copy))
+    found: dict[int, tuple[float, tuple[int, ...]]] = {0: (0.0, ())}
+    full = (1 << n_variables) - 1
+    for taken in range(full):
+        if taken not in found:
+            continue
+        score, chosen = found[taken]
+        v = (~taken & (taken + 1)).bit_length() - 1
+        options = [(mask, float(scores[copy]), (*chosen, copy)) for mask, copy in starting[v] if not mask & taken]
+        for mask, more, with_it in [*options, (1 << v, float(stays[v]), chosen)]:
+            if taken | mask not in found or score + more > found[taken | mask][0]:
+                found[taken | mask] = score + more, with_it
+    return list(found[full][1])
+
+
+def draw_mapping(copies: Copies, allowed: np.ndarray, rng: np.random.Generator) -> Choice:
+    """
+    Draw for each target action one of the pairs of state mapping and source action that are allowed, for the whole run.
+
+    :param allowed: see :func:`best_actions`
+    """
+    drawn = [rng.choice(np.argwhere(allowed[:, a])) for a in range(allowed.shape[1])]
+    chosen = np.array(drawn, dtype=np.int64)
+    return Choice(chosen[:, :1].copy(), chosen[:, 1:].copy())
+
+
+def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> Choice:
+    """
+    Draw a factored mapping for the whole run: a control that differs from what is chosen in nothing but the choice.
+
+    All divisions of as many target variables as possible into as few copies as possible are equally likely: the kind that
+    a person would try. So are all source actions, each copy's and each target action's on its own.
+    """
+    members = copies.state >= 0
+    ways = _count_divisions(members)
+    n_variables = members.shape[1]
+    taken, chosen = 0, []
+    masks = (members @ (1 << np.arange(n_variables))).tolist()
+    while taken < (1 << n_variables) - 1:
+        options = _options(taken, masks, ways)
+        counts = np.array([n for *_, n in options], dtype=np.float64)
+        mask, copy, _ = options[int(rng.choice(len(options), p=counts / counts.sum()))]
+        taken |= mask
+        if copy >= 0:
+            chosen.append(copy)
+    of_source = copies.table.n_actions[chosen]
+    actions = rng.integers(0, of_source, size=(n_actions, len(chosen)))
+    return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), actions.astype(np.int64))
+
+
+# For each set of variables that are divided already: variables that the rest leaves out, copies that it has, how many ways.
+Ways = dict[int, tuple[int, int, int]]
+
+
+def _count_divisions(members: np.ndarray) -> Ways:
+    """Count how many ways there are to divide the remaining variables, with as few left out and in as few copies as can be."""
+    n_variables = members.shape[1]
+    masks = (members @ (1 << np.arange(n_variables))).tolist()
+    full = (1 << n_variables) - 1
+    ways: Ways = {full: (0, 0, 1)}
+    for taken in range(full - 1, -1, -1):
+        best, n = (n_variables + 1, 0), 0
+        for mask, copy in _continuations(taken, masks):
+            left, more, count = ways[taken | mask]
+            cost = (left + (copy < 0), more + (copy >= 0))
+            if cost < best:
+                best, n = cost, 0
+            n += count if cost == best else 0
+        ways[taken] = (*best, n)
+    return ways
+
+
+def _continuations(taken: int, masks: list[int]) -> list[tuple[int, int]]:
+    """The copies that have the first variable that is not taken, and no other that is; or that it stays (copy -1)."""
+    first = ~taken & (taken + 1)
+    fit = [(mask, copy) for copy, mask in enumerate(masks) if mask & first and not mask & (taken | (first - 1))]
+    return [*fit, (first, -1)]
+
+
+def _options(taken: int, masks: list[int], ways: Ways) -> list[tuple[int, int, int]]:
+    """The continuations of the best divisions, and how many of these each has."""
+    left, more, _ = ways[taken]
+    return [
+        (mask, copy, ways[taken | mask][2])
+        for mask, copy in _continuations(taken, masks)
+        if (ways[taken | mask][0] + (copy < 0), ways[taken | mask][1] + (copy >= 0)) == (left, more)
+    ]

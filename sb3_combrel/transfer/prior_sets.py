@@ -1,0 +1,176 @@
+"""From what a user gives as mappings to the copies of a source, and to how they are chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
+from sb3_combrel.mappings.named_sets import InterTaskMapping, resolve
+from sb3_combrel.mappings.state_mappings import copies_of_source, with_mirrored
+from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike, load_sources
+from sb3_combrel.transfer.copies import Copies
+from sb3_combrel.transfer.prior_choice import (
+    MAX_FACTORED_VARIABLES,
+    Choice,
+    Chooser,
+    choose_factored,
+    choose_mapping,
+    draw_factored,
+    draw_mapping,
+)
+from sb3_combrel.transfer.source_prior import SourcePrior
+
+FACTORED_SETS = ("factored", "signed_factored")
+# Each copy predicts every transition with each source action.
+MAX_COPIES = 2000
+
+
+def is_factored(mappings: Any) -> bool:
+    """Whether ``mappings`` is a factored mapping, a dict of its arguments, or the name of a set of them."""
+    named = isinstance(mappings, str) and mappings in FACTORED_SETS
+    return named or isinstance(mappings, FactoredMapping) or (isinstance(mappings, Mapping) and "copies" in mappings)
+
+
+def make_prior(
+    source: SourceLike,
+    mappings: MappingsLike,
+    task: TargetTask,
+    *,
+    breadth: float,
+    given: bool,
+    drawn: np.random.Generator | None,
+    max_transitions: int,
+    transfer_terminals: bool,
+) -> SourcePrior:
+    """
+    Make the prior of a target task.
+
+    :param source: instances, a path to them, or a list of several
+    :param mappings: mappings from the target to the source, factored or not
+    :param breadth: kernel breadth of the source's model, in unit coordinates of the source
+    :param given: ``mappings`` is one mapping, or one for each target action, and is used as it is
+    :param drawn: one of ``mappings`` is drawn with this generator; None: it is chosen by compliance
+    :param max_transitions: by which is chosen, at most
+    :param transfer_terminals: whether the source's ends are used
+    :raises ValueError: if source or mappings do not fit the target
+    """
+    sources = load_sources(source)
+    parts = sources, task, breadth
+    choose: Chooser | Choice
+    if is_factored(mappings):
+        if isinstance(mappings, str):
+            copies = _named_copies(mappings, *parts)
+            choose = draw_factored(copies, task.n_actions, drawn) if drawn else partial(choose_factored, copies)
+        else:
+            copies, choose = _given_factored(mappings, *parts)
+    elif given:
+        copies, choose = _given(mappings, *parts)
+    else:
+        candidates = Candidates(source, mappings, task)
+        copies = _copies_of(candidates, task, breadth)
+        allowed = _allowed(candidates, copies)
+        choose = draw_mapping(copies, allowed, drawn) if drawn else partial(choose_mapping, copies, allowed=allowed)
+    return SourcePrior(
+        copies,
+        task,
+        choose,
+        whole=not is_factored(mappings),
+        max_transitions=max_transitions,
+        transfer_terminals=transfer_terminals,
+    )
+
+
+def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> Copies:
+    """Every copy of every source, or of some of its variables."""
+    if task.n_variables > MAX_FACTORED_VARIABLES:
+        raise ValueError(
+            f'mappings="{name}" is for targets of at most {MAX_FACTORED_VARIABLES} state variables, got {task.n_variables}; '
+            "give a FactoredMapping"
+        )
+    numbers, states, signs = [], [], []
+    for number, source in enumerate(sources):
+        state = copies_of_source(source.n_variables, task.n_variables)
+        sign = np.ones_like(state)
+        if name.startswith("signed_"):
+            state, sign = with_mirrored(state)
+        numbers.append(np.full(len(state), number, dtype=np.int64))
+        states.append(state)
+        signs.append(sign)
+    n = sum(map(len, numbers))
+    if n > MAX_COPIES:
+        raise ValueError(
+            f'mappings="{name}" has {n} copies from these source tasks to {task.n_variables} state variables, more than the '
+            f"{MAX_COPIES} that are practical; give a FactoredMapping"
+        )
+    arrays = np.concatenate(numbers), np.concatenate(states), np.concatenate(signs)
+    return Copies(sources, *arrays, breadth, task.exploration_threshold)
+
+
+def _given_factored(
+    mapping: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float
+) -> tuple[Copies, Choice]:
+    """The copies of a factored mapping, of the first source."""
+    if not isinstance(mapping, FactoredMapping):
+        if set(mapping) != {"copies"}:
+            raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
+        mapping = FactoredMapping(**mapping)
+    mapping.check(**_sizes(sources[0], task))
+    actions = np.array([copy.action for copy in mapping.copies], dtype=np.int64).T
+    numbers = np.tile(np.arange(len(mapping.copies)), (task.n_actions, 1))
+    return _of_mappings(mapping.copies, sources, task, breadth), Choice(numbers, actions.copy())
+
+
+def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
+    """One mapping, or one for each target action, of the first source."""
+    given = resolve(mappings, **_sizes(sources[0], task))
+    if len(given) not in (1, task.n_actions):
+        raise ValueError(
+            f"mapping must be one mapping or one for each of the {task.n_actions} target actions, got {len(given)}"
+        )
+    each = [given[a if len(given) > 1 else 0] for a in range(task.n_actions)]
+    used = list(dict.fromkeys(each))
+    copies = np.array([[used.index(mapping)] for mapping in each], dtype=np.int64)
+    actions = np.array([[mapping.action[a]] for a, mapping in enumerate(each)], dtype=np.int64)
+    return _of_mappings(used, sources, task, breadth), Choice(copies, actions)
+
+
+def _of_mappings(
+    mappings: Sequence[InterTaskMapping], sources: Sequence[SourceInstances], task: TargetTask, breadth: float
+) -> Copies:
+    """The state mappings of some mappings to the first source."""
+    state = np.array([mapping.state_index for mapping in mappings])
+    sign = np.array([mapping.state_sign for mapping in mappings])
+    number = np.zeros(len(state), dtype=np.int64)
+    return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
+
+
+def _copies_of(candidates: Candidates, task: TargetTask, breadth: float) -> Copies:
+    """All state mappings of a set, for each source."""
+    number = np.repeat(np.arange(len(candidates.sets)), [each.n_state_mappings for each in candidates.sets])
+    table = candidates.table
+    return Copies(candidates.sources, number, table.variable, table.sign, breadth, task.exploration_threshold)
+
+
+def _allowed(candidates: Candidates, copies: Copies) -> np.ndarray:
+    """Which state mapping and source action a set has for each target action: see ``best_actions``."""
+    arrays = candidates.arrays
+    n_actions = len(arrays.first) - 1
+    allowed = np.zeros((len(copies), n_actions, copies.most_actions), dtype=np.bool_)
+    for number, origin in enumerate(candidates.origins):
+        allowed[arrays.row[number], origin.target_action, origin.source_action] = True
+    return allowed
+
+
+def _sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:
+    return {
+        "n_source_variables": source.n_variables,
+        "n_target_variables": task.n_variables,
+        "n_source_actions": source.n_actions,
+        "n_target_actions": task.n_actions,
+    }

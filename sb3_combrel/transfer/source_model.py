@@ -1,0 +1,195 @@
+"""The local linear model of a source task: what its instances predict of any state and action of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint, compiled, inner
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
+from sb3_combrel.common.periodic import bring_near
+from sb3_combrel.models.linear_fits import RIDGE, Kernel, narrowed
+from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
+
+DEFAULT_SOURCE_BREADTH = 0.2
+DEFAULT_N_NEIGHBORS = 24
+# Rewards and ends jump from one state to the next: they are averaged over nearer instances.
+DEFAULT_OUTCOME_BREADTH = 0.05
+
+
+class SourceArrays(NamedTuple):
+    """A source's local linear model for compiled code.
+
+    :param instances: Instances, as a plain tuple
+    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
+    :param kernel: Kernel, as a plain tuple
+    :param near: NearestLists, as a plain tuple: work space
+    """
+
+    instances: tuple
+    effect_range: np.ndarray
+    kernel: tuple
+    near: tuple
+
+
+class SourcePredictions(NamedTuple):
+    """What a source predicts of n state-action pairs of its own. Unit coordinates of the source.
+
+    :param effect: float64, shape (n, n_variables): predicted displacement
+    :param reward: float64, shape (n,)
+    :param end: float64, shape (n,): probability of termination
+    :param weight: float64, shape (n,): how well founded the prediction is, see :class:`SourceModel`
+    """
+
+    effect: np.ndarray
+    reward: np.ndarray
+    end: np.ndarray
+    weight: np.ndarray
+
+
+@inner
+def predict_source(instances, effect_range, kernel, near, action, state, effect):
+    """Predict one state and action of the source.
+
+    :param instances: Instances; ``kernel``: Kernel; ``near``: NearestLists
+    :param effect: receives the predicted displacement, shape (n_variables,)
+    :return: reward, probability of termination, weight (see :class:`SourceModel`); 0 throughout, and no displacement, for an
+        action without instances
+    """
+    item, distance = near.item[action], near.distance[action]
+    length = nearest_instances(instances, action, state, kernel.reach, item, distance, near.length[action])
+    near.length[action] = length
+    d = len(state)
+    if length == 0:
+        effect[:] = 0.0
+        return 0.0, 0.0, 0.0
+    scale = narrowed(distance[length - 1], kernel) if length == kernel.n_neighbors else kernel.scale
+    sums, products = near.products[0], near.products[1]
+    sums[:] = 0.0
+    total = 0.0
+    outcomes = 0.0
+    reward = 0.0
+    end = 0.0
+    for k in range(length):
+        i = item[k]
+        bring_near(instances.state[action, i], state, instances.periodic, near.state)
+        products_of(near.state, instances.effect[action, i], products)
+        # Seen from the nearest: far from all instances the ridge would outweigh them, and a quotient could be 0 / 0.
+        beyond = distance[k] - distance[0]
+        add_products(sums, np.exp(beyond * scale), products)
+        total += np.exp(distance[k] * kernel.scale)
+        weight = np.exp(beyond * kernel.outcome_scale)
+        outcomes += weight
+        reward += weight * instances.reward[action, i]
+        if instances.terminated[action, i]:
+            end += weight
+    solve_regression(sums, -RIDGE / scale, near.factor, near.fit)
+    for v in range(d):
+        fitted = fitted_effect(near.fit, state, v)
+        effect[v] = min(max(fitted, effect_range[0, action, v]), effect_range[1, action, v])
+    return reward / outcomes, end / outcomes, total / (1.0 + beyond_data(sums, near.factor, state, near.fit))
+
+
+@inner
+def beyond_data(sums, factor, state, scratch):
+    """The squared distance of a state from the mean of the instances of a fit, in units of their spread along that way.
+
+    :param sums: of the fit; ``factor``: Cholesky factor of the spread, as :func:`solve_regression` leaves it
+    :param scratch: float64, at least n_variables long
+    """
+    distance = 0.0
+    for j in range(len(state)):
+        entry = state[j] - sums[1 + j] / sums[0]
+        for m in range(j):
+            entry -= factor[j, m] * scratch[m]
+        scratch[j] = entry / factor[j, j]
+        distance += scratch[j] * scratch[j]
+    return sums[0] * distance
+
+
+@compiled
+def predict_many(source, states, actions, predictions):
+    """Predict many states and actions; ``source``: SourceArrays, ``predictions``: SourcePredictions, as plain tuples."""
+    instances, effect_range, kernel, near = source
+    instances, kernel, near = Instances(*instances), Kernel(*kernel), NearestLists(*near)
+    effect, reward, end, weight = predictions
+    for i in range(len(actions)):
+        reward[i], end[i], weight[i] = predict_source(instances, effect_range, kernel, near, actions[i], states[i], effect[i])
+
+
+_predict_many = EntryPoint(predict_many)
+
+
+class SourceModel:
+    """
+    Local linear regression on the instances of a source, one model for each action.
+
+    The effect at a state is fitted, as a linear function of the state, to the ``n_neighbors`` nearest instances of the
+    action, with the kernel exp(-d^2 / breadth^2), narrowed where they lie closer so that the last of them weighs 0.05; it
+    stays within the range of the effects seen. Rewards and ends are averages with a kernel of ``outcome_breadth``. Far from
+    all instances the nearest ones still predict, with a small weight.
+
+    The weight of a prediction is the sum of exp(-d^2 / breadth^2) over these instances, divided by 1 + z^2, where z is how
+    far the state is from their mean in units of their spread along that way: so the variance of what a linear fit predicts
+    grows, and weight / (1 + z^2) instances all around the state would predict as well. At the edge of its data, and beyond,
+    a source knows less than the mere number of instances nearby suggests. In MountainCar2D no transition starts beyond the
+    goal, where one car of MountainCar4D waits for the other.
+
+    :param instances: of the source, in unit coordinates of it
+    :param breadth: unit coordinates of the source
+    :param n_neighbors: nearest instances of a fit
+    :param outcome_breadth: unit coordinates of the source; no broader than ``breadth``
+    """
+
+    def __init__(
+        self,
+        instances: Instances,
+        breadth: float = DEFAULT_SOURCE_BREADTH,
+        n_neighbors: int = DEFAULT_N_NEIGHBORS,
+        outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
+    ):
+        n_actions, _, d = instances.state.shape
+        self.instances = instances
+        self.kernel = Kernel(
+            scale=-1.0 / breadth**2,
+            reach=np.inf,
+            outcome_scale=-1.0 / min(breadth, outcome_breadth) ** 2,
+            n_neighbors=n_neighbors,
+        )
+        effect_range = np.zeros((2, n_actions, d))
+        for action, size in enumerate(instances.size.tolist()):
+            if size:
+                effect_range[0, action] = instances.effect[action, :size].min(axis=0)
+                effect_range[1, action] = instances.effect[action, :size].max(axis=0)
+        near = NearestLists(
+            item=np.zeros((n_actions, n_neighbors), dtype=np.int32),
+            distance=np.empty((n_actions, n_neighbors)),
+            length=np.zeros(n_actions, dtype=np.int64),
+            state=np.empty(d),
+            products=np.empty((2, n_products(d))),
+            factor=np.empty((d, d)),
+            fit=np.empty(d + d * d),
+            outcome=np.empty(3 + 2 * d),
+        )
+        # Plain tuples for compiled code (see ``common.compiled``).
+        self.arrays = SourceArrays(tuple(instances), effect_range, tuple(self.kernel), tuple(near))
+        self.plain = tuple(self.arrays)
+
+    @property
+    def n_variables(self) -> int:
+        """Number of state variables of the source."""
+        return int(self.instances.state.shape[2])
+
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> SourcePredictions:
+        """
+        Predict states and actions of the source.
+
+        :param states: unit coordinates of the source, float64, shape (n, n_variables)
+        :param actions: source actions, int64, shape (n,)
+        """
+        n = len(actions)
+        found = SourcePredictions(np.empty((n, self.n_variables)), np.empty(n), np.empty(n), np.empty(n))
+        _predict_many.call(self.plain, np.ascontiguousarray(states), actions, tuple(found))
+        return found

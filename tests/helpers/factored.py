@@ -1,0 +1,128 @@
+"""A source with linear dynamics, targets that are made of several copies of it, and the same computations written plainly."""
+
+import numpy as np
+
+from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.transfer.base import TargetTask
+
+# x' = x + SLOPES x + PUSH[u], unit coordinates: an oscillator that is left alone, pushed down or pushed up.
+SLOPES = np.array([[0.0, 0.15], [-0.12, -0.03]])
+CENTER = np.array([0.5, 0.5])
+PUSH = np.array([[0.0, 0.0], [0.0, -0.02], [0.0, 0.02]])
+LOW, RANGE = np.array([-2.0, 10.0]), np.array([4.0, 5.0])
+
+
+def oscillate(states, actions):
+    """Effects of the source, unit coordinates; ``states``: shape (n, 2)."""
+    return (states - CENTER) @ SLOPES.T + PUSH[actions]
+
+
+def ends(states):
+    """Where the source's episodes end."""
+    return states[:, 0] > 0.9
+
+
+def oscillator_source(n=600, seed=0, noise=0.0, effects=oscillate, rewards=None):
+    """Instances of the source from everywhere.
+
+    :param noise: standard deviation of what is added to effects, unit coordinates
+    """
+    rng = np.random.default_rng(seed)
+    states, actions = rng.random((n, 2)), rng.integers(3, size=n)
+    after = states + effects(states, actions) + noise * rng.normal(size=states.shape)
+    return SourceInstances(
+        LOW + RANGE * states,
+        actions,
+        -np.ones(n) if rewards is None else rewards(states),
+        LOW + RANGE * after,
+        ends(after),
+        LOW,
+        LOW + RANGE,
+        3,
+        ("x", "v"),
+        ("Wait", "Down", "Up"),
+        {"env": "Oscillator-v0"},
+    )
+
+
+def copies_mapping(n_copies, order=None):
+    """The mapping of a target of so many copies: action 0 moves none, 1 and 2 the first, 3 and 4 the second, ...
+
+    :param order: the target variable of each variable of the first copy, of the second, ...
+    """
+    order = list(range(2 * n_copies)) if order is None else list(order)
+    copies = []
+    for c in range(n_copies):
+        state, action = [None] * (2 * n_copies), [0] * (2 * n_copies + 1)
+        for k in range(2):
+            state[order[2 * c + k]] = k
+        action[2 * c + 1], action[2 * c + 2] = 1, 2
+        copies.append(InterTaskMapping(state, action))
+    return FactoredMapping(copies)
+
+
+def target_effects(mapping, states, actions):
+    """What happens in a target that is exactly what a factored mapping says."""
+    effects = np.zeros_like(states)
+    for copy in mapping.copies:
+        place = [copy.state.index(k) for k in range(2)]
+        effects[:, place] = oscillate(states[:, place], np.array(copy.action)[actions])
+    return effects
+
+
+def target_task(n_variables, n_actions, threshold=1.0):
+    return TargetTask(
+        scaling=StateScaling(np.zeros(n_variables), np.ones(n_variables)),
+        n_actions=n_actions,
+        sample_states=np.zeros((3, n_variables)),
+        exploration_threshold=threshold,
+        min_weight=0.01,
+        min_fraction=0.1,
+        state_names=tuple(f"s{k}" for k in range(n_variables)),
+        action_names=tuple(f"a{k}" for k in range(n_actions)),
+    )
+
+
+def walk(mapping, n, seed=0, length=40, spread=0.5):
+    """Transitions of such a target, in episodes that start at random and end after ``length`` steps.
+
+    :return: states, actions and effects
+    """
+    rng = np.random.default_rng(seed)
+    d, n_actions = mapping.n_target_variables, mapping.n_target_actions
+    rows = []
+    while len(rows) < n:
+        state = 0.5 + spread * (rng.random(d) - 0.5)
+        action = int(rng.integers(n_actions))
+        for _ in range(length):
+            if rng.random() < 0.3:
+                action = int(rng.integers(n_actions))
+            effect = target_effects(mapping, state[None], np.array([action]))[0]
+            rows.append((state, action, effect))
+            state = state + effect
+    states, actions, effects = zip(*rows[:n], strict=True)
+    return np.array(states), np.array(actions), np.array(effects)
+
+
+def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighbors, outcome_breadth):
+    """Effect, reward, end and weight that a local linear model predicts at ``at``, from the instances of one action."""
+    squared = ((states - at) ** 2).sum(axis=1)
+    near = np.argsort(squared, kind="stable")[:n_neighbors]
+    squared = squared[near]
+    scale = 1.0 / breadth**2
+    if len(near) == n_neighbors:
+        scale = min(max(scale, -np.log(0.05) / squared[-1]), scale / 0.02**2)
+    weights = np.exp(-(squared - squared[0]) * scale)
+    x, e = states[near], effects[near]
+    mean_x, mean_e = np.average(x, axis=0, weights=weights), np.average(e, axis=0, weights=weights)
+    ridge = 0.01 / scale
+    root = np.sqrt(weights)[:, None]
+    design = np.vstack([root * (x - mean_x), np.sqrt(ridge) * np.eye(len(at))])
+    wanted = np.vstack([root * (e - mean_e), np.zeros((len(at), e.shape[1]))])
+    slopes = np.linalg.lstsq(design, wanted, rcond=None)[0]
+    effect = np.clip(mean_e + (at - mean_x) @ slopes, effects.min(axis=0), effects.max(axis=0))
+    outcome = np.exp(-(squared - squared[0]) / min(breadth, outcome_breadth) ** 2)
+    spread = np.linalg.solve(design.T @ design / weights.sum(), at - mean_x)
+    weight = np.exp(-squared / breadth**2).sum() / (1.0 + (at - mean_x) @ spread)
+    return effect, np.average(rewards[near], weights=outcome), np.average(terminated[near], weights=outcome), weight

@@ -1,0 +1,113 @@
+"""What confirms and what contradicts the ends and rewards that a source predicts."""
+
+import numpy as np
+import pytest
+
+from sb3_combrel.transfer.borne_out import EPISODES_IN_VAIN, STEPS_OF_A_VISIT, Outcomes
+
+SURE, NONE = 0.9, 0.0
+
+
+def outcomes(rewards=-1.0):
+    return Outcomes(np.full(10, rewards), threshold=1.0)
+
+
+def note(made, ends, terminated=False, weight=5.0, reward=-1.0, predicted=-1.0):
+    """Note one transition for each predicted probability of an end; the last may end the episode."""
+    for k, end in enumerate(ends):
+        made.note(weight, end, predicted, reward, terminated and k == len(ends) - 1)
+
+
+@pytest.mark.parametrize(
+    ("ends", "terminated", "confirmed", "contradicted"),
+    [
+        ([NONE] * 20, False, 0, 0),
+        ([NONE, SURE], True, 1, 0),
+        # At the border a kernel average decides nothing: an end a step or two later is the one that was predicted.
+        ([NONE, SURE, 0.3, 0.2], True, 1, 0),
+        ([NONE, 0.2], True, 1, 0),
+        ([NONE, NONE], True, 0, 1),
+        ([NONE, SURE, SURE, NONE], False, 0, 1),
+        ([NONE, SURE, NONE, SURE, NONE], False, 0, 2),
+        ([NONE, 0.3, 0.3, NONE], False, 0, 0),
+        # Whoever stays where an end is predicted contradicts it again and again.
+        ([SURE] * STEPS_OF_A_VISIT, False, 0, 1),
+        ([SURE] * 3 * STEPS_OF_A_VISIT + [NONE], False, 0, 3),
+    ],
+)
+def test_visits_count_once(ends, terminated, confirmed, contradicted):
+    made = outcomes()
+    note(made, ends, terminated)
+    assert (made.confirmed, made.contradicted) == (confirmed, contradicted)
+    assert made.doubted == (contradicted > confirmed)
+
+
+def test_where_the_source_has_no_data_nothing_is_contradicted():
+    made = outcomes()
+    note(made, [SURE, SURE, NONE], weight=0.5)
+    note(made, [NONE], terminated=True, weight=0.5)
+    note(made, [NONE] * 30, weight=0.5, reward=1.0)
+    assert made.contradicted == made.rewards_wrong == 0 and not made.doubted
+
+
+def test_doubt_ends_when_confirmations_make_up_for_it():
+    made = outcomes()
+    note(made, [SURE, NONE])
+    assert made.doubted
+    note(made, [SURE], terminated=True)
+    assert not made.doubted
+
+
+def test_an_episode_cut_off_in_the_middle_of_a_visit_contradicts_the_end():
+    made = outcomes()
+    note(made, [NONE, SURE])
+    made.end_episode(truncated=True)
+    assert made.contradicted == 1 and made.doubted
+
+
+def test_ends_that_are_never_reached_are_doubted_if_rewards_tell_nothing():
+    for rewards, doubted in ((lambda t: -1.0, True), (lambda t: -1.0 - 0.01 * t, False)):
+        made = outcomes()
+        for episode in range(EPISODES_IN_VAIN):
+            assert not made.doubted
+            for t in range(5):
+                note(made, [NONE], reward=rewards(t), predicted=rewards(t))
+            made.end_episode(truncated=True)
+            assert made.in_vain == episode + 1
+        assert made.doubted == doubted
+    made = outcomes()
+    note(made, [SURE], terminated=True)
+    for _ in range(9):
+        note(made, [NONE])
+        made.end_episode(truncated=True)
+    assert not made.doubted
+
+
+def test_rewards_of_the_wrong_sign_are_doubted_and_small_differences_are_not():
+    made = outcomes()
+    note(made, [NONE] * 30, reward=-1.05)
+    assert made.rewards_right == 30 and not made.doubted
+    made = outcomes()
+    note(made, [NONE] * 9, reward=1.0)
+    assert not made.doubted
+    note(made, [NONE], reward=1.0)
+    assert made.doubted
+    spread = Outcomes(np.array([-5.0, 5.0]), 1.0)
+    note(spread, [NONE] * 30, reward=2.0)
+    assert not spread.doubted
+
+
+def test_counts_are_saved():
+    made, other = outcomes(), outcomes()
+    for terminated in (False, True):
+        note(made, [NONE, SURE, NONE, SURE, NONE], terminated)
+    note(made, [SURE, SURE])
+    other.set_state(made.get_state())
+    for each in (made, other):
+        note(each, [SURE, NONE])
+        each.end_episode(True)
+    assert vars(made) == vars(other)
+    fresh = outcomes()
+    fresh.set_state(outcomes().get_state())
+    note(fresh, [NONE])
+    assert fresh.reward_range == (-1.0, -1.0)
