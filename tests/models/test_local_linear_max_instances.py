@@ -108,11 +108,12 @@ def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_aga
     model = make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
     point = 4  # at 0.5
 
-    def add(at):
-        model.update_rows(model.add(np.array([at]), 0, -1.0, np.array([at + 0.1]), False))
+    def add(at, terminated=False):
+        model.update_rows(model.add(np.array([at]), 0, -1.0, np.array([at + 0.1]), terminated))
 
-    for _ in range(4):
-        add(0.5)
+    for number in range(4):
+        # An end, so that a part of the threshold is enough from then on.
+        add(0.5, terminated=number == 0)
     assert model.known[point] and model.mdp.arrays.modelled[point] and model.fits.reach[point] == 0.0
     # One after the other is replaced by one farther away.
     for at in (0.9, 0.1, 0.45, 0.56, 0.3):
