@@ -33,8 +33,8 @@ MAX_UNEXPLAINED = 0.2
 TOLERANCE = 0.1
 # The narrower weight of an instance is no less than this: where all are far away their mean is still a quotient.
 LEAST_WEIGHT = 1e-200
-# Narrower weights differ by many orders of magnitude. To subtract a large one leaves nothing but rounding of small ones: where
-# less than this is left, and what was subtracted was no small part of it, the sums are computed anew.
+# Narrower weights differ by many orders of magnitude, and subtracting a large one leaves nothing but rounding of small ones:
+# where less than this is left, and more than that was subtracted, the sums are computed anew.
 MUCH_ROUNDED = 1e-6
 # A variable that hardly ever changes is measured by this part of a cell.
 LEAST_SCALE = 0.02
@@ -494,7 +494,7 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
             scratch.point[changed] = scratch.point[f]
             changed += 1
             continue
-        if fits.outcome[pair, 0] < MUCH_ROUNDED and not 0.0 <= -shares[1] <= 0.1:
+        if fits.outcome[pair, 0] < MUCH_ROUNDED and not 0.0 <= -shares[1] <= 1.0:
             recount(instances, fits, pair, action, kernel, slot, scratch)
         # The fit is no longer that of the instances that are left.
         shares = min(1.0, abs(shares[0])), min(1.0, abs(shares[1]))

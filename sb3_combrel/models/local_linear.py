@@ -134,6 +134,8 @@ class LocalLinear(Model):
         # Whether an outcome has told states apart.
         self._informed, self._first_reward = False, np.nan
         self._threshold, self._demand = self.exploration_threshold, 1.0
+        # Transitions so far; with ``max_instances`` there are fewer instances.
+        self._n_added = 0
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
         self._all_actions = np.arange(self.n_actions)
         self._make_prediction(1)
@@ -178,6 +180,7 @@ class LocalLinear(Model):
             self._plain_scratch,
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
+        self._n_added += 1
         forgotten = self._demand_more()
         if len(left) + len(informed) + len(forgotten) == 0:
             return changed
@@ -265,7 +268,7 @@ class LocalLinear(Model):
 
     def _demand_more(self) -> np.ndarray:
         """Demand more weight of what is known while no outcome has told states apart; the pairs that are no longer known."""
-        if self._informed or self.n_instances % CHECKED_EVERY or self.known.mean() < EXPLORED:
+        if self._informed or self._n_added % CHECKED_EVERY or self.known.mean() < EXPLORED:
             return NO_PAIRS
         self._demand *= 2.0
         self.exploration_threshold = self._demand * self._threshold
@@ -356,7 +359,8 @@ class LocalLinear(Model):
             **super().get_state(),
             "reach": self.fits.reach.copy(),
             "limit": self.fits.limit.astype(np.float64),
-            "demand": np.array([self._demand]),
+            # The instance that has told states apart may have been replaced.
+            "demand": np.array([self._demand, float(self._informed), float(self._n_added)]),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
@@ -366,7 +370,9 @@ class LocalLinear(Model):
         fits = self.fits
         for row in state["instances"]:
             self._inform(row[-3], row[-2] > 0.5)
-        self._demand = max(1.0, float(state["demand"][0]))
+        demand, informed, n_added = state["demand"].tolist()
+        self._informed = self._informed or informed > 0.5
+        self._demand, self._n_added = max(1.0, demand), int(n_added)
         self.exploration_threshold = self._demand * self._threshold
         # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
         fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)

@@ -1,7 +1,7 @@
 """The local linear model again, written from its definition in plain loops and NumPy: slow, and independent of the package.
 
 Nothing is incremental but what the definition itself says has a history: how far the instances of a pair may be, and what is
-known, which stays known.
+known, which stays known unless more weight is demanded, and whether an outcome has told states apart.
 """
 
 import math
@@ -18,6 +18,7 @@ RIDGE = 0.01
 EXPLAINED_WEIGHT = 0.5
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 ON_GRID = 0.5
+EXPLORED, CHECKED_EVERY = 0.9, 50
 
 
 class Predicted(NamedTuple):
@@ -73,6 +74,9 @@ class NaiveLocalLinear:
         self.limit = np.full(shape, self.n_neighbors + self.n_neighbors // 2)
         self.total = np.zeros(shape)
         self.known = np.zeros(shape, dtype=bool)
+        # What has come so far, whatever has become of the instances.
+        self.rewards, self.has_ended = [], False
+        self.demand = 1.0
 
     # ---------------------------------------------------------------- the prior
 
@@ -176,6 +180,36 @@ class NaiveLocalLinear:
         corners = self.grid.corners(self.points[point] + found.effect) if found.end < 1.0 else {}
         return found.reward, {to: (1.0 - found.end) * part for to, part in corners.items()}
 
+    # ------------------------------------------------------------ what is known
+
+    def informed(self):
+        """Whether an outcome has told states apart: an end, or rewards that differ."""
+        return self.has_ended or len(set(self.rewards)) > 1
+
+    def needed_on_grid(self):
+        """The weight that makes a grid point known."""
+        return (ON_GRID if self.informed() else 1.0) * self.demand * self.threshold
+
+    def lower_threshold(self, threshold):
+        self.threshold = threshold
+        self.known |= self.total >= self.needed_on_grid()
+
+    def note_outcome(self, reward, terminated):
+        """The first outcome that tells states apart makes those pairs known that have what is needed from then on."""
+        before = self.informed()
+        self.rewards.append(reward)
+        self.has_ended = self.has_ended or terminated
+        if self.informed() and not before:
+            self.demand = 1.0
+            self.known |= self.total >= self.needed_on_grid()
+
+    def demand_more(self):
+        """Every so many transitions: twice the weight if nearly all is known, and no outcome has told states apart."""
+        checked = len(self.rewards) % CHECKED_EVERY == 0
+        if checked and not self.informed() and self.known.sum() >= EXPLORED * self.known.size:
+            self.demand *= 2.0
+            self.known &= self.total >= self.needed_on_grid()
+
     # ----------------------------------------------------------------- learning
 
     def add(self, state, action, reward, next_state, terminated):
@@ -184,16 +218,18 @@ class NaiveLocalLinear:
 
     def put(self, number, instance):
         action = instance.action
+        self.note_outcome(instance.reward, instance.terminated)
         self.instances[action][number : number + 1] = [instance]
         for point, at in enumerate(self.points):
             squared = squared_distance(at, instance.state, self.grid.periodic)
             if squared > self.reach[action, point]:
                 continue
+            self.total[action, point] += math.exp(-squared / self.breadth**2)
             if not self.known[action, point]:
-                self.total[action, point] += math.exp(-squared / self.breadth**2)
-                self.known[action, point] = self.total[action, point] >= ON_GRID * self.threshold
+                self.known[action, point] = self.total[action, point] >= self.needed_on_grid()
             if self.known[action, point] or self.claimed(action, point):
                 self.narrow(action, point)
+        self.demand_more()
 
     def narrow(self, action, point):
         """Let only the nearest instances of a pair count if there are more than its limit."""
@@ -205,3 +241,37 @@ class NaiveLocalLinear:
         left = len(self.counted(action, point))
         # Many at one and the same distance: the limit is twice as many.
         self.limit[action, point] = max(n + n // 2, 2 * left if left > n + n // 4 else 0)
+
+
+class NaiveReplacement:
+    """The definition with ``max_instances``: the nearest instance of the action is replaced."""
+
+    def __init__(self, naive, max_instances):
+        self.naive, self.max_instances = naive, max_instances
+
+    def add(self, state, action, reward, next_state, terminated):
+        naive = self.naive
+        number = len(naive.instances[action])
+        if number == self.max_instances:
+            number = naive.distances(state, action)[0][1]
+            self.remove(action, number)
+        naive.put(number, Instance(state, action, reward, next_state, terminated, naive.grid.periodic))
+
+    def remove(self, action, number):
+        """A narrow kernel that has lost more than half of its instances becomes as broad as is allowed, and narrows again."""
+        naive, n = self.naive, self.naive.n_neighbors
+        for point in range(naive.n_points):
+            counted = [i for _, i in naive.counted(action, point)]
+            if number not in counted:
+                continue
+            n_left, is_broad = len(counted) - 1, naive.reach[action, point] >= naive.full_reach
+            if n_left > 0 and (2 * n_left >= n or is_broad):
+                continue
+            others = [squared for squared, i in naive.distances(naive.points[point], action) if i != number]
+            within = [squared for squared in others if squared <= naive.full_reach]
+            naive.reach[action, point] = within[n - 1] if len(within) >= n else naive.full_reach
+            n_left = sum(squared <= naive.reach[action, point] for squared in within)
+            naive.limit[action, point] = max(n + n // 2, 2 * n_left if n_left > n + n // 4 else 0)
+            if n_left == 0:
+                naive.known[action, point], naive.total[action, point] = False, 0.0
+        naive.instances[action][number].state = np.full(naive.d, np.inf)

@@ -12,45 +12,11 @@ from helpers.linear_models import (
     linear_model_and_definition,
     make_linear_model,
 )
-from helpers.naive_fitted_rmax import Instance
+from helpers.naive_local_linear import NaiveReplacement
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 SMALL_GRIDS = [((3,), 1), ((2, 2), 0), ((1, 1, 1), 0), ((3,), 0, (True,)), ((2, 2), 1, (False, True))]
-
-
-class NaiveReplacement:
-    """The definition with ``max_instances``: the nearest instance of the action is replaced."""
-
-    def __init__(self, naive, max_instances):
-        self.naive, self.max_instances = naive, max_instances
-
-    def add(self, state, action, reward, next_state, terminated):
-        naive = self.naive
-        number = len(naive.instances[action])
-        if number == self.max_instances:
-            number = naive.distances(state, action)[0][1]
-            self.remove(action, number)
-        naive.put(number, Instance(state, action, reward, next_state, terminated, naive.grid.periodic))
-
-    def remove(self, action, number):
-        """A narrow kernel that has lost more than half of its instances becomes as broad as is allowed, and narrows again."""
-        naive, n = self.naive, self.naive.n_neighbors
-        for point in range(naive.n_points):
-            counted = [i for _, i in naive.counted(action, point)]
-            if number not in counted:
-                continue
-            n_left, is_broad = len(counted) - 1, naive.reach[action, point] >= naive.full_reach
-            if n_left > 0 and (2 * n_left >= n or is_broad):
-                continue
-            others = [squared for squared, i in naive.distances(naive.points[point], action) if i != number]
-            within = [squared for squared in others if squared <= naive.full_reach]
-            naive.reach[action, point] = within[n - 1] if len(within) >= n else naive.full_reach
-            n_left = sum(squared <= naive.reach[action, point] for squared in within)
-            naive.limit[action, point] = max(n + n // 2, 2 * n_left if n_left > n + n // 4 else 0)
-            if n_left == 0:
-                naive.known[action, point], naive.total[action, point] = False, 0.0
-        naive.instances[action][number].state = np.full(naive.d, np.inf)
 
 
 @settings(deadline=None, derandomize=True, max_examples=15)
@@ -108,11 +74,12 @@ def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_aga
     model = make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
     point = 4  # at 0.5
 
-    def add(at):
-        model.update_rows(model.add(np.array([at]), 0, -1.0, np.array([at + 0.1]), False))
+    def add(at, terminated=False):
+        model.update_rows(model.add(np.array([at]), 0, -1.0, np.array([at + 0.1]), terminated))
 
-    for _ in range(4):
-        add(0.5)
+    for number in range(4):
+        # An end, so that a part of the threshold is enough from then on.
+        add(0.5, terminated=number == 0)
     assert model.known[point] and model.mdp.arrays.modelled[point] and model.fits.reach[point] == 0.0
     # One after the other is replaced by one farther away.
     for at in (0.9, 0.1, 0.45, 0.56, 0.3):

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import GRIDS, learn, random_transitions, row_of
+from helpers.kernel_models import GRIDS, learn, random_transitions
 from helpers.linear_models import (
     LINEAR_KERNELS,
     LinearDynamics,
     StubPrior,
+    assert_restored,
     assert_same_fits,
     assert_same_sums,
     finish_episode,
@@ -17,46 +18,7 @@ from helpers.naive_local_linear import NaiveLocalLinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-LEARNED = ("sums", "outcome", "reach", "scale", "n_counted", "limit", "total", "known", "claimed", "prior", "effect_range")
 problems = st.tuples(st.sampled_from(GRIDS), st.sampled_from(LINEAR_KERNELS), st.integers(0, 10**6), st.integers(1, 80))
-
-
-def assert_same_to_the_last_bit(one, other):
-    for name in LEARNED:
-        np.testing.assert_array_equal(getattr(one.fits, name), getattr(other.fits, name), err_msg=name)
-    np.testing.assert_array_equal(one.instances.rows(), other.instances.rows())
-    modelled = one.known | one.fits.claimed
-    for name in ("fit", "row", "unexplained"):
-        of_one, of_other = getattr(one.fits, name), getattr(other.fits, name)
-        np.testing.assert_array_equal(of_one[modelled], of_other[modelled], err_msg=name)
-    np.testing.assert_array_equal(one.mdp.arrays.modelled, other.mdp.arrays.modelled)
-    np.testing.assert_array_equal(one.mdp.arrays.reward, other.mdp.arrays.reward)
-    for pair in range(len(one.known)):
-        assert row_of(one.mdp, pair) == row_of(other.mdp, pair)
-    rng = np.random.default_rng(0)
-    for state in rng.random((5, one.grid.n_variables)):
-        for array, same in zip(one.predict_at(state)[0], other.predict_at(state)[0], strict=True):
-            np.testing.assert_array_equal(array, same)
-
-
-def assert_restored(model, restored, transitions):
-    """``restored`` has what ``model`` has learned, and learns the same of some more transitions."""
-    finish_episode(model)
-    saved = model.get_state()
-    restored.set_state({name: array.copy() for name, array in saved.items()})
-    assert saved.keys() == restored.get_state().keys()
-    for name, array in restored.get_state().items():
-        assert array.dtype == np.float64
-        np.testing.assert_array_equal(array, saved[name], err_msg=name)
-    assert_same_to_the_last_bit(model, restored)
-    for transition in transitions:
-        changed, same = model.add(*transition), restored.add(*transition)
-        np.testing.assert_array_equal(changed, same)
-        model.update_rows(changed)
-        restored.update_rows(same)
-    finish_episode(model)
-    finish_episode(restored)
-    assert_same_to_the_last_bit(model, restored)
 
 
 @settings(deadline=None, derandomize=True, max_examples=25)
