@@ -11,7 +11,8 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.list_store import ListStore
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
+from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
 from sb3_combrel.models.kernel_lists import (
     KernelLists,
     ReachScratch,
@@ -24,15 +25,11 @@ from sb3_combrel.models.kernel_refill import in_neighbourhoods, note_all_effects
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
 
-# Fraction of the threshold by which own weight must have changed before the row of a pair that has transferred instances is
-# updated within an episode: an instance that hardly counts among them would have hundreds of pairs translated and planned.
-MIN_CHANGE = 0.5
-
 _enter, _leave_lists, _update_rows = EntryPoint(enter_plain), EntryPoint(leave_lists), EntryPoint(update_rows_plain)
 _predict_own, _join_transferred = EntryPoint(predict_own_plain), EntryPoint(join_transferred_plain)
 
 
-class KernelAverage(Model):
+class KernelAverage(CompiledModel):
     """
     The model of Jong & Stone (2007), one for each action, incremental.
 
@@ -74,25 +71,11 @@ class KernelAverage(Model):
         )
         self._plain_near = tuple(self._near)
         self._make_prediction(room)
-        self._nothing = TransferredInstances.empty(1, d)
 
     # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
 
     def _set_arrays(self, arrays: KernelLists) -> None:
         self.arrays, self._plain_arrays = arrays, arrays.plain()
-
-    def _make_prediction(self, room: int) -> None:
-        self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
-        self._plain_prediction = tuple(self._prediction)
-
-    @property
-    def instances(self) -> Instances:
-        """The instances, by action."""
-        return self._instances
-
-    @instances.setter
-    def instances(self, instances: Instances) -> None:
-        self._instances, self._plain_instances = instances, tuple(instances)
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
         """
@@ -168,29 +151,6 @@ class KernelAverage(Model):
             done = _update_rows.call(arrays, outcomes, mdp.plain, grid, mdp.gamma, query, transferred, scratch)
             if done < len(pairs):
                 mdp.make_room()
-
-    def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
-        """Transferred instances for pairs; known ones need none."""
-        if self.transfer is None or self.known[pairs].all():
-            if len(self._nothing.length) < len(pairs):
-                self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
-            return self._nothing
-        actions, points = np.divmod(pairs, self.grid.n_points)
-        # Of a known pair the full threshold, so that no method has work with it; it may have been lowered.
-        full = self.settings.exploration_threshold
-        own_weight = np.where(self.known[pairs], np.maximum(full, self.own_weight[pairs]), self.own_weight[pairs])
-        given = self.transfer.transferred_to_sample(points, actions, own_weight)
-        self._check(given, own_weight)
-        return given
-
-    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
-        rows = []
-        for state, action in zip(states, actions, strict=True):
-            self._predict_own(np.ascontiguousarray(state, dtype=np.float64))
-            rows.append([array[action].copy() for array in self._prediction])
-        _, weight, reward, length, probability, effect = map(np.array, zip(*rows, strict=True))
-        used = np.arange(probability.shape[1]) < length[:, None]
-        return Predictions(weight, reward, np.where(used, probability, 0.0), np.where(used[:, :, None], effect, 0.0))
 
     def _predict_own(self, state: np.ndarray) -> float:
         """Fill the prediction from the own instances; the least weight that an action has."""

@@ -247,7 +247,7 @@ def recount(instances, fits, pair, action, kernel, left_out, scratch):
 
     :param left_out: number of an instance that does not count; -1 for none
     :param scratch: ``at`` is where the pair's point is
-    :return: how many they are, and the sum of their weights (of breadth ``model_breadth``)
+    :return: the sum of their weights (of breadth ``model_breadth``)
     """
     fits.sums[pair, :] = 0.0
     fits.outcome[pair, :] = 0.0

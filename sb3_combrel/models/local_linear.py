@@ -9,7 +9,8 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import n_products
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
+from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
 from sb3_combrel.models.linear_fits import (
     LEAST_SCALE,
     FitScratch,
@@ -24,10 +25,6 @@ from sb3_combrel.models.linear_fits import (
 from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
-
-# As of the kernel average: own weight must have changed by this fraction of the threshold before the row of a pair that has
-# transferred instances is updated within an episode.
-MIN_CHANGE = 0.5
 
 # Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
 # values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
@@ -44,7 +41,7 @@ _refit_changed = EntryPoint(refit_changed)
 _join_transferred = EntryPoint(join_transferred_plain)
 
 
-class LocalLinear(Model):
+class LocalLinear(CompiledModel):
     """
     Local linear regression, one model for each action, incremental (Atkeson, Moore & Schaal 1997).
 
@@ -72,8 +69,6 @@ class LocalLinear(Model):
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
         self._prior = transfer if transfer is not None and transfer.use == "prior" else None
-        # Where instances come from for pairs that are not known.
-        self._giver = None if self._prior is not None else transfer
         grid = self.grid
         d, n_points, n_pairs, n_near = grid.n_variables, grid.n_points, len(self.known), settings.n_neighbors
         breadth = float(settings.model_breadth)
@@ -139,25 +134,11 @@ class LocalLinear(Model):
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
         self._all_actions = np.arange(self.n_actions)
         self._make_prediction(1)
-        self._nothing = TransferredInstances.empty(1, d)
 
     # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
 
     def _set_fits(self, fits: LinearFits) -> None:
         self.fits, self._plain_fits = fits, tuple(fits)
-
-    def _make_prediction(self, room: int) -> None:
-        self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
-        self._plain_prediction = tuple(self._prediction)
-
-    @property
-    def instances(self) -> Instances:
-        """The instances, by action."""
-        return self._instances
-
-    @instances.setter
-    def instances(self, instances: Instances) -> None:
-        self._instances, self._plain_instances = instances, tuple(instances)
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
         """
@@ -303,29 +284,6 @@ class LocalLinear(Model):
             )
             if done < len(pairs):
                 mdp.make_room()
-
-    def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
-        """Transferred instances for pairs; known ones need none."""
-        if self._giver is None or self.known[pairs].all():
-            if len(self._nothing.length) < len(pairs):
-                self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
-            return self._nothing
-        actions, points = np.divmod(pairs, self.grid.n_points)
-        # Of a known pair the full threshold, so that no method has work with it; it may have been lowered.
-        full = self.settings.exploration_threshold
-        own_weight = np.where(self.known[pairs], np.maximum(full, self.own_weight[pairs]), self.own_weight[pairs])
-        given = self._giver.transferred_to_sample(points, actions, own_weight)
-        self._check(given, own_weight)
-        return given
-
-    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
-        rows = []
-        for state, action in zip(states, actions, strict=True):
-            self._predict_own(np.ascontiguousarray(state, dtype=np.float64))
-            rows.append([array[action].copy() for array in self._prediction])
-        _, weight, reward, length, probability, effect = map(np.array, zip(*rows, strict=True))
-        used = np.arange(probability.shape[1]) < length[:, None]
-        return Predictions(weight, reward, np.where(used, probability, 0.0), np.where(used[:, :, None], effect, 0.0))
 
     def _predict_own(self, state: np.ndarray) -> float:
         """Fill the prediction from the own instances; the least weight that an action has."""

@@ -198,10 +198,7 @@ def test_unknown_tasks_are_refused():
 def test_every_task_can_be_learnt_and_has_its_headline(name, tmp_path):
     task = TASKS[name]
     assert task.headline in columns_of(task)
-    try:
-        env = task.make()
-    except gym.error.UnregisteredEnv:
-        pytest.skip("its environment is not in this checkout")
+    env = task.make()
     assert isinstance(env.action_space, gym.spaces.Discrete)
     wrapper = env
     while not isinstance(wrapper, gym.wrappers.TimeLimit):
