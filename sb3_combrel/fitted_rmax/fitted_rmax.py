@@ -109,6 +109,8 @@ class FittedRMax(PersistentAlgorithm):
         three, 30 for four, 40 for five, 60 for more
     :param outcome_breadth: with ``degree=1``, breadth of the narrower kernel by which rewards, ends, and what a fit leaves
         unexplained are averaged
+    :param max_model_steps: with ``degree=1``, the planner follows an action from a grid point by the local fit until a cell of
+        the grid is left, but for no more than so many steps; 1: one step, as the original does. None: 50.
     :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
         Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
         says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.
@@ -152,6 +154,7 @@ class FittedRMax(PersistentAlgorithm):
         degree: int = DEFAULTS.degree,
         n_neighbors: int | None = DEFAULTS.n_neighbors,
         outcome_breadth: float = DEFAULTS.outcome_breadth,
+        max_model_steps: int | None = DEFAULTS.max_model_steps,
         periodic: Sequence[bool] | None = DEFAULTS.periodic,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -191,6 +194,7 @@ class FittedRMax(PersistentAlgorithm):
         self.degree = degree if _init_setup_model else 0
         self.n_neighbors = n_neighbors
         self.outcome_breadth = outcome_breadth
+        self.max_model_steps = max_model_steps
         self.periodic = periodic
         self._warned_of_max_value = False
         self._generator_state: dict[str, Any] | None = None

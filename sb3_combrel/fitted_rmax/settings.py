@@ -21,9 +21,12 @@ CORNERS_A_STEP = {0: 400, 1: 1600}
 DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
 DEFAULT_NEIGHBORS = (16, 16, 24, 30, 40, 60)
 DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
+DEFAULT_MODEL_STEPS = {0: 1, 1: 50}
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
 # More than any step has time for; at an episode's end there are 400 times as many, which must fit into an int64.
 MAX_BACKUPS = 10**12
+# At the edge of what moves at all.
+MAX_MODEL_STEPS = 10_000
 # A fit to thousands of instances is no local one.
 MAX_NEIGHBORS = 10_000
 
@@ -40,6 +43,7 @@ class FittedRMaxSettings:
     model_breadth: float | None = None
     n_neighbors: int | None = None
     outcome_breadth: float = 0.05
+    max_model_steps: int | None = None
     min_fraction: float = 0.1
     min_weight: float | None = None
     exploration_threshold: float = 1.0
@@ -59,6 +63,11 @@ class FittedRMaxSettings:
             check_positive("model_breadth", self.model_breadth)
         check_count("n_neighbors", self.n_neighbors, min=2, max=MAX_NEIGHBORS, none_allowed=True)
         check_positive("outcome_breadth", self.outcome_breadth)
+        check_count("max_model_steps", self.max_model_steps, max=MAX_MODEL_STEPS, none_allowed=True)
+        if self.degree == 0 and self.max_model_steps not in (None, 1):
+            raise ValueError(
+                f"max_model_steps must be 1 or None with degree=0, the original algorithm, got {self.max_model_steps}"
+            )
         check_positive("min_fraction", self.min_fraction, max=1.0)
         if self.min_weight is not None:
             check_positive("min_weight", self.min_weight, max=0.99)
@@ -87,6 +96,10 @@ class FittedRMaxSettings:
     def min_weight_by_degree(self) -> float:
         """The weight below which instances do not count."""
         return DEFAULT_MIN_WEIGHTS[self.degree] if self.min_weight is None else float(self.min_weight)
+
+    def model_steps_by_degree(self) -> int:
+        """Most steps that the planner's model leads ahead."""
+        return DEFAULT_MODEL_STEPS[self.degree] if self.max_model_steps is None else int(self.max_model_steps)
 
     def backups_for(self, n_variables: int) -> int:
         """The backups of a step with so many state variables."""
@@ -119,6 +132,7 @@ class FittedRMaxSettings:
             max_instances=self.max_instances,
             n_neighbors=self.neighbors_for(n_variables),
             outcome_breadth=float(self.outcome_breadth),
+            max_model_steps=self.model_steps_by_degree(),
         )
 
 

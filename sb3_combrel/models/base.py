@@ -30,6 +30,7 @@ class ModelSettings:
     :param max_instances: of one action; None for no limit
     :param n_neighbors: of a local linear model: nearest instances that a fit is made to
     :param outcome_breadth: of a local linear model: breadth of the kernel for rewards and ends
+    :param max_model_steps: of a local linear model: most steps that a row of the finite MDP leads ahead
     """
 
     model_breadth: float
@@ -39,6 +40,7 @@ class ModelSettings:
     max_instances: int | None = None
     n_neighbors: int = 40
     outcome_breadth: float = 0.05
+    max_model_steps: int = 1
 
 
 class Predictions(NamedTuple):

@@ -10,14 +10,8 @@ from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_dista
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.linear_fits import (
-    PRIOR_WEIGHT,
-    RIDGE,
-    Kernel,
-    mean_outcome,
-    narrowed,
-    unexplained_effect,
-)
+from sb3_combrel.models.fit_arrays import Kernel
+from sb3_combrel.models.linear_fits import PRIOR_WEIGHT, RIDGE, mean_outcome, narrowed, unexplained_effect
 from sb3_combrel.planning.q_values import Prediction
 
 

@@ -11,18 +11,10 @@ from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
-from sb3_combrel.models.linear_fits import (
-    LEAST_SCALE,
-    FitScratch,
-    Kernel,
-    LinearFits,
-    enter_plain,
-    leave,
-    recount_pairs,
-    refit_changed,
-    update_rows_plain,
-)
+from sb3_combrel.models.fit_arrays import FitScratch, Kernel, LinearFits
+from sb3_combrel.models.fit_updates import LEAST_SCALE, enter_plain, leave, recount_pairs, refit_changed
 from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
+from sb3_combrel.models.linear_rows import update_rows_plain
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
 
@@ -51,6 +43,11 @@ class LocalLinear(CompiledModel):
     of a kernel average is of the order of the breadth, that of a linear fit of the order of its square, so a broad kernel,
     which needs few instances, predicts well. Predicted effects stay within the range of the effects seen. Rewards and ends,
     which jump from one state to the next, are kernel averages with a narrower kernel. One successor a pair: the mean.
+
+    A row of the finite MDP leads from a grid point to where its action, held for as many steps as it takes to leave the cell,
+    leads by the pair's own fit, at most ``max_model_steps``: values that are interpolated once a cell are nearer to the truth
+    than those that are interpolated once a step (Munos & Moore 2002). Where an instance near the point has ended an episode
+    it is one step.
 
     On the grid, the sums of each pair's regression are kept: an instance is added to those of all pairs that it reaches, and
     the regression is solved again only where the instances since the last time contradict it. When a pair has half as many
@@ -89,9 +86,11 @@ class LocalLinear(CompiledModel):
                 reach=np.full(n_pairs, self._kernel.reach),
                 scale=np.full(n_pairs, self._kernel.scale),
                 n_counted=np.zeros(n_pairs, dtype=np.int32),
+                n_ended=np.zeros(n_pairs, dtype=np.int32),
                 limit=np.full(n_pairs, n_near + n_near // 2, dtype=np.int32),
                 total=self.own_weight,
                 last_total=np.zeros(n_pairs),
+                clipped=np.zeros(n_pairs, dtype=np.bool_),
                 known=self.known,
                 claimed=np.zeros(n_pairs, dtype=np.bool_),
                 target=np.empty((self.n_actions, self.instances.capacity, d)),
@@ -104,6 +103,7 @@ class LocalLinear(CompiledModel):
             at=np.empty(d),
             entering=np.empty(d),
             state=np.empty(d),
+            step=np.empty(d),
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
             nearest=np.empty(n_near),
@@ -113,6 +113,9 @@ class LocalLinear(CompiledModel):
             distance=np.empty(n_points),
         )
         self._plain_scratch = tuple(self._scratch)
+        # The range of effects when rows were last brought in line with it.
+        self._range_before = self.fits.effect_range[:2].copy()
+        self._planned = self.mdp.gamma, settings.max_model_steps, self._prior is not None
         self._renew_targets()
         self._near = NearestLists(
             item=np.empty((self.n_actions, n_near), dtype=np.int32),
@@ -267,7 +270,10 @@ class LocalLinear(CompiledModel):
     def end_episode(self) -> np.ndarray:
         """Fit all pairs again that have had instances since the last time."""
         changed = np.empty(len(self.known), dtype=np.int64)
-        n = _refit_changed.call(self.fits, self.grid.arrays, self._scratch, changed)
+        effect_range = self.fits.effect_range[:2]
+        range_has_changed = (effect_range != self._range_before).any(axis=(0, 2))
+        n = _refit_changed.call(self.fits, self.grid.arrays, self._scratch, range_has_changed, changed)
+        self._range_before = effect_range.copy()
         return changed[:n]
 
     def outdated(self) -> np.ndarray:
@@ -280,7 +286,7 @@ class LocalLinear(CompiledModel):
         while done < len(pairs):
             query, scratch = (pairs, done), mdp.plain_scratch
             done = _update_rows.call(
-                self._plain_fits, mdp.plain, self.grid.plain, mdp.gamma, query, transferred, scratch, self._plain_scratch
+                self._plain_fits, mdp.plain, self.grid.plain, self._planned, query, transferred, scratch, self._plain_scratch
             )
             if done < len(pairs):
                 mdp.make_room()
@@ -342,3 +348,4 @@ class LocalLinear(CompiledModel):
             _recount.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._threshold_on_grid(), self._scratch)
         fits.total[:] = state["total"]
         self.update_all_rows()
+        self._range_before = fits.effect_range[:2].copy()

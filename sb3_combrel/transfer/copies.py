@@ -11,7 +11,7 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
-from sb3_combrel.models.linear_fits import Kernel
+from sb3_combrel.models.fit_arrays import Kernel
 from sb3_combrel.models.linear_prediction import NearestLists
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances

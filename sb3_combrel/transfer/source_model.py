@@ -10,7 +10,8 @@ from sb3_combrel.common.compiled import EntryPoint, compiled, inner
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
-from sb3_combrel.models.linear_fits import RIDGE, Kernel, narrowed
+from sb3_combrel.models.fit_arrays import Kernel
+from sb3_combrel.models.linear_fits import RIDGE, narrowed
 from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
 
 DEFAULT_SOURCE_BREADTH = 0.2
