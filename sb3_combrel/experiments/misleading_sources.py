@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from sb3_combrel.sources.source_instances import SourceInstances
 
-#: Standard deviation of the effects of ``noise``, in parts of the range of each variable.
-NOISE = 0.03
+#: Standard deviations of random effects, in parts of the range of each variable. True effects have 0.012 to 0.020, in both
+#: sources: the first is a fifth of that, the others twice and twenty times as much.
+NOISE: dict[str, float] = {"noise-small": 0.003, "noise": 0.03, "noise-large": 0.3}
 
 
-def noise(source: SourceInstances) -> SourceInstances:
-    """Effects are random, of about the size that effects have."""
+def noise(source: SourceInstances, size: float) -> SourceInstances:
+    """
+    Effects are random and say nothing; successors stay in the task's bounds.
+
+    :param source: a good source
+    :param size: standard deviation of the effects, in parts of the range of each variable
+    """
     rng = np.random.default_rng(0)
-    scale = NOISE * (source.scaling.high - source.scaling.low)
+    scale = size * (source.scaling.high - source.scaling.low)
     after = source.states + scale * rng.standard_normal(source.states.shape)
     return replace(source, next_states=np.clip(after, source.scaling.low, source.scaling.high))
 
@@ -53,7 +60,7 @@ def few(source: SourceInstances) -> SourceInstances:
 
 #: By name; each makes a misleading source of a good one.
 MISLEADING: dict[str, Callable[[SourceInstances], SourceInstances]] = {
-    "noise": noise,
+    **{name: partial(noise, size=size) for name, size in NOISE.items()},
     "shuffled": shuffled,
     "mirrored": mirrored,
     "wrong-goal": wrong_goal,

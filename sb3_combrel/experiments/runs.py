@@ -177,6 +177,14 @@ def coarse_on_purpose() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def outside_bounds_on_purpose() -> Iterator[None]:
+    """Suppress the warning of an observation outside the bounds that a task gives, which would come once for every run."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="(?s)the observation .* is outside the bounds")
+        yield
+
+
 def make_task(env_id: str, **kwargs: Any) -> Any:
     """
     Make one of the package's environments.

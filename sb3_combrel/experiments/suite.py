@@ -142,11 +142,11 @@ def _check(
 def _learn_sources(runs: Sequence[SuiteRun], console: Console) -> None:
     """Learn, once for all runs, the source tasks that they need."""
     for run in runs:
-        if run.variant.transfer is not None and not run.source_file.exists():
-            assert run.task.source is not None
-            console.print(f"Learning the source task {run.task.source.name} ...")
+        source = run.source
+        if source is not None and not run.file_of(source).exists():
+            console.print(f"Learning the source task {source.name} ...")
             (run.folder / SOURCES).mkdir(parents=True, exist_ok=True)
-            run.task.source.learn().save(run.source_file)
+            source.learn().save(run.file_of(source))
 
 
 def _carry_out_all(runs: Sequence[SuiteRun], jobs: int, console: Console) -> None:

@@ -63,12 +63,21 @@ def steps_in(first: int, last: int) -> Measure:
     :param first: number of the first episode
     :param last: number of the last episode
     """
-    return Measure(f"steps_{first}_to_{last}", lambda episodes: _of_range(episodes, first, last, np.sum))
+    return Measure(f"steps_{first}_to_{last}", lambda episodes: _of_range(episodes.steps, first, last, np.sum))
 
 
 def mean_steps_in(first: int, last: int) -> Measure:
     """Measure the mean steps of episodes ``first`` to ``last``, counted from 1."""
-    return Measure(f"mean_steps_{first}_to_{last}", lambda episodes: _of_range(episodes, first, last, np.mean))
+    return Measure(f"mean_steps_{first}_to_{last}", lambda episodes: _of_range(episodes.steps, first, last, np.mean))
+
+
+def mean_return_in(first: int, last: int) -> Measure:
+    """Measure the mean return of episodes ``first`` to ``last``, counted from 1: of the first ones, the jumpstart."""
+    return Measure(
+        f"mean_return_{first}_to_{last}",
+        lambda episodes: _of_range(episodes.returns, first, last, np.mean),
+        higher_is_better=True,
+    )
 
 
 def steps_until_always(limit: int) -> Measure:
@@ -151,7 +160,5 @@ def summary_of_evaluation(episodes: Episodes, failure_return: float | None, last
     }
 
 
-def _of_range(episodes: Episodes, first: int, last: int, statistic: Callable[[np.ndarray], float]) -> float:
-    if len(episodes.steps) < last:
-        return np.nan
-    return float(statistic(episodes.steps[first - 1 : last]))
+def _of_range(column: np.ndarray, first: int, last: int, statistic: Callable[[np.ndarray], float]) -> float:
+    return float(statistic(column[first - 1 : last])) if len(column) >= last else np.nan

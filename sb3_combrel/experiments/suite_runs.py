@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import os
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +17,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_combrel.experiments.runs import coarse_on_purpose
+from sb3_combrel.experiments.runs import coarse_on_purpose, outside_bounds_on_purpose
 from sb3_combrel.experiments.suite_measures import Episodes, summary_of_evaluation, summary_of_learning
-from sb3_combrel.experiments.suite_tasks import Task
-from sb3_combrel.experiments.suite_transfers import make_transfer
+from sb3_combrel.experiments.suite_tasks import Source, Task
+from sb3_combrel.experiments.suite_transfers import make_transfer, source_for
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 
 #: Evaluation episodes begin with this seed plus the run's: no run has learnt with it.
@@ -82,10 +80,13 @@ class SuiteRun:
         return self.folder / RUNS / f"{self.name}.json"
 
     @property
-    def source_file(self) -> Path:
-        """The instances of the task's source task."""
-        assert self.task.source is not None
-        return self.folder / SOURCES / f"{self.task.source.name}.npz"
+    def source(self) -> Source | None:
+        """The source task that the variant transfers from; None without transfer."""
+        return None if self.variant.transfer is None else source_for(self.variant.transfer, self.task)
+
+    def file_of(self, source: Source) -> Path:
+        """The file with the instances of a source task."""
+        return self.folder / SOURCES / f"{source.name}.npz"
 
     def settings(self) -> dict[str, Any]:
         """What the results depend on besides the names, as JSON represents it."""
@@ -114,10 +115,12 @@ class SuiteRun:
 
     def make_model(self, env: gym.Env) -> FittedRMax:
         """Make the learner, which has learnt nothing yet."""
-        transfer = self.variant.transfer and make_transfer(self.variant.transfer, self.task, self.source_file)
+        transfer = None
+        if self.variant.transfer is not None and self.source is not None:
+            transfer = make_transfer(self.variant.transfer, self.task, self.file_of(self.source))
         with coarse_on_purpose():
             learner = {**self.task.learner, **self.variant.learner}
-            return FittedRMax(env, transfer=transfer or None, seed=self.seed, **learner)
+            return FittedRMax(env, transfer=transfer, seed=self.seed, **learner)
 
 
 class EpisodeRecorder(BaseCallback):
@@ -156,7 +159,7 @@ def carry_out(run: SuiteRun) -> SuiteRun:
     th.set_num_threads(1)
     _compile(run)
     recorder = EpisodeRecorder(run.task.n_episodes)
-    with closing(run.task.make()) as env, _outside_bounds_on_purpose():
+    with closing(run.task.make()) as env, outside_bounds_on_purpose():
         model = run.make_model(env)
         start = time.process_time()
         model.learn(run.task.n_steps or UNLIMITED, recorder, log_interval=None)
@@ -188,7 +191,7 @@ def evaluate(run: SuiteRun, model: FittedRMax, last10_return: float) -> dict[str
     """
     found: dict[str, float] = {}
     for name, keeps_state in ((WITH_STATE, True), (WITHOUT_STATE, False)):
-        with closing(run.task.make()) as env, _outside_bounds_on_purpose():
+        with closing(run.task.make()) as env, outside_bounds_on_purpose():
             episodes = play(model, env, run.evaluation_episodes, EVALUATION_SEED + run.seed, keeps_state)
         summary = summary_of_evaluation(episodes, run.task.failure_return, last10_return)
         found |= {f"{name}_{key}": value for key, value in summary.items()}
@@ -247,20 +250,12 @@ def _rows_of(run: SuiteRun, episodes: Episodes) -> list[list[Any]]:
     ]
 
 
-@contextlib.contextmanager
-def _outside_bounds_on_purpose() -> Iterator[None]:
-    """Suppress the warning of an observation outside the bounds that a task gives, which would come once for every run."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="(?s)the observation .* is outside the bounds")
-        yield
-
-
 def _compile(run: SuiteRun) -> None:
     """Learn for some steps, so that compiling, or loading what was compiled before, is not in the time of a step."""
     key = (run.task.name, run.variant.name)
     if key in _COMPILED:
         return
-    with closing(run.task.make()) as env, _outside_bounds_on_purpose():
+    with closing(run.task.make()) as env, outside_bounds_on_purpose():
         model = run.make_model(gym.wrappers.TimeLimit(env, COMPILED_STEPS // 2)).learn(COMPILED_STEPS, log_interval=None)
         play(model, gym.wrappers.TimeLimit(env, 3), 1, run.seed, keeps_state=True)
     _COMPILED.add(key)

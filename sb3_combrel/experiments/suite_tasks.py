@@ -11,11 +11,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeAction
 
-from sb3_combrel.experiments import ball_striking, mountain_car
+from sb3_combrel.experiments import ball_striking, cart_pole, mountain_car
 from sb3_combrel.experiments.point_robot import make_point_robot
 from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.experiments.suite_measures import (
     Measure,
+    mean_return_in,
     mean_steps_in,
     steps_in,
     steps_until_always,
@@ -119,12 +120,6 @@ def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
 CAP = 2000
 #: A hit by the first command returns 99.
 STRIKE: dict[str, Any] = {"max_value": 100.0}
-#: As in zoo_configs/fitted_rmax.yml. The velocities of the pole and the cart have no bounds of their own.
-CART_POLE: dict[str, Any] = {
-    "gamma": 0.99,
-    "max_value": 100.0,
-    "bounds": ([-4.8, -3.0, -0.23, -3.2], [4.8, 3.0, 0.23, 3.2]),
-}
 #: As in zoo_configs/fitted_rmax.yml: the bounds of the velocities leave out what the swing-up does not reach.
 ACROBOT: dict[str, Any] = {
     "gamma": 0.99,
@@ -136,12 +131,14 @@ SLIGHT_NOISE = 0.003
 
 CAR_2D = Source("mountain_car_2d", mountain_car.learn_source)
 TORSO = Source("icub_torso", ball_striking.learn_source)
+CART_POLE = Source("cart_pole", cart_pole.learn_source)
 
 _car_2d = partial(make_task, mountain_car.SOURCE_ID, max_episode_steps=CAP)
 _car_4d = partial(make_task, mountain_car.TARGET_ID, max_episode_steps=CAP)
 _car_6d = partial(make_task, "combrel/MountainCar6D-v0", max_episode_steps=CAP)
 _gym_car = partial(make_task, "MountainCar-v0", disable_env_checker=True)
-_cart_pole = partial(make_task, "CartPole-v1", disable_env_checker=True)
+_cart_pole = cart_pole.make_cart_pole
+_long_cart_pole = partial(cart_pole.make_cart_pole, cart_pole.LONG, cart_pole.ORDER)
 _noisy_car_2d = partial(make_noisy, mountain_car.SOURCE_ID, max_episode_steps=CAP)
 _noisy_gym_car = partial(make_noisy, "MountainCar-v0", disable_env_checker=True)
 
@@ -149,6 +146,8 @@ _TWELVE = steps_in(1, 12)
 _LAST_OF_60 = mean_steps_in(41, 60)
 _LAST_OF_50 = mean_steps_in(41, 50)
 _FIRST_8 = mean_steps_in(1, 8)
+_FIRST_EPISODE = mean_return_in(1, 1)
+_FIRST_3 = mean_return_in(1, 3)
 _TORSO_SETTLED = steps_until_always(27)
 _NEAR_50 = steps_until_median(50)
 # 475 is Gymnasium's own threshold.
@@ -167,7 +166,17 @@ _ALL = (
     Task("MountainCar-v0-noisy", _noisy_gym_car, n_steps=3000),
     Task("Acrobot-v1", make_acrobot, ACROBOT, n_steps=6000),
     Task("Acrobot-v1-15000", make_acrobot, ACROBOT, n_steps=15_000),
-    Task("CartPole-v1", _cart_pole, CART_POLE, n_steps=3000, failure_return=_FALLEN),
+    Task("CartPole-v1", _cart_pole, cart_pole.LEARNER, n_steps=3000, failure_return=_FALLEN),
+    Task(
+        "CartPole-long",
+        _long_cart_pole,
+        cart_pole.LONG_LEARNER,
+        n_steps=5000,
+        # Both the jumpstart and, as the headline, what is left of it after learning.
+        measures=(_FIRST_EPISODE, _FIRST_3),
+        failure_return=_FALLEN,
+        source=CART_POLE,
+    ),
     Task("Pendulum-v1", make_pendulum, {"gamma": 0.97}, n_steps=1000, failure_return=_NOT_UP),
     *(
         Task(

@@ -1,14 +1,20 @@
-"""The transfer methods of the suite, by name."""
+"""
+The transfer methods of the suite, by name, and the source from which each transfers.
+
+``COMBREL@...`` is COMBREL from a source that misleads: the task's own one changed, see
+:mod:`~sb3_combrel.experiments.misleading_sources`, or with ``COMBREL@other-domain`` one of another domain.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from sb3_combrel import COMBREL, TIMBREL, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping, SourceInstances
+from sb3_combrel.experiments import cart_pole
 from sb3_combrel.experiments.misleading_sources import MISLEADING
-from sb3_combrel.experiments.mountain_car import factored_mapping
-from sb3_combrel.experiments.suite_tasks import Task
+from sb3_combrel.experiments.mountain_car import factored_mapping, intuitive_mapping
+from sb3_combrel.experiments.suite_tasks import CAR_2D, CART_POLE, TORSO, Source, Task
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -16,12 +22,25 @@ def _misled(change: Callable[[SourceInstances], SourceInstances]) -> Callable[[S
     return lambda source, task: COMBREL(change(source))
 
 
-#: The mapping that a person would choose, by task.
-ORACLES = {
+OTHER_DOMAIN = "COMBREL@other-domain"
+#: By the name of a task's own source: the source of another domain.
+OTHER_DOMAINS: dict[str, Source] = {CAR_2D.name: TORSO, TORSO.name: CAR_2D, CART_POLE.name: CAR_2D}
+
+#: The mapping that a person would choose with ``use="prior"``, by task.
+ORACLES: dict[str, FactoredMapping] = {
     "MountainCar4D": factored_mapping(2),
     "MountainCar4D-60": factored_mapping(2),
     "MountainCar6D": factored_mapping(3),
+    "CartPole-long": FactoredMapping((cart_pole.right_mapping(),)),
 }
+#: The same with ``use="instances"``: one mapping, or one for each action of the target.
+INSTANCE_ORACLES: dict[str, InterTaskMapping | Sequence[InterTaskMapping]] = {
+    "MountainCar4D": intuitive_mapping(),
+    "MountainCar4D-60": intuitive_mapping(),
+    "CartPole-long": cart_pole.right_mapping(),
+}
+# By the transfer method that needs them.
+_ORACLES_OF: dict[str, Mapping[str, object]] = {"oracle": ORACLES, "oracle-instances": INSTANCE_ORACLES}
 
 #: From the name on the command line to a function of (source instances, name of the task).
 TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
@@ -30,6 +49,8 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
     "TIMBREL-random": lambda source, task: TIMBREL(source, "random"),
     "random": lambda source, task: TIMBREL(source, "random", mappings="factored", use="prior"),
     "oracle": lambda source, task: TIMBREL(source, ORACLES[task], use="prior"),
+    "oracle-instances": lambda source, task: TIMBREL(source, INSTANCE_ORACLES[task], use="instances"),
+    OTHER_DOMAIN: lambda source, task: COMBREL(source),
     **{f"COMBREL@{name}": _misled(change) for name, change in MISLEADING.items()},
 }
 
@@ -40,22 +61,45 @@ def make_transfer(name: str, task: Task, source: Path) -> Transfer:
 
     :param name: one of :data:`TRANSFERS`
     :param task: the target task
-    :param source: file with the instances of its source task
-    :raises ValueError: if the name is unknown, or the task has no source task
+    :param source: file with the instances of the source task, that of :func:`source_for`
+    :raises ValueError: as :func:`check_transfer` does
     """
     check_transfer(name, task)
     return TRANSFERS[name](SourceInstances.load(source), task.name)
+
+
+def source_for(name: str, task: Task) -> Source:
+    """
+    Return the source task from which a transfer method transfers to a task.
+
+    :param name: one of :data:`TRANSFERS`
+    :param task: the target task
+    :return: the task's own source; for ``COMBREL@other-domain`` the one of another domain
+    :raises ValueError: if the task has no source task, or none of another domain is known
+    """
+    if task.source is None:
+        raise ValueError(f"transfer={name}: the task {task.name} has no source task")
+    if name != OTHER_DOMAIN:
+        return task.source
+    if task.source.name not in OTHER_DOMAINS:
+        raise ValueError(
+            f"transfer={name}: for {task.name} no source of another domain is known; known are those for tasks whose own "
+            f"source is one of {', '.join(OTHER_DOMAINS)}, got {task.source.name!r}"
+        )
+    return OTHER_DOMAINS[task.source.name]
 
 
 def check_transfer(name: str, task: Task) -> None:
     """
     Check that a task can be learnt with a transfer method.
 
-    :raises ValueError: if the name is unknown, or the task has no source task
+    :param name: its name
+    :param task: the target task
+    :raises ValueError: if the name is unknown, the task has no such source task, or the mapping that is asked for is not known
     """
     if name not in TRANSFERS:
         raise ValueError(f"transfer must be one of {', '.join(TRANSFERS)}, got {name!r}")
-    if task.source is None:
-        raise ValueError(f"transfer={name}: the task {task.name} has no source task")
-    if name == "oracle" and task.name not in ORACLES:
-        raise ValueError(f"transfer=oracle: nobody knows the mapping of {task.name}; known are {', '.join(ORACLES)}")
+    source_for(name, task)
+    known = _ORACLES_OF.get(name)
+    if known is not None and task.name not in known:
+        raise ValueError(f"transfer={name}: nobody knows the mapping of {task.name}; known are {', '.join(known)}")

@@ -18,6 +18,7 @@ from sb3_combrel.experiments.statistics import holm, p_value_of_difference
 from sb3_combrel.experiments.suite_measures import (
     Episodes,
     failures,
+    mean_return_in,
     mean_steps_in,
     steps_in,
     steps_until_always,
@@ -28,7 +29,7 @@ from sb3_combrel.experiments.suite_measures import (
 from sb3_combrel.experiments.suite_report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
 from sb3_combrel.experiments.suite_runs import SuiteRun, Variant, play
 from sb3_combrel.experiments.suite_tasks import TASKS, NoisyActions, Task, tasks_of
-from sb3_combrel.experiments.suite_transfers import TRANSFERS, make_transfer
+from sb3_combrel.experiments.suite_transfers import INSTANCE_ORACLES, ORACLES, TRANSFERS, make_transfer, source_for
 
 SMALL = Task("small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(steps_in(1, 3),), headline="steps_1_to_3")
 SHORT = Task("short", partial(make_point_robot, 2), n_steps=500)
@@ -132,15 +133,74 @@ def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
     run(tmp_path, tasks=[task], variants=[Variant("combrel", {"gamma": 0.99}, "COMBREL")])
     assert len(calls) == 1
     assert len(rows_of(tmp_path / "runs.csv")) == 2
-    # The oracle's mapping is known for the Mountain Cars only.
-    for name in TRANSFERS.keys() - {"oracle"}:
-        assert make_transfer(name, task, tmp_path / "sources" / "robot_2d.npz") is not None
-    with pytest.raises(ValueError, match="nobody knows the mapping of robot"):
-        make_transfer("oracle", task, tmp_path / "sources" / "robot_2d.npz")
+    # Neither the right mapping nor a source of another domain is known for a task of our own.
+    unknown = {"oracle": "nobody knows the mapping of robot", "oracle-instances": "nobody knows the mapping of robot"}
+    unknown["COMBREL@other-domain"] = "robot no source of another domain"
+    for name in TRANSFERS:
+        if name not in unknown:
+            assert make_transfer(name, task, tmp_path / "sources" / "robot_2d.npz") is not None
+            continue
+        with pytest.raises(ValueError, match=unknown[name]):
+            make_transfer(name, task, tmp_path / "sources" / "robot_2d.npz")
     with pytest.raises(ValueError, match="no source task"):
         run(tmp_path, tasks=[SHORT], variants=[Variant("combrel", {}, "COMBREL")])
     with pytest.raises(ValueError, match="transfer must be one of"):
         run(tmp_path, tasks=[task], variants=[Variant("other", {}, "OTHER")])
+
+
+def test_a_source_of_another_domain_is_learnt_in_place_of_the_own(tmp_path, monkeypatch):
+    from sb3_combrel import SourceInstances
+    from sb3_combrel.experiments import suite_transfers
+    from sb3_combrel.experiments.suite_tasks import Source
+
+    calls = []
+
+    def learn(name, make):
+        calls.append(name)
+        return SourceInstances.record(None, make(), n_instances=100, seed=0)
+
+    own = Source("robot_2d", partial(learn, "own", partial(make_point_robot, 2)))
+    other = Source("car", partial(learn, "other", partial(make_task, "MountainCar-v0", disable_env_checker=True)))
+    monkeypatch.setitem(suite_transfers.OTHER_DOMAINS, own.name, other)
+    task = Task("robot", partial(make_point_robot, 3), n_steps=150, source=own)
+    variants = [Variant("none", {"degree": 1}), Variant("other", {}, "COMBREL@other-domain")]
+    run(tmp_path, tasks=[task], variants=variants)
+    assert calls == ["other"], "once, and the task's own source is not needed"
+    assert [path.name for path in (tmp_path / "sources").iterdir()] == ["car.npz"]
+    used = SuiteRun(tmp_path, task, variants[1], 0, 1).make_model(task.make())
+    assert used.transfer.source.origin["env"] == "MountainCar-v0"
+    run(tmp_path, tasks=[task], variants=[*variants, Variant("own", {}, "COMBREL")])
+    assert calls == ["other", "own"]
+
+
+def test_the_other_domain_is_the_torso_for_cars_and_the_car_for_the_arm():
+    for name, source in {
+        "MountainCar4D": "icub_torso",
+        "MountainCar6D": "icub_torso",
+        "ICubArm-noisy": "mountain_car_2d",
+        "CartPole-long": "mountain_car_2d",
+    }.items():
+        task = TASKS[name]
+        assert source_for("COMBREL@other-domain", task).name == source != task.source.name
+        assert source_for("COMBREL", task) is source_for("COMBREL@noise-large", task) is task.source
+    with pytest.raises(ValueError, match="CartPole-v1 has no source task"):
+        source_for("COMBREL@other-domain", TASKS["CartPole-v1"])
+
+
+@pytest.mark.parametrize("name", sorted({*ORACLES, *INSTANCE_ORACLES}))
+def test_mappings_that_are_given_fit_their_tasks(name):
+    env = TASKS[name].make()
+    n_variables, n_actions = (4, 2) if TASKS[name].source.name == "cart_pole" else (2, 3)
+    of_instances = INSTANCE_ORACLES.get(name, [])
+    given = [ORACLES[name], *(of_instances if isinstance(of_instances, list) else [of_instances])]
+    for mapping in given:
+        mapping.check(
+            n_source_variables=n_variables,
+            n_target_variables=env.observation_space.shape[0],
+            n_source_actions=n_actions,
+            n_target_actions=env.action_space.n,
+        )
+    env.close()
 
 
 def test_variants_are_read_from_text():
@@ -214,6 +274,8 @@ def test_measures_of_hand_made_episodes():
     assert steps_in(1, 3).of(episodes) == 170
     assert mean_steps_in(4, 5).of(episodes) == 40
     assert np.isnan(steps_in(1, 10).of(episodes))
+    assert mean_return_in(1, 3).of(episodes._replace(returns=np.arange(9.0) ** 2)) == pytest.approx(5 / 3)
+    assert np.isnan(mean_return_in(1, 10).of(episodes)) and mean_return_in(1, 1).higher_is_better
     assert steps_until_always(27).of(episodes) == 230
     assert steps_until_always(59).of(episodes) == 230
     assert steps_until_always(60).of(episodes) == 100
