@@ -13,7 +13,8 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import GOES_ON, Outcomes
 from sb3_combrel.transfer.candidates import Candidate
-from sb3_combrel.transfer.copies import MANY, Copies, CopySums, Predicted
+from sb3_combrel.transfer.copies import MANY, Copies, Predicted
+from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
