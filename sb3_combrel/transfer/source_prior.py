@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 
 import numpy as np
@@ -11,7 +10,7 @@ from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.mappings.factored_mapping import describe_actions, describe_copy
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.borne_out import GOES_ON, Outcomes
+from sb3_combrel.transfer.borne_out import GOES_ON, TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
 from sb3_combrel.transfer.candidates import Candidate
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
@@ -31,7 +30,6 @@ MIN_TRUST = 0.5
 MIN_EXPLAINED = 0.25
 # Trust is in steps of this: with every change all pairs are predicted anew.
 TRUST_STEP = 0.1
-TRANSITIONS_BEFORE_WARNING = 300
 
 
 class SourcePrior:
@@ -294,17 +292,12 @@ class SourcePrior:
         if self._warned or self.n_observed < TRANSITIONS_BEFORE_WARNING or not self.error() > 1.0:
             return
         self._warned = True
-        names = ", ".join(str(source.origin.get("env", source)) for source in self.copies.sources)
-        warnings.warn(
-            f"what was transferred from {names} predicts the target worse than that nothing changes: on {self.n_observed} "
-            f"transitions its mean squared error is {self.error():.2f} times as large; try another mapping or source",
-            stacklevel=2,
-        )
+        warn_of_error(self.copies.sources, self.n_observed, self.error())
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""
         return {
-            "transfer/prior_error": self.error(),
+            "transfer/prediction_error": self.error(),
             "transfer/prior_trust": float(self.trust.mean()),
             "transfer/prior_doubted": float(self.outcomes.doubted),
             "transfer/ends_confirmed": self.outcomes.confirmed,
