@@ -14,8 +14,8 @@ from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, Outcomes,
 WINDOW = 200
 # So much must be new since the kernel was last narrowed: transitions that were compared, ends predicted that did not come.
 MIN_TRANSITIONS, MIN_CONTRADICTIONS = 20, 3
-# So many episodes in a row that ran into their time limit, with nothing in the rewards that tells states apart.
-EPISODES_IN_VAIN = 20
+# So many episodes that ran into their time limit without a single transferred instance tried, and none that ended in between.
+EPISODES_IN_VAIN = 3
 # Predictions that wait for their transition, at most: of many environments at once, or of actions never carried out.
 MAX_PENDING = 1024
 
@@ -30,8 +30,9 @@ class InstancesCheck:
     - at least ``MIN_TRANSITIONS`` were compared, and the error of the predicted effects is larger than that of "no change"; or
     - the ends that they predict did not come on at least ``MIN_CONTRADICTIONS`` visits (see :class:`Outcomes`), and never one
       has come where it was predicted. Without this, right dynamics with a wrong goal are not found out; or
-    - ``EPISODES_IN_VAIN`` episodes in a row ran into their time limit with the same reward, not above 0, at every step: where
-      instances are transferred to all states and no end is known, nothing is optimistic, and nothing would ever be explored.
+    - nothing can be found out any more: ``EPISODES_IN_VAIN`` episodes, and none that ended by itself in between, ran into
+      their time limit without one step on transferred instances, and all rewards are alike and not above 0. Where instances
+      are transferred to all other states and lead nowhere, nothing is optimistic, and nothing would ever be explored.
 
     Wrong rewards do not count: the target's own transitions correct them where the agent goes.
 
@@ -49,6 +50,8 @@ class InstancesCheck:
         # Transitions compared and ends contradicted, as far as they have narrowed the kernel.
         self._used_up = 0, 0
         self._in_vain = 0
+        # Transitions compared before the present episode.
+        self._n_before = 0
         self._warned = False
         self._pending: dict[bytes, TransferredInstances] = {}
 
@@ -95,7 +98,8 @@ class InstancesCheck:
         if not self._warned and self.n_compared >= TRANSITIONS_BEFORE_WARNING and self.error() > 1.0:
             self._warned = True
             warn_of_error(self._sources, WINDOW, self.error())
-        self._in_vain = self._in_vain + 1 if truncated else 0
+        self._in_vain = self._in_vain + (self.n_compared == self._n_before) if truncated else 0
+        self._n_before = self.n_compared
         if not (truncated and self._contradicted()):
             return False
         self._used_up = self.n_compared, self.outcomes.contradicted
@@ -119,8 +123,8 @@ class InstancesCheck:
         return wrong / baseline if baseline > 0.0 else np.nan
 
     def get_state(self) -> np.ndarray:
-        """What was found so far, float64, shape (15,)."""
-        figures = *self._sums, self.n_compared, *self._used_up, self._in_vain, self._warned
+        """What was found so far, float64, shape (16,)."""
+        figures = *self._sums, self.n_compared, *self._used_up, self._in_vain, self._n_before, self._warned
         return np.concatenate([np.array(figures, dtype=np.float64), self.outcomes.get_state()])
 
     def set_state(self, state: np.ndarray) -> None:
@@ -128,6 +132,6 @@ class InstancesCheck:
         if not state.any():
             return
         self._sums = np.array(state[:2])
-        self.n_compared, compared, contradicted, self._in_vain = (int(value) for value in state[2:6])
-        self._used_up, self._warned = (compared, contradicted), bool(state[6] > 0.5)
-        self.outcomes.set_state(state[7:])
+        self.n_compared, compared, contradicted, self._in_vain, self._n_before = (int(value) for value in state[2:7])
+        self._used_up, self._warned = (compared, contradicted), bool(state[7] > 0.5)
+        self.outcomes.set_state(state[8:])

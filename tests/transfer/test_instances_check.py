@@ -113,7 +113,7 @@ def test_a_right_source_keeps_its_breadth_in_episodes_that_reach_their_limit():
     def noisy(action, rng):
         return STEP[action] + 0.01 * rng.normal(size=2)
 
-    found, method = breadths(steady_source(), EPISODES_IN_VAIN - 1, noisy)
+    found, method = breadths(steady_source(), 40, noisy)
     assert found == [0.3] * len(found)
     assert 0.0 < method.statistics()["transfer/prediction_error"] < 0.2
 
@@ -185,7 +185,7 @@ def test_ends_that_came_once_outweigh_those_that_did_not():
 @pytest.mark.parametrize(
     ("rewards", "narrows"), [((-1.0, -1.0), True), ((0.0, 0.0), True), ((1.0, 1.0), False), ((-1.0, 0.0), False)]
 )
-def test_many_episodes_in_vain_count_where_no_reward_tells_states_apart(rewards, narrows):
+def test_episodes_in_which_nothing_is_tried_count_where_no_reward_tells_states_apart(rewards, narrows):
     check = check_of()
     found = []
     for _ in range(EPISODES_IN_VAIN + 1):
@@ -195,6 +195,18 @@ def test_many_episodes_in_vain_count_where_no_reward_tells_states_apart(rewards,
     assert found == [False] * (EPISODES_IN_VAIN - 1) + [narrows] * 2
     check.end_episode(False)
     assert not check.end_episode(True)
+
+
+def test_episodes_in_which_something_transferred_is_tried_are_not_in_vain():
+    check = check_of()
+    for _ in range(10):
+        step(check, one_instance([0.05, 0.0]), [0.05, 0.0])
+        assert not check.end_episode(True)
+    for _ in range(EPISODES_IN_VAIN - 1):
+        assert not check.end_episode(True)
+    step(check, one_instance([0.05, 0.0]), [0.05, 0.0])
+    assert not check.end_episode(True)
+    assert check.end_episode(True), "the one before is only not counted"
 
 
 def test_wrong_effects_are_warned_of_once():
