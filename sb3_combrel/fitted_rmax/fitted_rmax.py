@@ -110,7 +110,8 @@ class FittedRMax(PersistentAlgorithm):
     :param outcome_breadth: with ``degree=1``, breadth of the narrower kernel by which rewards, ends, and what a fit leaves
         unexplained are averaged
     :param max_model_steps: with ``degree=1``, the planner follows an action from a grid point by the local fit until a cell of
-        the grid is left, but for no more than so many steps; 1: one step, as the original does. None: 50.
+        the grid is left, but for no more than so many steps; 1: one step, as the original does. None: 3 for four or five
+        state variables, 50 for fewer or more.
     :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
         Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
         says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.

@@ -208,8 +208,9 @@ class FittedRMaxPolicy(BasePolicy):
     ) -> None:
         expected = self.agent.get_state()
         if self.agent.settings.degree == 0:
-            # Version 0.1.0, which had the kernel average only, did not count them.
-            state_dict.setdefault(prefix + "visits", th.zeros(expected["visits"].shape, dtype=th.float64))
+            # Version 0.1.0, which had the kernel average only, did not have them.
+            for name in {"visits", "transfer_check"} & expected.keys():
+                state_dict.setdefault(prefix + name, th.zeros(expected[name].shape, dtype=th.float64))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):

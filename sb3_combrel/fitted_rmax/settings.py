@@ -21,7 +21,8 @@ CORNERS_A_STEP = {0: 400, 1: 1600}
 DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
 DEFAULT_NEIGHBORS = (16, 16, 24, 30, 40, 60)
 DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
-DEFAULT_MODEL_STEPS = {0: 1, 1: 50}
+# Of degree 1. Mountain Car 4D must change between its actions more often than once a cell.
+DEFAULT_MODEL_STEPS = (50, 50, 50, 3, 3, 50)
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
 # More than any step has time for; at an episode's end there are 400 times as many, which must fit into an int64.
 MAX_BACKUPS = 10**12
@@ -97,9 +98,11 @@ class FittedRMaxSettings:
         """The weight below which instances do not count."""
         return DEFAULT_MIN_WEIGHTS[self.degree] if self.min_weight is None else float(self.min_weight)
 
-    def model_steps_by_degree(self) -> int:
-        """Most steps that the planner's model leads ahead."""
-        return DEFAULT_MODEL_STEPS[self.degree] if self.max_model_steps is None else int(self.max_model_steps)
+    def model_steps_for(self, n_variables: int) -> int:
+        """Most steps that the planner's model leads ahead with so many state variables."""
+        if self.max_model_steps is not None:
+            return int(self.max_model_steps)
+        return int(_by_number(DEFAULT_MODEL_STEPS, n_variables)) if self.degree else 1
 
     def backups_for(self, n_variables: int) -> int:
         """The backups of a step with so many state variables."""
@@ -132,7 +135,7 @@ class FittedRMaxSettings:
             max_instances=self.max_instances,
             n_neighbors=self.neighbors_for(n_variables),
             outcome_breadth=float(self.outcome_breadth),
-            max_model_steps=self.model_steps_by_degree(),
+            max_model_steps=self.model_steps_for(n_variables),
         )
 
 

@@ -1,8 +1,13 @@
-"""Whether the target's own transitions bear out the ends and rewards that a source predicts."""
+"""Whether the target's own transitions bear out what a source predicts: ends and rewards, and a warning of wrong effects."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+
 import numpy as np
+
+from sb3_combrel.sources.source_instances import SourceInstances
 
 # A transition is predicted to end the episode above the first, and not to end it below the second: between them, at the
 # border of where episodes end, a kernel average decides nothing.
@@ -12,6 +17,23 @@ STEPS_OF_A_VISIT = 10
 # So many episodes that ran into their time limit, and never an end where one is predicted.
 EPISODES_IN_VAIN = 3
 MIN_REWARDS = 10
+# Transitions from which on predictions worse than "no change" are warned of.
+TRANSITIONS_BEFORE_WARNING = 300
+
+
+def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> None:
+    """
+    Warn that what was transferred predicts the target worse than "no change".
+
+    :param n: transitions that the error is of
+    :param error: mean squared error of the predicted effects, over that of "no change"
+    """
+    names = ", ".join(str(source.origin.get("env", source)) for source in sources)
+    warnings.warn(
+        f"what was transferred from {names} predicts the target worse than that nothing changes: on {n} "
+        f"transitions its mean squared error is {error:.2f} times as large; try another mapping or source",
+        stacklevel=3,
+    )
 
 
 class Outcomes:

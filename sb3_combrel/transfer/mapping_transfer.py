@@ -19,6 +19,7 @@ from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike
 from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.instances_check import InstancesCheck
 from sb3_combrel.transfer.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
@@ -50,7 +51,8 @@ class MappingTransfer(Transfer):
     :param source: instances, a path to them, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
     :param breadth: kernel breadth of transferred instances, in unit coordinates
-    :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit
+    :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after the target's own transitions
+        have contradicted what was transferred (see :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`)
     :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance
     :param relevance_fraction: mu of Eq. 4
@@ -131,6 +133,8 @@ class MappingTransfer(Transfer):
         )
         self._selector = self._make_selector(task)
         self._last_selected: Ranges = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        self._last_state = np.empty(0)
+        self._check = InstancesCheck(self.candidates.sources, float(task.exploration_threshold))
         self._uses: Counter[int] = Counter()
         self._instances_used = 0
         self._n_of_relevance = 0
@@ -169,6 +173,7 @@ class MappingTransfer(Transfer):
         if self.use == "prior":
             return TransferredInstances.empty(len(actions), states.shape[1])
         self._last_selected = self._selector.select(states, actions, own_weight)
+        self._last_state = states[0]
         return self._translator(states, own_weight, self._last_selected)
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
@@ -202,6 +207,7 @@ class MappingTransfer(Transfer):
         if self.use == "prior":
             self._prior.observe(state, action, reward, effect, terminated)
             return
+        self._check.observe(state, action, reward, effect, terminated)
         selector = self._selector
         selector.before_transition()
         if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
@@ -212,15 +218,16 @@ class MappingTransfer(Transfer):
 
     def end_episode(self, truncated: bool) -> None:
         """
-        Take in the end of an episode; one that reached its time limit narrows the kernel of transferred instances.
+        Take in the end of an episode.
 
-        Where transferred instances reach the threshold everywhere, wrongly, nothing is optimistic and nothing would ever
-        be explored.
+        One that reached its time limit narrows the kernel of transferred instances, if the target's own transitions have
+        contradicted them: where they reach the threshold everywhere, wrongly, nothing is optimistic and nothing would ever be
+        explored. A time limit alone says nothing against them.
         """
         if self.use == "prior":
             self._prior.end_episode(truncated)
             return
-        if truncated and self.breadth_decay < 1.0:
+        if self._check.end_episode(truncated) and self.breadth_decay < 1.0:
             self._translator.set_breadth(self._translator.rules.breadth * self.breadth_decay)
             self._all_changed = True
         if self._selector.end_episode() and self.relevance:
@@ -230,6 +237,7 @@ class MappingTransfer(Transfer):
         if self.use == "prior":
             return
         first, _ = self._last_selected
+        self._check.note_use(self._last_state, transferred, len(first))
         for candidate, n in zip(first.tolist(), transferred.length[: len(first)].tolist(), strict=True):
             if n > 0 and self._selector.selects_one:
                 self._uses[candidate] += 1
@@ -300,6 +308,8 @@ class MappingTransfer(Transfer):
             "transfer/instances_used": self._instances_used,
             "transfer/uses": sum(self._uses.values()),
             "transfer/mappings_used": len(self._uses),
+            "transfer/prediction_error": self._check.error(),
+            "transfer/breadth": self._translator.rules.breadth,
             **self._selector.statistics(),
         }
 
@@ -321,6 +331,7 @@ class MappingTransfer(Transfer):
             "breadth": np.array([self._translator.rules.breadth]),
             "uses": uses,
             "instances_used": np.array([float(self._instances_used)]),
+            "check": self._check.get_state(),
             **self._selector.get_state(),
         }
 
@@ -340,6 +351,7 @@ class MappingTransfer(Transfer):
         used = np.flatnonzero(state["uses"] >= 1.0)
         self._uses = Counter(dict(zip(used.tolist(), state["uses"][used].astype(np.int64).tolist(), strict=True)))
         self._instances_used = int(state["instances_used"][0])
+        self._check.set_state(state["check"])
         if self.relevance and self._selector.n_used():
             self._renew_relevance(self._selector.n_used())
 

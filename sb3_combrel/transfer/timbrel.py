@@ -46,8 +46,14 @@ class TIMBREL(MappingTransfer):
         paper's sets, a list of mappings or a ``MappingSet``
     :param breadth: kernel breadth of transferred instances, in unit coordinates. The paper names none; it needs to be
         wide enough for 1000 instances to cover the source.
-    :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit (the paper: none, 1). So pairs
-        for which the source is wrong are explored in the end, whatever the source.
+    :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after new evidence against what
+        was transferred (the paper: none, 1): the target's own transitions were predicted worse than by "no change", or ends
+        were predicted that never came, or there was nothing left to find out (see
+        :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`). So pairs for which the source is wrong are explored in
+        the end, whatever the source. A point robot among walls, from two to three dimensions by a mapping made by hand
+        (``degree=0``), with a model breadth of 0.05 reached its goal in 284, 290 and 282 of 300 episodes; with a decay at
+        every time limit in 175, 159 and 159, without any in 284, 288 and 282. With the default model breadth, where episodes
+        seldom reach the limit, the three are alike (265 to 291).
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The paper does not
         say. Where this is wrong the target's own transitions correct it; without it no path leads to an end at first.
     :param relevance: order the instances by relevance (Eq. 7) to the target's transitions, not by distance. The paper

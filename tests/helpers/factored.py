@@ -4,7 +4,10 @@ import numpy as np
 
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.mappings.state_mappings import copies_of_source
 from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.copies import Copies
+from sb3_combrel.transfer.copy_sums import CopySums
 
 # x' = x + SLOPES x + PUSH[u], unit coordinates: an oscillator that is left alone, pushed down or pushed up.
 SLOPES = np.array([[0.0, 0.15], [-0.12, -0.03]])
@@ -126,3 +129,34 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     spread = np.linalg.solve(design.T @ design / weights.sum(), at - mean_x)
     weight = np.exp(-squared / breadth**2).sum() / (1.0 + (at - mean_x) @ spread)
     return effect, np.average(rewards[near], weights=outcome), np.average(terminated[near], weights=outcome), weight
+
+
+def measured(n_copies, n, noise=0.0, order=None, whole=False, seed=0):
+    """The sums over transitions of a target that is so many copies of the source, and these transitions."""
+    mapping = copies_mapping(n_copies, order)
+    states, actions, effects = walk(mapping, n, seed)
+    effects = effects + noise * np.random.default_rng(seed).normal(size=effects.shape)
+    rows = copies_of_source(2, 2 * n_copies)
+    copies = Copies([oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, np.ones_like(rows), 0.2, 1.0)
+    sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
+    for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
+        copies.measure(state, action, effect, sums, whole)
+    return mapping, copies, sums, (states, actions, effects)
+
+
+def predicted_by(copies, copy, source_action, states):
+    """Effects that a copy with one source action predicts, computed one state after the other; NaN: not in the copy."""
+    [source] = copies.sources
+    row = copies.state[copy]
+    used = np.unique(row[row >= 0])
+    mask = source.actions == source_action
+    units = source.scaling.to_unit(source.states)[mask][:, used]
+    effects = (source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))[mask][:, used]
+    found = np.full(states.shape, np.nan)
+    for i, state in enumerate(states):
+        at = np.array([state[list(row).index(k)] for k in used])
+        nowhere = np.zeros(len(units))
+        effect, *_ = naive_prediction(units, effects, nowhere, nowhere, at, 0.2, 24, 0.05)
+        for k, value in zip(used, effect, strict=True):
+            found[i, list(row).index(k)] = value
+    return found

@@ -14,12 +14,14 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.models.kernel_average import KernelAverage
+from sb3_combrel.transfer.instances_check import InstancesCheck
 
 DATA = Path(__file__).parents[1] / "data"
 # Of these predictions no trace is left any more, so that the counts are lower.
 COUNTS = ("transfer_uses", "transfer_instances_used")
 # What version 0.1.0 did not have.
-NEW = {*COUNTS, "visits"}
+ADDED = ("visits", "transfer_check")
+NEW = {*COUNTS, *ADDED}
 
 
 @pytest.fixture(params=["timbrel", "combrel"])
@@ -62,8 +64,10 @@ def test_a_model_of_version_0_1_0_predicts_as_it_did(former):
     np.testing.assert_array_equal(model.predict(observations, deterministic=True)[0], expected["actions"])
 
 
-def test_a_model_of_version_0_1_0_learns_on_as_it_did(former):
+def test_a_model_of_version_0_1_0_learns_on_as_it_did(former, monkeypatch):
     path, expected = former
+    # Then every time limit narrowed the kernel of transferred instances.
+    monkeypatch.setattr(InstancesCheck, "end_episode", lambda self, truncated: truncated)
     model = FittedRMax.load(path, env=Walk())
     model.get_env().seed(5)
     model.learn(120, reset_num_timesteps=False)
@@ -77,12 +81,12 @@ def test_a_model_of_version_0_1_0_learns_on_as_it_did(former):
 def test_parameters_of_a_file_of_version_0_1_0_can_be_set(former, exact_match):
     path, _ = former
     loaded, model = FittedRMax.load(path), FittedRMax.load(path, env=Walk()).learn(90)
-    visits = model.get_parameters()["policy"]["visits"].clone()
+    before = {name: model.get_parameters()["policy"][name].clone() for name in ADDED}
     model.set_parameters(path, exact_match=exact_match)
     found, expected = (each.get_parameters()["policy"] for each in (model, loaded))
     # Without exact_match what is not given stays as it is.
-    expected["visits"] = expected["visits"] if exact_match else visits
     if not exact_match:
+        expected |= before
         expected |= {name: found[name] for name in COUNTS if name not in parameters_of(path)}
     assert found.keys() == expected.keys()
     for name, tensor in expected.items():

@@ -221,15 +221,17 @@ def test_no_more_transitions_are_recorded_than_allowed():
     assert method.statistics()["transfer/target_transitions"] == 7
 
 
-def test_each_episode_that_reaches_its_limit_narrows_the_kernel_of_transferred_instances():
+def test_episodes_that_reach_their_limit_narrow_the_kernel_of_contradicted_instances():
     rng = np.random.default_rng(2)
     source, task = naive.random_source(rng, 200, 2, 2), naive.target_task(POINTS, 2)
     decaying, steady = (bound(COMBREL(source, breadth_decay=f, bandwidths=BANDWIDTHS), task) for f in (0.5, 1.0))
     narrow = bound(COMBREL(source, breadth=0.15, bandwidths=BANDWIDTHS), task)
-    for _ in range(20):
+    for _ in range(60):
         transition = naive.random_transition(rng, 3, 2)
         for method in (decaying, steady, narrow):
+            method.note_use(transferred_at(method, transition.state, np.zeros(2)))
             show(method, transition)
+    assert decaying.statistics()["transfer/prediction_error"] > 1.0
     for method in (decaying, steady, narrow):
         changed_pairs(method)
     before = transferred_to_all(decaying, task)

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.mappings.state_mappings import copies_of_source
-from sb3_combrel.transfer.copies import Copies, CopySums
+from sb3_combrel.transfer.copies import Copies
+from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.equations import division_score, prediction_compliances, running_scales
 from sb3_combrel.transfer.prior_choice import (
     MIN_GAIN,
@@ -46,73 +47,14 @@ def test_the_best_division_is_the_best_of_all(seed, n_variables, n_copies):
     assert total(tuple(found)) == pytest.approx(max(map(total, all_divisions(members))))
 
 
-def measured(n_copies, n, noise=0.0, order=None, whole=False, seed=0):
-    """The sums over transitions of a target that is so many copies of the source, and these transitions."""
-    mapping = f.copies_mapping(n_copies, order)
-    states, actions, effects = f.walk(mapping, n, seed)
-    effects = effects + noise * np.random.default_rng(seed).normal(size=effects.shape)
-    rows = copies_of_source(2, 2 * n_copies)
-    copies = Copies([f.oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, np.ones_like(rows), 0.2, 1.0)
-    sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
-    for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
-        copies.measure(state, action, effect, sums, whole)
-    return mapping, copies, sums, (states, actions, effects)
-
-
-def predicted_by(copies, copy, source_action, states):
-    """Effects that a copy with one source action predicts, computed one state after the other; NaN: not in the copy."""
-    [source] = copies.sources
-    row = copies.state[copy]
-    used = np.unique(row[row >= 0])
-    mask = source.actions == source_action
-    units = source.scaling.to_unit(source.states)[mask][:, used]
-    effects = (source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))[mask][:, used]
-    found = np.full(states.shape, np.nan)
-    for i, state in enumerate(states):
-        at = np.array([state[list(row).index(k)] for k in used])
-        ends = np.zeros(len(units))
-        effect, *_ = f.naive_prediction(units, effects, ends, ends, at, 0.2, 24, 0.05)
-        for k, value in zip(used, effect, strict=True):
-            found[i, list(row).index(k)] = value
-    return found
-
-
-def test_compliances_are_those_of_the_equations():
-    _, copies, sums, (states, actions, effects) = measured(2, 40, noise=0.01)
-    scales = running_scales(effects)
-    for copy in (0, 3, 11, 12, 19):
-        has = copies.state[copy] >= 0
-        for u in range(3):
-            predicted = predicted_by(copies, copy, u, states)[:, has]
-            each = prediction_compliances(effects[:, has], predicted, scales[:, has])
-            errors = (predicted - effects[:, has]) ** 2
-            for a in range(5):
-                rows = actions == a
-                np.testing.assert_allclose(sums.compliance[copy, a, u], each[rows].sum(), rtol=1e-6)
-                np.testing.assert_allclose(sums.error[copy, a, u, has], errors[rows].sum(axis=0), rtol=1e-5)
-    for a in range(5):
-        stays = [
-            prediction_compliances(effects[:, [v]], np.zeros((40, 1)), scales[:, [v]])[actions == a].sum() for v in range(4)
-        ]
-        np.testing.assert_allclose(sums.stay[a], stays)
-
-
-def test_with_whole_mappings_compliance_is_over_all_variables_those_unmapped_stay():
-    _, copies, sums, (states, actions, effects) = measured(2, 25, noise=0.01, whole=True)
-    scales = running_scales(effects)
-    predicted = np.nan_to_num(predicted_by(copies, 3, 1, states))
-    each = prediction_compliances(effects, predicted, scales)
-    np.testing.assert_allclose(sums.compliance[3, :, 1], [each[actions == a].sum() for a in range(5)], rtol=1e-6)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_the_division_found_has_the_highest_score_of_all(seed):
-    _, copies, sums, (states, actions, effects) = measured(2, 30, noise=0.02, seed=seed)
+    _, copies, sums, (states, actions, effects) = f.measured(2, 30, noise=0.02, seed=seed)
     scales = running_scales(effects)
     parts, stays = {}, {}
     for copy in range(len(copies)):
         has = copies.state[copy] >= 0
-        found = [predicted_by(copies, copy, u, states)[:, has] for u in range(3)]
+        found = [f.predicted_by(copies, copy, u, states)[:, has] for u in range(3)]
         each = np.array([prediction_compliances(effects[:, has], p, scales[:, has]) for p in found])
         # The best source action of each target action, on its own.
         part = np.empty(len(actions))
@@ -134,14 +76,14 @@ def test_the_division_found_has_the_highest_score_of_all(seed):
 
 @pytest.mark.parametrize(("n_copies", "order"), [(1, None), (2, (0, 2, 1, 3)), (2, (3, 0, 2, 1)), (3, (4, 1, 0, 5, 3, 2))])
 def test_copies_of_exact_dynamics_are_found_with_their_actions(n_copies, order):
-    mapping, copies, sums, _ = measured(n_copies, 100 * n_copies, order=order)
+    mapping, copies, sums, _ = f.measured(n_copies, 100 * n_copies, order=order)
     choice = choose_factored(copies, sums)
     chosen = {tuple(copies.state[c].tolist()): u.tolist() for c, u in zip(choice.copies[0], choice.actions.T, strict=True)}
     assert chosen == {tuple(copy.state_index.tolist()): list(copy.action) for copy in mapping.copies}
 
 
 def test_an_action_that_was_never_taken_has_no_source_action():
-    _, copies, _, (states, actions, effects) = measured(2, 200)
+    _, copies, _, (states, actions, effects) = f.measured(2, 200)
     fresh = CopySums.zero(len(copies), 3, 5, 4)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         if action != 3:
@@ -169,7 +111,7 @@ def test_a_variable_that_nothing_in_the_source_explains_stays():
 
 
 def test_one_mapping_for_each_action_is_the_best_that_is_allowed():
-    _, copies, sums, _ = measured(2, 200, noise=0.01, whole=True)
+    _, copies, sums, _ = f.measured(2, 200, noise=0.01, whole=True)
     rng = np.random.default_rng(0)
     for _ in range(20):
         allowed = rng.random((len(copies), 5, 3)) < 0.2
@@ -180,7 +122,7 @@ def test_one_mapping_for_each_action_is_the_best_that_is_allowed():
 
 
 def test_what_is_drawn_is_allowed_and_of_every_kind():
-    _, copies, _, _ = measured(2, 1)
+    _, copies, _, _ = f.measured(2, 1)
     allowed = np.zeros((len(copies), 5, 3), dtype=bool)
     allowed[[2, 4], :, 1] = allowed[4, 2] = True
     rng = np.random.default_rng(0)

@@ -98,7 +98,7 @@ def test_an_exact_source_is_found_and_claims_what_it_knows(seed, n_copies):
     np.testing.assert_allclose(found.effect, f.target_effects(mapping, states, actions), atol=1e-3)
     np.testing.assert_allclose(found.reward, -1.0)
     assert (found.weight[found.end < 0.1] > 1.0).mean() > 0.95
-    assert transfer.statistics()["transfer/prior_error"] < 0.01
+    assert transfer.statistics()["transfer/prediction_error"] < 0.01
     # Ten times as many transitions change nothing any more.
     again = show(transfer, f.walk(mapping, 300, seed + 100))
     assert max(again) <= versions[-1] + 2
@@ -163,7 +163,7 @@ def test_a_given_mapping_that_is_wrong_stops_predicting_and_a_warning_says_so():
     with pytest.warns(UserWarning, match=r"Oscillator-v0 predicts the target worse .* is \d") as caught:
         show(transfer, f.walk(TWO, 600))
     assert len(caught) == 1
-    assert transfer.statistics()["transfer/prior_error"] > 1.0
+    assert transfer.statistics()["transfer/prediction_error"] > 1.0
     found = transfer.prior(states, actions)
     # By chance noise may explain some of one variable's effects.
     assert (found.effect == 0.0).mean() > 0.7 and not found.weight.any()

@@ -1,0 +1,151 @@
+"""Compiled predictions of target states and actions by copies of sources."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.models.fit_arrays import Kernel
+from sb3_combrel.models.linear_prediction import NearestLists
+from sb3_combrel.transfer.source_model import predict_source
+
+
+class CopyTable(NamedTuple):
+    """Copies of sources for compiled code, one a row.
+
+    :param variable: int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
+    :param sign: float64, same shape: -1 where it is mirrored
+    :param share: float64, shape (n_copies, n_source_variables): 1 / number of target variables that a variable of the copy has
+    :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least
+    :param first: int64, shape (n_copies,): the model's number of the source's first action; ``n_actions``: same shape
+    """
+
+    variable: np.ndarray
+    sign: np.ndarray
+    share: np.ndarray
+    least: np.ndarray
+    first: np.ndarray
+    n_actions: np.ndarray
+
+
+class Uses(NamedTuple):
+    """The copies and source actions that make up each target action, each pair of them once.
+
+    :param copy: int64, shape (n_uses,): copy; ``action``: the model's number of the source action
+    :param of_action: int64, shape (n_target_actions, most copies): uses of each target action, -1 for none
+    :param complete: bool, shape (n_target_actions,): whether every copy of the action has a source action
+    """
+
+    copy: np.ndarray
+    action: np.ndarray
+    of_action: np.ndarray
+    complete: np.ndarray
+
+
+class UsePredictions(NamedTuple):
+    """What each use predicts at one state: work space of :func:`predict_pairs`.
+
+    :param done: bool, shape (n_uses,); ``effect``: float64, shape (n_uses, n_source_variables)
+    :param outcome: float64, shape (n_uses, 3): reward, probability of termination, weight
+    """
+
+    done: np.ndarray
+    effect: np.ndarray
+    outcome: np.ndarray
+
+
+@inlined
+def see_state(table, copy, state, at):
+    """Write to ``at`` a target state as ``copy`` has it: the mean where several target variables are one of its own."""
+    at[:] = 0.0
+    for v in range(len(state)):
+        k = table.variable[copy, v]
+        if k >= 0:
+            at[k] += table.share[copy, k] * (1.0 - state[v] if table.sign[copy, v] < 0.0 else state[v])
+
+
+@compiled
+def predict_pairs_plain(source, table, uses, pairs, predicted, found):
+    """Predict target states and actions.
+
+    :param source: SourceArrays; ``table``: CopyTable; plain tuples
+    :param uses: Uses; ``found``: UsePredictions; plain tuples
+    :param pairs: (states, actions)
+    :param predicted: receives effects, rewards, probabilities of termination, and weights: the least of all copies'
+    """
+    instances, effect_range, kernel, near = source
+    instances, kernel, near = Instances(*instances), Kernel(*kernel), NearestLists(*near)
+    table, uses, found = CopyTable(*table), Uses(*uses), UsePredictions(*found)
+    states, actions = pairs
+    at = found.effect[len(uses.copy)]
+    before = 0
+    found.done[:] = False
+    for i in range(len(actions)):
+        for v in range(states.shape[1]):
+            if states[i, v] != states[before, v]:
+                found.done[:] = False
+        before = i
+        for c in range(uses.of_action.shape[1]):
+            use = uses.of_action[actions[i], c]
+            if use >= 0 and not found.done[use]:
+                copy = uses.copy[use]
+                see_state(table, copy, states[i], at)
+                effect, outcome = found.effect[use], found.outcome[use]
+                outcome[0], outcome[1], outcome[2] = predict_source(
+                    instances, effect_range, kernel, near, uses.action[use], at, effect
+                )
+                found.done[use] = True
+        join_copies(table, uses, actions[i], i, found.effect, found.outcome, predicted)
+
+
+@inlined
+def join_copies(table, uses, action, i, effects, outcomes, predicted):
+    """Write what all copies predict of pair ``i``.
+
+    :param effects: float64, shape (n_uses, n_source_variables): of each use; ``outcomes``: float64, shape (n_uses, 3)
+    """
+    effect, reward, end, weight = predicted
+    effect[i, :] = 0.0
+    n = 0
+    total = 0.0
+    ends = 1.0
+    least = np.inf
+    for c in range(uses.of_action.shape[1]):
+        use = uses.of_action[action, c]
+        if use < 0:
+            continue
+        n += 1
+        total += outcomes[use, 0]
+        ends *= outcomes[use, 1]
+        least = min(least, outcomes[use, 2])
+        for v in range(effect.shape[1]):
+            k = table.variable[uses.copy[use], v]
+            if k >= 0:
+                effect[i, v] = table.sign[uses.copy[use], v] * effects[use, k]
+    reward[i] = total / n if n > 0 else 0.0
+    end[i] = ends if n > 0 else 0.0
+    weight[i] = least if n > 0 and uses.complete[action] else 0.0
+
+
+@compiled
+def join_many_plain(table, uses, actions, found, predicted):
+    """:func:`join_copies` for many pairs.
+
+    :param found: for each use and pair, the number of its prediction, int64, shape (n_uses, n); and these predictions,
+        float64, shape (n_predictions, n_source_variables) and (n_predictions, 3)
+    """
+    table, uses = CopyTable(*table), Uses(*uses)
+    rows, effects, outcomes, effect_here, outcome_here = found
+    for i in range(len(actions)):
+        for c in range(uses.of_action.shape[1]):
+            use = uses.of_action[actions[i], c]
+            if use >= 0:
+                row = rows[use, i]
+                for k in range(effects.shape[1]):
+                    effect_here[use, k] = effects[row, k]
+                for k in range(3):
+                    outcome_here[use, k] = outcomes[row, k]
+        join_copies(table, uses, actions[i], i, effect_here, outcome_here, predicted)

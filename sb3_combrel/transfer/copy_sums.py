@@ -1,0 +1,159 @@
+"""Sums over a target's transitions: how well copies of sources predict them, by target action and source action."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.models.fit_arrays import Kernel
+from sb3_combrel.models.linear_prediction import NearestLists
+from sb3_combrel.transfer.copy_predictions import CopyTable, Uses, see_state
+from sb3_combrel.transfer.source_model import predict_source
+
+# The smallest scale that compliance is measured by, squared unit coordinates: a variable that never moves.
+SMALLEST_SCALE = 1e-12
+# Squared errors count as at most this many times the squared effect: a bound of 1 would find noise to explain something.
+LARGEST_MISS = 2.0
+
+
+class CopySums(NamedTuple):
+    """Sums over the target's transitions, by target action.
+
+    :param n: float64, shape (n_target_actions,): transitions
+    :param size: float64, shape (n_target_actions, n_target_variables): sizes of effects
+    :param effect: float64, same shape: squared effects
+    :param moved: float64, same shape: transitions in which the variable moved at all
+    :param stay: float64, same shape: compliances of each variable with "it stays as it is"
+    :param compliance: float64, shape (n_copies, n_target_actions, most source actions): compliances of each copy
+    :param error: float64, shape (n_copies, n_target_actions, most source actions, n_target_variables): squared errors
+    :param missed: float64, same shape: squared errors in parts of the squared effects, each at most
+        ``LARGEST_MISS``, where the source has data: times how much of the threshold its weight reaches, at most 1
+    :param founded: float64, shape (n_copies, n_target_actions, most source actions): sums of these factors
+    """
+
+    n: np.ndarray
+    size: np.ndarray
+    effect: np.ndarray
+    moved: np.ndarray
+    stay: np.ndarray
+    compliance: np.ndarray
+    error: np.ndarray
+    missed: np.ndarray
+    founded: np.ndarray
+
+    @classmethod
+    def zero(cls, n_copies: int, n_source_actions: int, n_actions: int, n_variables: int) -> CopySums:
+        """Sums over no transitions."""
+        return cls(
+            n=np.zeros(n_actions),
+            size=np.zeros((n_actions, n_variables)),
+            effect=np.zeros((n_actions, n_variables)),
+            moved=np.zeros((n_actions, n_variables)),
+            stay=np.zeros((n_actions, n_variables)),
+            compliance=np.zeros((n_copies, n_actions, n_source_actions)),
+            error=np.zeros((n_copies, n_actions, n_source_actions, n_variables)),
+            missed=np.zeros((n_copies, n_actions, n_source_actions, n_variables)),
+            founded=np.zeros((n_copies, n_actions, n_source_actions)),
+        )
+
+
+class CopyScratch(NamedTuple):
+    """Work space.
+
+    :param at: float64, shape (n_source_variables,): a state as the copy has it; ``effect``: what the source predicts there
+    :param scale: float64, shape (n_target_variables,): what squared errors are compared with in compliance
+    """
+
+    at: np.ndarray
+    effect: np.ndarray
+    scale: np.ndarray
+
+
+@inlined
+def add_effect(sums, action, effect):
+    """Add the effect of a target transition to the sums that do not depend on copies, but for compliances."""
+    sums.n[action] += 1.0
+    for v in range(len(effect)):
+        sums.size[action, v] += abs(effect[v])
+        sums.effect[action, v] += effect[v] * effect[v]
+        if effect[v] * effect[v] > SMALLEST_SCALE:
+            sums.moved[action, v] += 1.0
+
+
+@inlined
+def add_error(table, sums, at, effect, predicted, founded):
+    """Add the error of one variable to the sums; its square.
+
+    :param at: (copy, target action, source action, target variable)
+    """
+    copy, action, u, v = at
+    error = (effect - predicted) ** 2
+    sums.error[copy, action, u, v] += error
+    compared = max(effect * effect, table.least[copy, v])
+    sums.missed[copy, action, u, v] += founded * min(LARGEST_MISS, error / max(compared, 1e-300))
+    return error
+
+
+@compiled
+def measure_plain(source, table, rules, transition, sums, scratch):
+    """Add one target transition to the sums: errors and compliances of all copies and source actions.
+
+    The scale of compliance, of each variable, is the square of the mean size of its effects so far. (The mean of their
+    squares would be that of a few large ones, such as those of a car that hits the wall, beside which nothing counts.)
+
+    :param source: SourceArrays; ``table``: CopyTable; ``sums``: CopySums; ``scratch``: CopyScratch; plain tuples
+    :param rules: (whole: compliance is over all target variables, those that a copy does not have stay; else over its own;
+        weight from which on the source has data)
+    :param transition: (state, action, effect), unit coordinates
+    """
+    instances, effect_range, kernel, near = source
+    instances, kernel, near = Instances(*instances), Kernel(*kernel), NearestLists(*near)
+    table, sums, scratch = CopyTable(*table), CopySums(*sums), CopyScratch(*scratch)
+    whole, threshold = rules
+    state, action, effect = transition
+    n_variables = len(state)
+    add_effect(sums, action, effect)
+    n = sums.n.sum()
+    for v in range(n_variables):
+        scratch.scale[v] = max(SMALLEST_SCALE, (sums.size[:, v].sum() / n) ** 2)
+        sums.stay[action, v] += np.exp(-effect[v] * effect[v] / scratch.scale[v])
+    for copy in range(len(table.first)):
+        see_state(table, copy, state, scratch.at)
+        for u in range(table.n_actions[copy]):
+            source_action = table.first[copy] + u
+            _, _, weight = predict_source(instances, effect_range, kernel, near, source_action, scratch.at, scratch.effect)
+            founded = min(1.0, weight / threshold)
+            sums.founded[copy, action, u] += founded
+            missed = 0.0
+            for v in range(n_variables):
+                k = table.variable[copy, v]
+                if k >= 0:
+                    predicted = table.sign[copy, v] * scratch.effect[k]
+                    error = add_error(table, sums, (copy, action, u, v), effect[v], predicted, founded)
+                    missed += error / scratch.scale[v]
+                elif whole:
+                    missed += effect[v] * effect[v] / scratch.scale[v]
+            sums.compliance[copy, action, u] += np.exp(-missed)
+
+
+@compiled
+def follow_plain(table, uses, transition, sums):
+    """Add one target transition to the sums, with the errors of what makes up its action alone, and no compliances.
+
+    :param transition: (action, effect, predicted effect, weight of the prediction in parts of the threshold, at most 1)
+    """
+    table, uses, sums = CopyTable(*table), Uses(*uses), CopySums(*sums)
+    action, effect, predicted, founded = transition
+    add_effect(sums, action, effect)
+    for c in range(uses.of_action.shape[1]):
+        use = uses.of_action[action, c]
+        if use >= 0:
+            copy = uses.copy[use]
+            u = uses.action[use] - table.first[copy]
+            sums.founded[copy, action, u] += founded
+            for v in range(len(effect)):
+                if table.variable[copy, v] >= 0:
+                    add_error(table, sums, (copy, action, u, v), effect[v], predicted[v], founded)
