@@ -45,7 +45,8 @@ class SourcePrior:
     has been confirmed.
 
     *What it predicts.* Its effects are the mean that the target's own instances are fitted to wherever it claims nothing, too:
-    all but those on variables of which it turns out to explain next to nothing under the target action; these are 0.
+    all but those on variables of which it turns out to explain less than ``MIN_EXPLAINED`` under the action; these
+    are 0.
 
     :param copies: the copies that can be chosen
     :param task: the target task

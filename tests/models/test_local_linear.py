@@ -15,7 +15,8 @@ from helpers.linear_models import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel.models.linear_fits import MAX_UNEXPLAINED, TOLERANCE
+from sb3_combrel.models.fit_updates import MAX_UNEXPLAINED
+from sb3_combrel.models.linear_fits import TOLERANCE
 from sb3_combrel.models.local_linear import ON_GRID
 
 slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=30)
