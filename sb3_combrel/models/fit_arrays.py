@@ -67,6 +67,7 @@ class FitScratch(NamedTuple):
     :param along: float64, shape (n_variables, largest axis of the grid): squared distances along one variable
     :param span: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one
     :param point: int64, shape (n_points,): points within reach; ``distance``: float64, same shape: squared distances
+    :param full_reach: float64, shape (n_points,): the squared reach of a kernel that is not narrowed
     """
 
     at: np.ndarray
@@ -80,6 +81,7 @@ class FitScratch(NamedTuple):
     span: np.ndarray
     point: np.ndarray
     distance: np.ndarray
+    full_reach: np.ndarray
 
 
 class Kernel(NamedTuple):
@@ -89,9 +91,11 @@ class Kernel(NamedTuple):
     :param reach: squared distance at which an instance weighs ``min_weight``
     :param outcome_scale: -1 / outcome_breadth ** 2, for rewards and ends
     :param n_neighbors: instances that a fit is made to
+    :param counting_scale: the scale of the weights that decide what is known, no broader
     """
 
     scale: float
     reach: float
     outcome_scale: float
     n_neighbors: int
+    counting_scale: float

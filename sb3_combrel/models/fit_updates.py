@@ -133,7 +133,7 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
             products_of(state, fits.target[action, slot], products)
         shares = count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
         fits.n_counted[pair] += 1
-        fits.total[pair] += np.exp(distance * kernel.scale)
+        fits.total[pair] += np.exp(distance * kernel.counting_scale)
         if not fits.known[pair] and fits.total[pair] >= threshold:
             fits.known[pair] = True
             fits.unexplained[pair] = np.inf
@@ -265,3 +265,16 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
         fits.unexplained[pair] = np.inf
         if fits.n_counted[pair] > 0 and (fits.known[pair] or fits.claimed[pair]):
             refit(fits, pair, action, grid, scratch, 0.0)
+
+
+@compiled
+def recount_totals(instances, fits, grid, kernel, scratch):
+    """Compute the weights that decide what is known anew, from all instances."""
+    n_points = grid.shape[0] * grid.strides[0]
+    fits.total[:] = 0.0
+    for action in range(len(instances.size)):
+        total = fits.total[action * n_points : (action + 1) * n_points]
+        for i in range(instances.size[action]):
+            n_found = points_within(instances.state[action, i], scratch.full_reach, kernel.reach, grid, scratch)
+            for f in range(n_found):
+                total[scratch.point[f]] += np.exp(scratch.distance[f] * kernel.counting_scale)

@@ -89,7 +89,7 @@ def recount(instances, fits, pair, action, kernel, left_out, scratch):
 
     :param left_out: number of an instance that does not count; -1 for none
     :param scratch: ``at`` is where the pair's point is
-    :return: the sum of their weights (of breadth ``model_breadth``)
+    :return: the sum of their weights (of the kernel that decides what is known)
     """
     fits.sums[pair, :] = 0.0
     fits.outcome[pair, :] = 0.0
@@ -112,7 +112,7 @@ def recount(instances, fits, pair, action, kernel, left_out, scratch):
             products_of(scratch.state, fits.target[action, i], products)
             reward, terminated = instances.reward[action, i], instances.terminated[action, i]
             count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
-            total += np.exp(distance * kernel.scale)
+            total += np.exp(distance * kernel.counting_scale)
             count += 1
     fits.n_counted[pair] = count
     return total

@@ -101,7 +101,7 @@ def fit_nearest(instances, target, action, state, kernel, near):
     """Fit the effect around ``state`` to the instances in ``near``; into ``near.fit``.
 
     :param target: as in ``LinearFits``
-    :return: sum of their weights (of breadth ``model_breadth``)
+    :return: sum of their weights (of the kernel that decides what is known)
     """
     length = near.length[action]
     nearest, last = near.distance[action, 0], near.distance[action, length - 1]
@@ -117,7 +117,7 @@ def fit_nearest(instances, target, action, state, kernel, near):
         bring_near(instances.state[action, i], state, instances.periodic, near.state)
         products_of(near.state, target[action, i], products)
         add_products(sums, np.exp(distance * scale), products)
-        total += np.exp(distance * kernel.scale)
+        total += np.exp(distance * kernel.counting_scale)
         # Seen from the nearest: far from all instances the weights would be too small for a quotient.
         weight = np.exp((distance - nearest) * kernel.outcome_scale)
         outcome[0] += weight

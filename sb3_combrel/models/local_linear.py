@@ -12,7 +12,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
 from sb3_combrel.models.fit_arrays import FitScratch, Kernel, LinearFits
-from sb3_combrel.models.fit_updates import LEAST_SCALE, enter_plain, leave, recount_pairs, refit_changed
+from sb3_combrel.models.fit_updates import LEAST_SCALE, enter_plain, leave, recount_pairs, recount_totals, refit_changed
 from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
 from sb3_combrel.models.linear_rows import update_rows_plain
 from sb3_combrel.planning.mdp import FiniteMDP
@@ -26,10 +26,11 @@ ON_GRID = 0.5
 # As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, twice the weight
 # is demanded: a broad kernel knows soon how states change, and would never find a small goal.
 EXPLORED, CHECKED_EVERY = 0.9, 50
+MAX_DEMAND = 2.0**20
 
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
-_refit_changed = EntryPoint(refit_changed)
+_refit_changed, _recount_totals = EntryPoint(refit_changed), EntryPoint(recount_totals)
 _join_transferred = EntryPoint(join_transferred_plain)
 
 
@@ -74,6 +75,7 @@ class LocalLinear(CompiledModel):
             reach=-np.log(settings.min_weight) * breadth**2,
             outcome_scale=-1.0 / min(breadth, float(settings.outcome_breadth)) ** 2,
             n_neighbors=n_near,
+            counting_scale=-1.0 / breadth**2,
         )
         self._plain_kernel = tuple(self._kernel)
         self._set_fits(
@@ -111,6 +113,7 @@ class LocalLinear(CompiledModel):
             span=np.empty((3, d), dtype=np.int64),
             point=np.empty(n_points, dtype=np.int64),
             distance=np.empty(n_points),
+            full_reach=np.full(n_points, self._kernel.reach),
         )
         self._plain_scratch = tuple(self._scratch)
         # The range of effects when rows were last brought in line with it.
@@ -131,7 +134,7 @@ class LocalLinear(CompiledModel):
         self._prior_version = -1
         # Whether an outcome has told states apart.
         self._informed, self._first_reward = False, np.nan
-        self._threshold, self._demand = self.exploration_threshold, 1.0
+        self._demand = 1.0
         # Transitions so far; with ``max_instances`` there are fewer instances.
         self._n_added = 0
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
@@ -247,22 +250,29 @@ class LocalLinear(CompiledModel):
         self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
         if not self._informed:
             return NO_PAIRS
-        self._demand = 1.0
-        return self.lower_threshold(self._threshold)
+        if self._demand > 1.0:
+            self._set_demand(1.0)
+            _recount_totals.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._scratch)
+        return self.lower_threshold(self.exploration_threshold)
 
     def _demand_more(self) -> np.ndarray:
         """Demand more weight of what is known while no outcome has told states apart; the pairs that are no longer known."""
         if self._informed or self._n_added % CHECKED_EVERY or self.known.mean() < EXPLORED:
             return NO_PAIRS
-        self._demand *= 2.0
-        self.exploration_threshold = self._demand * self._threshold
+        self._set_demand(2.0 * self._demand)
+        _recount_totals.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._scratch)
         forgotten = np.flatnonzero(self.known & (self.own_weight < self._threshold_on_grid()))
         self.known[forgotten] = False
         return forgotten
 
+    def _set_demand(self, demand: float) -> None:
+        """Let known be decided by a kernel that is so many times narrower (squared)."""
+        self._demand = demand
+        self._kernel = self._kernel._replace(counting_scale=demand * self._kernel.scale)
+        self._plain_kernel = tuple(self._kernel)
+
     def lower_threshold(self, threshold: float) -> np.ndarray:
-        self._threshold = threshold
-        self.exploration_threshold = self._demand * threshold
+        self.exploration_threshold = threshold
         newly_known = np.flatnonzero(~self.known & (self.own_weight >= self._threshold_on_grid()))
         self.known[newly_known] = True
         return newly_known
@@ -336,8 +346,8 @@ class LocalLinear(CompiledModel):
             self._inform(row[-3], row[-2] > 0.5)
         demand, informed, n_added = state["demand"].tolist()
         self._informed = self._informed or informed > 0.5
-        self._demand, self._n_added = max(1.0, demand), int(n_added)
-        self.exploration_threshold = self._demand * self._threshold
+        self._n_added = int(n_added)
+        self._set_demand(min(max(1.0, demand), MAX_DEMAND))
         # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
         fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)
         fits.limit[:] = np.clip(state["limit"], fits.limit, np.iinfo(np.int32).max)

@@ -158,6 +158,7 @@ class SourceModel:
             reach=np.inf,
             outcome_scale=-1.0 / min(breadth, outcome_breadth) ** 2,
             n_neighbors=n_neighbors,
+            counting_scale=-1.0 / breadth**2,
         )
         effect_range = np.zeros((2, n_actions, d))
         for action, size in enumerate(instances.size.tolist()):
