@@ -269,7 +269,7 @@ def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
 
 @compiled
 def recount_totals(instances, fits, grid, kernel, scratch):
-    """Compute the weights that decide what is known anew, from all instances."""
+    """Compute the weights that decide what is known anew, from all instances that a kernel may reach at all."""
     n_points = grid.shape[0] * grid.strides[0]
     fits.total[:] = 0.0
     for action in range(len(instances.size)):

@@ -23,10 +23,12 @@ from sb3_combrel.planning.q_values import Prediction
 # would make the states beside them look good for ever. Only once an episode has ended or rewards have differed: until then
 # nothing says where to go, and to know how states change is not to know what is there.
 ON_GRID = 0.5
-# As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, twice the weight
-# is demanded: a broad kernel knows soon how states change, and would never find a small goal.
+# As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, known is decided
+# by a kernel of half the squared breadth: a broad kernel knows soon how states change, and would never find a small goal. To
+# demand more weight instead would send the agent to where it has been first (point robot: in half of the runs no goal).
 EXPLORED, CHECKED_EVERY = 0.9, 50
-MAX_DEMAND = 2.0**20
+# In a damaged file there may be anything.
+MAX_NARROWING = 2.0**20
 
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
@@ -134,7 +136,7 @@ class LocalLinear(CompiledModel):
         self._prior_version = -1
         # Whether an outcome has told states apart.
         self._informed, self._first_reward = False, np.nan
-        self._demand = 1.0
+        self._narrowing = 1.0
         # Transitions so far; with ``max_instances`` there are fewer instances.
         self._n_added = 0
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
@@ -153,8 +155,8 @@ class LocalLinear(CompiledModel):
         :return: the pairs whose predictions have moved, but with a transfer method only known ones and those whose weight
             has changed enough; the others may wait (see :meth:`outdated`)
         """
-        slot, left = self._slot_for(state, action)
         informed = self._inform(reward, terminated)
+        slot, left = self._slot_for(state, action)
         min_change = 0.0 if self._giver is None else MIN_CHANGE * self.exploration_threshold
         n_changed = _enter.call(
             self._plain_instances,
@@ -168,7 +170,7 @@ class LocalLinear(CompiledModel):
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
         self._n_added += 1
-        forgotten = self._demand_more()
+        forgotten = self._narrow_known()
         if len(left) + len(informed) + len(forgotten) == 0:
             return changed
         return np.unique(np.concatenate([left, informed, forgotten, changed]))
@@ -250,26 +252,29 @@ class LocalLinear(CompiledModel):
         self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
         if not self._informed:
             return NO_PAIRS
-        if self._demand > 1.0:
-            self._set_demand(1.0)
-            _recount_totals.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._scratch)
+        if self._narrowing > 1.0:
+            self._set_narrowing(1.0)
+            self._recount_totals()
         return self.lower_threshold(self.exploration_threshold)
 
-    def _demand_more(self) -> np.ndarray:
-        """Demand more weight of what is known while no outcome has told states apart; the pairs that are no longer known."""
+    def _narrow_known(self) -> np.ndarray:
+        """Narrow the kernel that decides what is known while no outcome has told states apart; what is no longer known."""
         if self._informed or self._n_added % CHECKED_EVERY or self.known.mean() < EXPLORED:
             return NO_PAIRS
-        self._set_demand(2.0 * self._demand)
-        _recount_totals.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._scratch)
+        self._set_narrowing(2.0 * self._narrowing)
+        self._recount_totals()
         forgotten = np.flatnonzero(self.known & (self.own_weight < self._threshold_on_grid()))
         self.known[forgotten] = False
         return forgotten
 
-    def _set_demand(self, demand: float) -> None:
-        """Let known be decided by a kernel that is so many times narrower (squared)."""
-        self._demand = demand
-        self._kernel = self._kernel._replace(counting_scale=demand * self._kernel.scale)
+    def _set_narrowing(self, narrowing: float) -> None:
+        """Let known be decided by a kernel whose squared breadth is so many times smaller."""
+        self._narrowing = narrowing
+        self._kernel = self._kernel._replace(counting_scale=narrowing * self._kernel.scale)
         self._plain_kernel = tuple(self._kernel)
+
+    def _recount_totals(self) -> None:
+        _recount_totals.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._scratch)
 
     def lower_threshold(self, threshold: float) -> np.ndarray:
         self.exploration_threshold = threshold
@@ -334,7 +339,7 @@ class LocalLinear(CompiledModel):
             "reach": self.fits.reach.copy(),
             "limit": self.fits.limit.astype(np.float64),
             # The instance that has told states apart may have been replaced.
-            "demand": np.array([self._demand, float(self._informed), float(self._n_added)]),
+            "narrowing": np.array([self._narrowing, float(self._informed), float(self._n_added)]),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
@@ -344,10 +349,10 @@ class LocalLinear(CompiledModel):
         fits = self.fits
         for row in state["instances"]:
             self._inform(row[-3], row[-2] > 0.5)
-        demand, informed, n_added = state["demand"].tolist()
+        narrowing, informed, n_added = state["narrowing"].tolist()
         self._informed = self._informed or informed > 0.5
         self._n_added = int(n_added)
-        self._set_demand(min(max(1.0, demand), MAX_DEMAND))
+        self._set_narrowing(min(max(1.0, narrowing), MAX_NARROWING))
         # Whatever a file says, or another ``model_breadth`` or ``n_neighbors`` than when it was saved.
         fits.reach[:] = np.clip(state["reach"], 0.0, self._kernel.reach)
         fits.limit[:] = np.clip(state["limit"], fits.limit, np.iinfo(np.int32).max)

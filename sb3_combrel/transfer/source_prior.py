@@ -39,14 +39,14 @@ class SourcePrior:
     *What it claims.* The weight of a prediction is that of the source's data there, the least of all copies', times the
     trust in the mapping for the target action: which part of the effects of the target's own transitions with it the source
     explains, of the variable of which it explains least (see :meth:`explained`; a sum over variables would hide a wrong
-    action, which shows in velocities alone). No trust below ``MIN_EXPLAINED``, or before ``MIN_TRANSITIONS`` of the action; of a
-    mapping that is given, trust in all actions together stands in for that of an action with fewer. Nothing is claimed any
-    more while the source's ends or rewards are doubted (see :class:`Outcomes`), and no transition that may end before an end
-    has been confirmed.
+    action, which shows in velocities alone). No trust below ``MIN_EXPLAINED``, or before ``MIN_TRANSITIONS`` of the action;
+    of a mapping that is given, trust in all actions together stands in for that of an action with fewer. Nothing is claimed
+    any more while the source's ends or rewards are doubted (see :class:`Outcomes`), and no transition that may end before
+    an end has been confirmed.
 
     *What it predicts.* Its effects are the mean that the target's own instances are fitted to wherever it claims nothing, too:
-    all but those on variables of which it turns out to explain less than ``MIN_EXPLAINED`` under the action; these
-    are 0.
+    all but those on variables of which it turns out to explain less than ``MIN_EXPLAINED`` under the action;
+    these are 0.
 
     :param copies: the copies that can be chosen
     :param task: the target task

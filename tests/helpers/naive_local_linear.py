@@ -1,7 +1,7 @@
 """The local linear model again, written from its definition in plain loops and NumPy: slow, and independent of the package.
 
 Nothing is incremental but what the definition itself says has a history: how far the instances of a pair may be, and what is
-known, which stays known unless more weight is demanded, and whether an outcome has told states apart.
+known, which stays known unless the kernel that decides it narrows, and whether an outcome has told states apart.
 """
 
 import math
@@ -22,7 +22,7 @@ EXPLORED, CHECKED_EVERY = 0.9, 50
 
 
 class Predicted(NamedTuple):
-    """Of one action at one state; ``weight``: sum of exp(-d^2 / breadth^2) over the instances behind it."""
+    """Of one action at one state; ``weight``: sum of exp(-narrowing d^2 / breadth^2) over the instances behind it."""
 
     effect: np.ndarray
     reward: float
@@ -76,7 +76,7 @@ class NaiveLocalLinear:
         self.known = np.zeros(shape, dtype=bool)
         # What has come so far, whatever has become of the instances.
         self.rewards, self.has_ended = [], False
-        self.demand = 1.0
+        self.narrowing = 1.0
 
     # ---------------------------------------------------------------- the prior
 
@@ -127,7 +127,7 @@ class NaiveLocalLinear:
         share = weights.sum() / (weights.sum() + PRIOR_WEIGHT) if claimed else 1.0
         effect = np.clip(of_prior + share * (intercept + at @ slopes + left_over), low, high)
         reward, end = self.outcome(squared, instances, prior_reward, prior_end, claimed)
-        return Predicted(effect, reward, end, float(np.exp(-squared / self.breadth**2).sum()))
+        return Predicted(effect, reward, end, float(np.exp(-squared * self.narrowing / self.breadth**2).sum()))
 
     def outcome(self, squared, instances, prior_reward, prior_end, claimed):
         """Averages by the narrower kernel, seen from the nearest instance, where weights would be too small for a quotient."""
@@ -188,7 +188,7 @@ class NaiveLocalLinear:
 
     def needed_on_grid(self):
         """The weight that makes a grid point known."""
-        return (ON_GRID if self.informed() else 1.0) * self.demand * self.threshold
+        return (ON_GRID if self.informed() else 1.0) * self.threshold
 
     def lower_threshold(self, threshold):
         self.threshold = threshold
@@ -200,36 +200,46 @@ class NaiveLocalLinear:
         self.rewards.append(reward)
         self.has_ended = self.has_ended or terminated
         if self.informed() and not before:
-            self.demand = 1.0
+            self.decide_by(1.0)
             self.known |= self.total >= self.needed_on_grid()
 
-    def demand_more(self):
-        """Every so many transitions: twice the weight if nearly all is known, and no outcome has told states apart."""
+    def decide_by(self, narrowing):
+        """Let known be decided by a kernel of so much less squared breadth: all weights are computed anew if it is another."""
+        if narrowing == self.narrowing:
+            return
+        self.narrowing = narrowing
+        for action in range(self.n_actions):
+            for point in range(self.n_points):
+                squared = [d for d, _ in self.distances(self.points[point], action) if d <= self.full_reach]
+                self.total[action, point] = sum(math.exp(-d * narrowing / self.breadth**2) for d in squared)
+
+    def narrow_known(self):
+        """Every so many transitions: half the squared breadth if nearly all is known, and no outcome has told states apart."""
         checked = len(self.rewards) % CHECKED_EVERY == 0
         if checked and not self.informed() and self.known.sum() >= EXPLORED * self.known.size:
-            self.demand *= 2.0
+            self.decide_by(2.0 * self.narrowing)
             self.known &= self.total >= self.needed_on_grid()
 
     # ----------------------------------------------------------------- learning
 
     def add(self, state, action, reward, next_state, terminated):
         """Add an instance; the kernels of pairs that have too many by it narrow."""
+        self.note_outcome(reward, terminated)
         self.put(len(self.instances[action]), Instance(state, action, reward, next_state, terminated, self.grid.periodic))
 
     def put(self, number, instance):
         action = instance.action
-        self.note_outcome(instance.reward, instance.terminated)
         self.instances[action][number : number + 1] = [instance]
         for point, at in enumerate(self.points):
             squared = squared_distance(at, instance.state, self.grid.periodic)
             if squared > self.reach[action, point]:
                 continue
-            self.total[action, point] += math.exp(-squared / self.breadth**2)
+            self.total[action, point] += math.exp(-squared * self.narrowing / self.breadth**2)
             if not self.known[action, point]:
                 self.known[action, point] = self.total[action, point] >= self.needed_on_grid()
             if self.known[action, point] or self.claimed(action, point):
                 self.narrow(action, point)
-        self.demand_more()
+        self.narrow_known()
 
     def narrow(self, action, point):
         """Let only the nearest instances of a pair count if there are more than its limit."""
@@ -251,6 +261,7 @@ class NaiveReplacement:
 
     def add(self, state, action, reward, next_state, terminated):
         naive = self.naive
+        naive.note_outcome(reward, terminated)
         number = len(naive.instances[action])
         if number == self.max_instances:
             number = naive.distances(state, action)[0][1]

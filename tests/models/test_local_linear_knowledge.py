@@ -1,4 +1,4 @@
-"""The local linear model demands more weight as long as no outcome has told states apart."""
+"""What decides what the local linear model knows narrows as long as no outcome has told states apart."""
 
 import numpy as np
 import pytest
@@ -32,34 +32,55 @@ def outcome_at(state, reward, terminated):
     return np.array([state]), 0, reward, np.array([state + 0.1]), terminated
 
 
+def narrowing_of(model):
+    return model.get_state()["narrowing"][0]
+
+
 def assert_same_knowledge(model, naive):
     np.testing.assert_array_equal(model.known.reshape(naive.known.shape), naive.known)
     np.testing.assert_array_equal(model.mdp.arrays.modelled, model.known)
     np.testing.assert_allclose(model.own_weight.reshape(naive.known.shape), naive.total, rtol=1e-9)
-    assert model.exploration_threshold == naive.demand * naive.threshold
+    assert narrowing_of(model) == naive.narrowing and model.exploration_threshold == naive.threshold
+
+
+def weights_by_a_kernel(model, narrowing):
+    """Of each pair: the sum of the weights of all instances within reach."""
+    weights = []
+    for action in range(N_ACTIONS):
+        states = model.instances.state[action, : model.instances.size[action]]
+        for point in model.grid.points():
+            squared = ((states - point) ** 2).sum(axis=1)
+            within = squared <= -np.log(KERNEL["min_weight"]) * KERNEL["breadth"] ** 2
+            weights.append(np.exp(-narrowing * squared[within] / KERNEL["breadth"] ** 2).sum())
+    return np.array(weights)
 
 
 @pytest.mark.parametrize("outcome", [AN_END, ANOTHER_REWARD], ids=["an_end", "another_reward"])
-def test_demand_doubles_and_pairs_are_forgotten_until_the_first_outcome_restores_them(outcome):
-    model = make_linear_model(GRID, KERNEL, threshold=THRESHOLD)
+def test_the_kernel_narrows_and_pairs_are_forgotten_until_the_first_outcome_restores_them(outcome):
+    threshold = 10.0
+    model = make_linear_model(GRID, KERNEL, threshold=threshold)
     transitions = uninformative(0, CHECKED_EVERY)
     for transition in transitions[:-1]:
         model.update_rows(model.add(*transition))
-    assert model.known.all() and model.exploration_threshold == THRESHOLD
-    weight_before = model.own_weight.copy()
+    assert narrowing_of(model) == 1.0
+    model.accept(np.arange(len(model.known)))
+    assert model.known.all()
     changed = model.add(*transitions[-1])
     model.update_rows(changed)
-    assert model.exploration_threshold == 2.0 * THRESHOLD
+    assert narrowing_of(model) == 2.0
+    np.testing.assert_allclose(model.own_weight, weights_by_a_kernel(model, 2.0))
+    np.testing.assert_array_equal(model.known, model.own_weight >= threshold)
     forgotten = np.flatnonzero(~model.known)
     assert 0 < len(forgotten) < len(model.known)
-    np.testing.assert_array_equal(model.known, model.own_weight >= 2.0 * THRESHOLD)
     assert np.isin(forgotten, changed).all() and not model.mdp.arrays.modelled[forgotten].any()
-    assert (model.own_weight > weight_before).any(), "the weight of what was known has gone on growing"
-    # One instance, and the pairs of both actions are known again.
+    # One instance, and the weights are those of the broad kernel again.
+    broad = weights_by_a_kernel(model, 1.0)
     changed = model.add(*outcome_at(0.5, *outcome))
     model.update_rows(changed)
-    assert model.exploration_threshold == THRESHOLD
-    assert np.isin(forgotten, changed).all() and model.known.all() and model.mdp.arrays.modelled.all()
+    assert narrowing_of(model) == 1.0
+    restored = forgotten[broad[forgotten] >= ON_GRID * threshold]
+    assert len(restored) and model.known[restored].all() and model.mdp.arrays.modelled[restored].all()
+    assert np.isin(restored, changed).all()
 
 
 def test_the_same_reward_again_and_again_tells_nothing_and_pairs_need_the_full_threshold():
@@ -73,15 +94,14 @@ def test_the_same_reward_again_and_again_tells_nothing_and_pairs_need_the_full_t
     assert model.known[between].all()
 
 
-def test_a_threshold_that_is_lowered_is_still_multiplied():
+def test_a_threshold_can_be_lowered_while_the_kernel_is_narrow():
     model = make_linear_model(GRID, KERNEL, threshold=THRESHOLD)
     for transition in uninformative(0, CHECKED_EVERY):
         model.update_rows(model.add(*transition))
+    assert narrowing_of(model) == 2.0
     model.lower_threshold(0.9 * THRESHOLD)
-    assert model.exploration_threshold == pytest.approx(1.8 * THRESHOLD)
-    np.testing.assert_array_equal(model.known, model.own_weight >= 1.8 * THRESHOLD)
-    model.add(*outcome_at(0.5, *AN_END))
-    assert model.exploration_threshold == pytest.approx(0.9 * THRESHOLD)
+    assert narrowing_of(model) == 2.0
+    np.testing.assert_array_equal(model.known, model.own_weight >= 0.9 * THRESHOLD)
 
 
 @pytest.mark.parametrize("max_instances", [None, 25, 10])
@@ -96,25 +116,25 @@ def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outc
     for transition in [*uninformative(2, 230), outcome_at(0.5, *AN_END), *uninformative(3, 60)]:
         learn_linear(model, learner, [transition])
         assert_same_knowledge(model, naive)
-        highest = max(highest, naive.demand)
-    assert 2.0 <= highest <= 16.0 and naive.demand == 1.0
+        highest = max(highest, naive.narrowing)
+    assert 2.0 <= highest <= 64.0 and naive.narrowing == 1.0
     assert_same_sums(model, naive)
     finish_episode(model)
     assert assert_same_fits(model, naive) > 0
 
 
 @pytest.mark.parametrize("n", [CHECKED_EVERY - 5, CHECKED_EVERY + 5, 2 * CHECKED_EVERY + 30])
-def test_what_is_demanded_is_saved_and_restored(n):
+def test_how_narrow_it_is_is_saved_and_restored(n):
     model, restored = (make_linear_model(GRID, KERNEL, threshold=THRESHOLD) for _ in range(2))
     for transition in uninformative(4, n):
         model.update_rows(model.add(*transition))
-    demanded = model.exploration_threshold
-    assert (demanded > THRESHOLD) == (n > CHECKED_EVERY)
+    narrowing = narrowing_of(model)
+    assert (narrowing > 1.0) == (n > CHECKED_EVERY)
     assert_restored(model, restored, [])
-    assert restored.exploration_threshold == demanded
+    assert narrowing_of(restored) == narrowing
     # Transitions after which it is looked at again, and the first outcome.
     assert_restored(model, restored, [*uninformative(5, CHECKED_EVERY), outcome_at(0.5, *AN_END)])
-    assert model.exploration_threshold == restored.exploration_threshold == THRESHOLD
+    assert narrowing_of(model) == narrowing_of(restored) == 1.0
 
 
 def test_an_outcome_whose_instance_has_been_replaced_is_remembered_after_loading():
@@ -129,4 +149,4 @@ def test_an_outcome_whose_instance_has_been_replaced_is_remembered_after_loading
         model.update_rows(model.add(*transition))
         restored.update_rows(restored.add(*transition))
         np.testing.assert_array_equal(restored.known, model.known)
-    assert model.exploration_threshold == restored.exploration_threshold == THRESHOLD
+    assert narrowing_of(model) == narrowing_of(restored) == 1.0
