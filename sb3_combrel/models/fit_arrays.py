@@ -22,6 +22,7 @@ class LinearFits(NamedTuple):
     :param limit: int32, shape (n_pairs,): more than this, and the kernel narrows
     :param total: float64, shape (n_pairs,): sum of the weights (of breadth ``model_breadth``) of all that counted
     :param last_total: float64, shape (n_pairs,): what ``total`` was when the pair's row was updated
+    :param refitted: bool, shape (n_pairs,): the pair has been fitted again since its row was written
     :param clipped: bool, shape (n_pairs,): the pair's row would be another one if the range of effects were larger
     :param known: bool, shape (n_pairs,)
     :param claimed: bool, shape (n_pairs,): the prior suffices for a model
@@ -45,6 +46,7 @@ class LinearFits(NamedTuple):
     limit: np.ndarray
     total: np.ndarray
     last_total: np.ndarray
+    refitted: np.ndarray
     clipped: np.ndarray
     known: np.ndarray
     claimed: np.ndarray

@@ -241,7 +241,8 @@ def refit_changed(fits, grid, scratch, range_has_changed, changed):
         else:
             unit_coordinates_of(pair - action * n_points, grid, scratch.at)
             moved = prediction_moved(fits, pair, action, scratch.at, 0.0)
-        if moved or (fits.clipped[pair] and range_has_changed[action]):
+        # The prediction at the point may be as before, and that on the way not.
+        if moved or fits.refitted[pair] or (fits.clipped[pair] and range_has_changed[action]):
             changed[n] = pair
             n += 1
     return n

@@ -199,6 +199,7 @@ def refit(fits, pair, action, grid, scratch, tolerance):
     unit_coordinates_of(pair - action * grid.shape[0] * grid.strides[0], grid, scratch.at)
     solve_regression(fits.sums[pair], -RIDGE / fits.scale[pair], scratch.factor, fits.fit[pair])
     fits.unexplained[pair] = 0.0
+    fits.refitted[pair] = True
     return prediction_moved(fits, pair, action, scratch.at, tolerance)
 
 

@@ -167,6 +167,7 @@ def update_rows(fits, mdp, grid, planned, pairs, transferred, scratch, fit_scrat
                 written = write_row(fits, mdp, grid, gamma, pair, (max_steps, has_prior), scratch, fit_scratch)
             if not written:
                 return done
+        fits.refitted[pair] = False
         fits.last_total[pair] = fits.total[pair]
         set_modelled(mdp, pair, modelled)
         done += 1

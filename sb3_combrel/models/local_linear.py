@@ -94,6 +94,7 @@ class LocalLinear(CompiledModel):
                 limit=np.full(n_pairs, n_near + n_near // 2, dtype=np.int32),
                 total=self.own_weight,
                 last_total=np.zeros(n_pairs),
+                refitted=np.zeros(n_pairs, dtype=np.bool_),
                 clipped=np.zeros(n_pairs, dtype=np.bool_),
                 known=self.known,
                 claimed=np.zeros(n_pairs, dtype=np.bool_),

@@ -153,6 +153,8 @@ BAD_ARGUMENTS = [
     ("n_neighbors", 7.5),
     ("n_neighbors", True),
     ("n_neighbors", "all"),
+    ("max_model_steps", 0),
+    ("max_model_steps", True),
     ("outcome_breadth", 0.0),
     ("outcome_breadth", -0.1),
     ("outcome_breadth", np.nan),

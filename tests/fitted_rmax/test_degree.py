@@ -23,6 +23,10 @@ REFUSED = [
     ("n_neighbors", 2.5, "a whole number from 2 to 10,000 or None"),
     ("n_neighbors", True, "a whole number from 2 to 10,000 or None"),
     ("n_neighbors", "many", "a whole number from 2 to 10,000 or None"),
+    ("max_model_steps", 0, "a whole number from 1 to 10,000 or None"),
+    ("max_model_steps", 10_001, "a whole number from 1 to 10,000 or None"),
+    ("max_model_steps", 2.5, "a whole number from 1 to 10,000 or None"),
+    ("max_model_steps", "all", "a whole number from 1 to 10,000 or None"),
     ("outcome_breadth", 0.0, "a number above 0"),
     ("outcome_breadth", -0.1, "a number above 0"),
     ("outcome_breadth", np.inf, "a number above 0"),
@@ -52,6 +56,14 @@ def test_defaults_depend_on_the_number_of_state_variables(n_variables):
     assert defaults.n_neighbors > n_variables + 1, "a fit has so many unknowns for each effect"
     average = FittedRMaxSettings(degree=0).model_settings(n_variables)
     assert average.model_breadth < defaults.model_breadth and average.min_weight < defaults.min_weight
+
+
+def test_the_original_looks_one_step_ahead():
+    assert FittedRMaxSettings(degree=0).model_settings(2).max_model_steps == 1
+    assert FittedRMaxSettings(degree=0, max_model_steps=1).model_settings(2).max_model_steps == 1
+    with pytest.raises(ValueError, match="max_model_steps must be 1 or None with degree=0, the original algorithm, got 3"):
+        FittedRMaxSettings(degree=0, max_model_steps=3)
+    assert FittedRMaxSettings(max_model_steps=7).model_settings(4).max_model_steps == 7
 
 
 def test_the_arguments_reach_the_model():

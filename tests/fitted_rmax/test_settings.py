@@ -29,6 +29,7 @@ BAD_SETTINGS = [
     ("n_neighbors", 1),
     ("n_neighbors", 2.5),
     ("outcome_breadth", 0.0),
+    ("max_model_steps", 0),
     ("exploration_threshold", 0.0),
     ("max_value", np.nan),
     ("gamma", 1.5),

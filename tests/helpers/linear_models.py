@@ -20,7 +20,9 @@ LINEAR_KERNELS = [
 LEARNED = ("sums", "outcome", "reach", "scale", "n_counted", "limit", "total", "known", "claimed", "prior", "effect_range")
 
 
-def make_linear_model(grid, kernel, *, gamma=1.0, max_instances=None, prior=None, threshold=1.0, n_actions=N_ACTIONS):
+def make_linear_model(
+    grid, kernel, *, gamma=1.0, max_instances=None, prior=None, threshold=1.0, n_actions=N_ACTIONS, max_model_steps=1
+):
     """A model on a finite MDP of its own; ``grid`` as in ``kernel_models.GRIDS``."""
     settings = ModelSettings(
         model_breadth=kernel["breadth"],
@@ -30,14 +32,20 @@ def make_linear_model(grid, kernel, *, gamma=1.0, max_instances=None, prior=None
         max_instances=max_instances,
         n_neighbors=kernel["n_neighbors"],
         outcome_breadth=kernel["outcome_breadth"],
+        max_model_steps=max_model_steps,
     )
     return LocalLinear(FiniteMDP(make_grid(grid), n_actions, gamma), settings, prior)
 
 
-def linear_model_and_definition(grid, kernel, *, threshold=1.0, prior=None, **kwargs):
-    model = make_linear_model(grid, kernel, threshold=threshold, prior=prior, **kwargs)
+def linear_model_and_definition(grid, kernel, *, threshold=1.0, prior=None, max_model_steps=1, **kwargs):
+    model = make_linear_model(grid, kernel, threshold=threshold, prior=prior, max_model_steps=max_model_steps, **kwargs)
     naive = NaiveLocalLinear(
-        grid, kernel, model.n_actions, threshold=threshold, prior=None if prior is None else prior.as_naive(threshold)
+        grid,
+        kernel,
+        model.n_actions,
+        threshold=threshold,
+        prior=None if prior is None else prior.as_naive(threshold),
+        max_model_steps=max_model_steps,
     )
     return model, naive
 
@@ -84,7 +92,8 @@ def assert_same_fits(model, naive, gamma=1.0):
             np.testing.assert_allclose(
                 model.fits.row[pair], [*expected.effect, expected.reward, expected.end], rtol=1e-7, atol=1e-8
             )
-            reward, successors = without_staying(*naive.row(action, point), point, gamma)
+            *row, steps = naive.row(action, point, gamma)
+            reward, successors = without_staying(*row, point, gamma**steps)
             # A geometric series magnifies rounding.
             np.testing.assert_allclose(model.mdp.arrays.reward[pair], reward, rtol=1e-5, atol=1e-7)
             assert_same_row(row_of(model.mdp, point, action), successors)

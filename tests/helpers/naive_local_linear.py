@@ -56,10 +56,11 @@ class NaiveLocalLinear:
     :param grid: (resolution by variable, margin[, periodic])
     :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``
     :param threshold: weight that makes an exact state known
+    :param max_model_steps: most steps that a row leads ahead
     :param prior: function of (state, action) that returns effect, reward, end and whether it claims to know; None for none
     """
 
-    def __init__(self, grid, kernel, n_actions, *, threshold=1.0, prior=None):
+    def __init__(self, grid, kernel, n_actions, *, threshold=1.0, prior=None, max_model_steps=1):
         self.grid = NaiveGrid(*grid[:2], grid[2] if len(grid) > 2 else None)
         self.points = [self.grid.unit(point) for point in range(len(self.grid.coordinates))]
         self.n_points, self.n_actions, self.d = len(self.points), n_actions, len(grid[0])
@@ -68,6 +69,7 @@ class NaiveLocalLinear:
         self.full_reach = -math.log(kernel["min_weight"]) * self.breadth**2
         self.threshold = threshold
         self.prior = prior
+        self.max_model_steps = max_model_steps
         self.instances = [[] for _ in range(n_actions)]
         shape = n_actions, self.n_points
         self.reach = np.full(shape, self.full_reach)
@@ -174,11 +176,67 @@ class NaiveLocalLinear:
             outcome += near * np.concatenate([[1.0, instance.reward, float(instance.terminated)], state, target])
         return np.concatenate([[one], x, xx[np.tril_indices(self.d)], e, xe.reshape(-1)]), outcome
 
-    def row(self, action, point):
-        """(R, {successor: probability}) of a pair, staying included and undiscounted."""
+    def row(self, action, point, gamma=1.0):
+        """(R, {successor: probability}, steps) of a pair, staying included and undiscounted."""
         found = self.at_pair(action, point)
-        corners = self.grid.corners(self.points[point] + found.effect) if found.end < 1.0 else {}
-        return found.reward, {to: (1.0 - found.end) * part for to, part in corners.items()}
+        ended = any(self.instances[action][number].terminated for _, number in self.counted(action, point))
+        displacement, steps = found.effect, 1.0
+        if self.max_model_steps > 1 and found.end == 0.0 and not ended:
+            displacement, steps = self.follow(action, point)
+        corners = self.grid.corners(self.points[point] + displacement) if found.end < 1.0 else {}
+        reward = found.reward * (steps if gamma == 1.0 else (1.0 - gamma**steps) / (1.0 - gamma))
+        return reward, {to: (1.0 - found.end) * part for to, part in corners.items()}, steps
+
+    def follow(self, action, point):
+        """Displacement and steps until a variable has changed by a cell; the last step is cut short there."""
+        at, cells = self.points[point], np.array(self.grid.cells, dtype=float)
+        first, claimed = self.at_pair(action, point).effect, self.claimed(action, point)
+        slopes, share = np.zeros((self.d, self.d)), 1.0
+        counted = self.counted(action, point)
+        if counted:
+            breadth = self.narrowed(self.reach[action, point])
+            instances = [self.instances[action][number] for _, number in counted]
+            states = np.array([at + np.array(apart(i.state, at, self.grid.periodic)) for i in instances])
+            weights = np.exp(-np.array([d for d, _ in counted]) / breadth**2)
+            slopes = ridge_regression(weights, states, [self.target(i) for i in instances], RIDGE * breadth**2)[1]
+            share = weights.sum() / (weights.sum() + PRIOR_WEIGHT) if claimed else 1.0
+        low, high = self.effect_range(action)
+        # The edge of the grid, from the point.
+        last = np.array(self.grid.shape) - 1.0
+        coordinates = np.array(self.grid.coordinates[point], dtype=float)
+        least = np.where(self.grid.periodic, -np.inf, -coordinates / cells)
+        most = np.where(self.grid.periodic, np.inf, (last - coordinates) / cells)
+        away, steps = np.zeros(self.d), 0.0
+        while steps < self.max_model_steps:
+            effect = np.clip(first + share * away @ slopes + self.prior_change(action, point, away), low, high)
+            after = np.clip(away + effect, least, most)
+            parts = [1.0]
+            for k in range(self.d):
+                if steps > 0.0 and abs(after[k]) * cells[k] > 1.0:
+                    parts.append((np.sign(after[k]) / cells[k] - away[k]) / (after[k] - away[k]))
+            away = away + min(parts) * (after - away)
+            steps += min(parts)
+            if min(parts) < 1.0 or (np.abs(away) * cells).max() >= 1.0 or (np.abs(away) * cells).max() < 1e-6:
+                break
+        return away, steps
+
+    def prior_change(self, action, point, away):
+        """By how much the prior's effect changes, linear between the pair and those beside it, if they are claimed alike."""
+        change = np.zeros(self.d)
+        for j in np.flatnonzero(away):
+            side = 1 if away[j] > 0.0 else -1
+            beside = list(self.grid.coordinates[point])
+            beside[j] += side
+            if self.grid.periodic[j]:
+                beside[j] %= self.grid.shape[j]
+            elif not 0 <= beside[j] < self.grid.shape[j]:
+                side = -side
+                beside[j] += 2 * side
+            other = self.grid.number[tuple(beside)]
+            if self.claimed(action, other) == self.claimed(action, point):
+                slope = self.prior_at(self.points[other], action)[0] - self.prior_at(self.points[point], action)[0]
+                change += slope * side * self.grid.cells[j] * away[j]
+        return change
 
     # ------------------------------------------------------------ what is known
 
