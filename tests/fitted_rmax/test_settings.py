@@ -65,7 +65,7 @@ def test_settings_cannot_be_changed_afterwards():
 def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
     defaults = FittedRMaxSettings()
     of_fitted_rmax = inspect.signature(FittedRMax).parameters
-    assert len(FittedRMaxSettings.names()) == 15
+    assert len(FittedRMaxSettings.names()) == 16
     for name in FittedRMaxSettings.names():
         assert of_fitted_rmax[name].default == getattr(defaults, name), name
     # The policy hands on what it is given, and has no defaults of its own.
