@@ -65,6 +65,10 @@ class FittedRMax(PersistentAlgorithm):
       shortens the list).
     - Planning is bounded by ``max_backups`` a step, points around the agent first; the others are backed up later, most of
       them at an episode's end. Staying in a grid point is summed in closed form.
+    - With ``degree=1`` the planner's model leads several steps ahead, until a cell of the grid is left (``max_model_steps``):
+      values that are interpolated at every step spread over the grid.
+    - With ``degree=1``, as long as no outcome has told states apart (no episode has ended, and all rewards were alike), what
+      is known is decided by a kernel that narrows whenever nearly all is known: otherwise a small goal might not be found.
     - Where the agent returns to the same small cell many times in an episode, an interpolated value that is too high is
       corrected (see ``sb3_combrel.planning.corrections``): otherwise the agent could be caught in a loop for ever.
     - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%: with a narrow
