@@ -26,7 +26,7 @@ DEFAULT_MODEL_STEPS = (50, 50, 50, 3, 3, 50)
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
 # More than any step has time for; at an episode's end there are 400 times as many, which must fit into an int64.
 MAX_BACKUPS = 10**12
-# At the edge of what moves at all.
+# More would not leave a cell in which the state hardly moves.
 MAX_MODEL_STEPS = 10_000
 # A fit to thousands of instances is no local one.
 MAX_NEIGHBORS = 10_000
