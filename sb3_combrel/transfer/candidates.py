@@ -30,11 +30,13 @@ class Candidate(NamedTuple):
     :param target_action: number of the target action
     :param source_action: name of the source action that it is mapped to
     :param state_mapping: the pairs of target and source variables, as text
+    :param action_mapping: names of the source actions of all target actions, where whole mappings are candidates; else ()
     """
 
     target_action: int
     source_action: str
     state_mapping: str
+    action_mapping: tuple[str, ...] = ()
 
 
 class Origin(NamedTuple):
@@ -172,14 +174,15 @@ class Candidates:
         mappings = self.sets[number]
         whole = repr(mappings[mappings.find(state_index, action, source_action)])
         variables = whole[whole.index("(") + 1 : whole.index(";")]
-        return Candidate(action, self.sources[number].action_names[source_action], variables)
+        actions = tuple(self._whole_action_names(candidate)) if self.whole else ()
+        return Candidate(action, self.sources[number].action_names[source_action], variables, actions)
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""
         parts = self.parts(candidate)
         words = f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
         if self.whole:
-            words += f", of the actions {', '.join(self._whole_action_names(candidate))}"
+            words += f", of the actions {', '.join(parts.action_mapping)}"
         return words if len(self.sources) == 1 else f"source {self.origins[candidate].source}: {words}"
 
     def _whole_action_names(self, candidate: int) -> list[str]:

@@ -1,0 +1,140 @@
+"""The two domains of the paper, and the settings in which each is learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sb3_combrel import SourceInstances
+from sb3_combrel.experiments import ball_striking, mountain_car
+
+#: As in the paper; where exploration is expensive, with this package's instance transfer; and this package's defaults.
+PAPER, EXPLORE, BEST = SETTINGS = ("paper", "explore", "best")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """
+    How the methods are set in one domain.
+
+    :param learner: arguments of :class:`~sb3_combrel.FittedRMax`
+    :param max_episode_steps: steps after which an episode is cut off
+    :param mappings: the set that COMBREL chooses from, and from which random mappings are drawn
+    :param combrel: arguments of :class:`~sb3_combrel.COMBREL` besides the set
+    :param timbrel: arguments of :class:`~sb3_combrel.TIMBREL` besides the mapping
+    :param paper: whether COMBREL is that of ``COMBREL.paper``
+    """
+
+    learner: Mapping[str, Any]
+    max_episode_steps: int
+    mappings: str
+    combrel: Mapping[str, Any] = field(default_factory=dict)
+    timbrel: Mapping[str, Any] = field(default_factory=dict)
+    paper: bool = False
+
+    @property
+    def use(self) -> str:
+        """What is transferred: "instances" or "prior"."""
+        return str(self.timbrel.get("use", "instances"))
+
+
+@dataclass(frozen=True)
+class Domain:
+    """
+    A source task and a target task.
+
+    :param name: in file names
+    :param title: in figures
+    :param source_id: id of the source task
+    :param target_id: id of the target task
+    :param learn_source: learns the source and returns its instances; a function of the seed
+    :param n_runs: runs of each method, by default
+    :param n_episodes: episodes of each run, by default
+    :param first_seed: seed of the first run; no setting was chosen with this seed or those after it
+    :param thresholds: steps of an episode; the training needed to get there is reported for each
+    :param unit: what a step is called
+    :param settings: by name
+    """
+
+    name: str
+    title: str
+    source_id: str
+    target_id: str
+    learn_source: Callable[[int], SourceInstances]
+    n_runs: int
+    n_episodes: int
+    first_seed: int
+    thresholds: tuple[int, ...]
+    unit: str
+    settings: Mapping[str, Setting]
+
+
+# Table 1 of the paper. It names no breadth for transferred instances: the only one that it names is taken for both.
+_CAR_PAPER = Setting(
+    learner={"degree": 0, "model_breadth": 0.4, "min_fraction": 0.1, "min_weight": 0.01},
+    max_episode_steps=4000,
+    mappings="paper_mountain_car",
+    combrel={"breadth": 0.4, "n_neighbors": 3},
+    timbrel={"breadth": 0.4, "breadth_decay": 1.0},
+    paper=True,
+)
+_CAR_EXPLORE = Setting(
+    learner={"degree": 0, "model_breadth": 0.1},
+    max_episode_steps=2000,
+    mappings="injective",
+    combrel={"use": "instances"},
+)
+_CAR_BEST = Setting(learner={}, max_episode_steps=2000, mappings="factored", timbrel={"use": "prior"})
+
+# Table 3. A hit by the first command returns 99.
+_ICUB_PAPER = Setting(
+    learner={"degree": 0, "model_breadth": 0.1, "min_fraction": 0.01, "min_weight": 0.01, "max_value": 100.0},
+    max_episode_steps=ball_striking.MAX_EPISODE_STEPS,
+    mappings="paper_icub",
+    combrel={"breadth": 0.1, "n_neighbors": 3},
+    timbrel={"breadth": 0.1, "breadth_decay": 1.0},
+    paper=True,
+)
+_ICUB_EXPLORE = Setting(
+    learner=ball_striking.LEARNER,
+    max_episode_steps=ball_striking.MAX_EPISODE_STEPS,
+    mappings="signed_injective",
+    combrel={key: value for key, value in ball_striking.OF_ALL.items() if key != "mappings"},
+    timbrel={"breadth": ball_striking.OF_ALL["breadth"], "breadth_decay": 1.0},
+)
+_ICUB_BEST = Setting(
+    learner={"max_value": 100.0},
+    max_episode_steps=ball_striking.MAX_EPISODE_STEPS,
+    mappings="factored",
+    timbrel={"use": "prior"},
+)
+
+MOUNTAIN_CAR = Domain(
+    name="mountain_car",
+    title="Mountain Car 4D",
+    source_id=mountain_car.SOURCE_ID,
+    target_id=mountain_car.TARGET_ID,
+    learn_source=mountain_car.learn_source,
+    n_runs=15,
+    n_episodes=200,
+    first_seed=5000,
+    thresholds=(400, 300, 250),
+    unit="steps",
+    settings={PAPER: _CAR_PAPER, EXPLORE: _CAR_EXPLORE, BEST: _CAR_BEST},
+)
+ICUB = Domain(
+    name="icub",
+    title="iCub, arm",
+    source_id=ball_striking.SOURCE_ID,
+    target_id=ball_striking.TARGET_ID,
+    learn_source=ball_striking.learn_source,
+    n_runs=10,
+    n_episodes=300,
+    first_seed=5000,
+    thresholds=(200, 150, 100, 75, 50, 40),
+    unit="commands",
+    settings={PAPER: _ICUB_PAPER, EXPLORE: _ICUB_EXPLORE, BEST: _ICUB_BEST},
+)
+#: The other domain's source is the one that has nothing to do with a target.
+DOMAINS = {domain.name: domain for domain in (MOUNTAIN_CAR, ICUB)}
