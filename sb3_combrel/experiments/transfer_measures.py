@@ -204,7 +204,8 @@ def total_reward(curves: LearningCurves, n_episodes: int | None = None) -> np.nd
     :return: in units of return, shape (n_runs,)
     :raises ValueError: if a run has fewer episodes
     """
-    return area_under_curve(curves.first_episodes(n_episodes).returns)
+    n_episodes = _episodes_of_all("n_episodes", n_episodes, curves)
+    return area_under_curve(curves.returns[:, :n_episodes])
 
 
 def total_reward_by_steps(curves: LearningCurves, n_steps: int | None = None) -> np.ndarray:
@@ -437,7 +438,10 @@ def _read_monitor_file(file: Path) -> list[tuple[float, float, float]]:
     try:
         start = float(json.loads(header.removeprefix("#"))["t_start"])
         for row in csv.DictReader(lines):
-            episodes.append((float(row["r"]), float(row["l"]), start + float(row["t"])))
+            values = (float(row["r"]), float(row["l"]), start + float(row["t"]))
+            if not np.isfinite(values).all():
+                raise ValueError(f"not finite: {values}")
+            episodes.append(values)
         if lines and not lines[-1].endswith("\n"):
             raise ValueError("the last line has no end")
     except (ValueError, KeyError, TypeError) as error:
