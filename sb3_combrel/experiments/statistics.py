@@ -1,15 +1,25 @@
-"""Means of several runs with confidence intervals, and the steps that a method saves, by SciPy."""
+"""
+Means of several runs with confidence intervals, the steps that a method saves, and tests of differences.
+
+Bootstrap intervals are in :mod:`~sb3_combrel.experiments.bootstrap`, effect sizes in
+:mod:`~sb3_combrel.experiments.effect_sizes`.
+"""
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
-TESTS = ("welch", "mann-whitney")
+TESTS = ("welch", "mann-whitney", "permutation")
+#: A permutation test draws so many regroupings at random, or takes each one once if there are at most so many.
+N_PERMUTATIONS = 10_000
 
 
 class Estimate(NamedTuple):
@@ -93,14 +103,62 @@ def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarr
     return np.array([each[: int(n)].sum() if np.isfinite(n) else np.inf for each, n in zip(steps, episodes, strict=True)])
 
 
-def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "welch") -> float:
+def interquartile_mean(samples: np.ndarray, axis: int = 0) -> np.ndarray:
+    """
+    Compute the mean without the lowest and the highest quarter of the runs.
+
+    From each end, a quarter of their number is left out, rounded down: with fewer than four runs this is the mean.
+
+    :param samples: one run a row, shape (n_runs, ...)
+    :param axis: the axis of the runs
+    """
+    return stats.trim_mean(np.asarray(samples, dtype=np.float64), 0.25, axis=axis)
+
+
+def area_under_curve(samples: np.ndarray, widths: np.ndarray | None = None) -> np.ndarray:
+    """
+    Compute the area between each run's curve and zero, each point a rectangle.
+
+    Of the returns of episodes this is their sum, the total reward. Two methods are compared by their whole curves with
+    ``p_value_of_difference(area_under_curve(first), area_under_curve(second), "permutation")``.
+
+    :param samples: one run a row, shape (n_runs, n_points)
+    :param widths: width of each point, such as the steps of an episode, shape (n_runs, n_points) or (n_points,); None: 1
+    :return: shape (n_runs,)
+    :raises ValueError: unless samples has two dimensions
+    """
+    samples = np.asarray(samples, dtype=np.float64)
+    if samples.ndim != 2:
+        raise ValueError(f"samples must have shape (n_runs, n_points), got {samples.shape}")
+    return (samples if widths is None else samples * widths).sum(axis=1)
+
+
+def as_sample(name: str, values: np.ndarray) -> np.ndarray:
+    """
+    Return the values of several runs as an array of floats.
+
+    :param name: name of the argument
+    :param values: one for each run, shape (n_runs,)
+    :raises ValueError: if the shape is another, there are none, or some are NaN
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    if sample.ndim != 1 or not len(sample):
+        raise ValueError(f"{name} must have one value for each run, shape (n_runs,), got shape {sample.shape}")
+    if np.isnan(sample).any():
+        raise ValueError(f"{name} must have no NaN, got {np.isnan(sample).sum()} of {len(sample)}: leave out runs on purpose")
+    return sample
+
+
+def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "welch", seed: int = 0) -> float:
     """
     Compute the two-sided p-value that two samples have the same mean, or the same distribution.
 
     :param first: one sample, shape (n,); inf is allowed
     :param second: the other
-    :param test: ``"welch"``, Welch's t-test, or ``"mann-whitney"``, the test by Mann and Whitney, which is also used where
-        a value is infinite and means do not exist
+    :param test: ``"welch"``, Welch's t-test, ``"permutation"``, the permutation test of the difference of means, which
+        assumes no distribution, or ``"mann-whitney"``, the test by Mann and Whitney, which is also used where a value is
+        infinite and means do not exist
+    :param seed: of the permutation test, where there are more than :data:`N_PERMUTATIONS` regroupings
     :return: NaN with fewer than two values in one sample, or a NaN in them; 1 if all values are equal
     :raises ValueError: if the test is unknown
     """
@@ -112,9 +170,11 @@ def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "we
         return np.nan
     if (together == together[0]).all():
         return 1.0
-    no_spread = (first == first[0]).all() and (second == second[0]).all()
+    no_spread = test == "welch" and (first == first[0]).all() and (second == second[0]).all()
     if test == "mann-whitney" or no_spread or not np.isfinite(together).all():
         return float(stats.mannwhitneyu(first, second).pvalue)
+    if test == "permutation":
+        return _p_value_by_permutation(first, second, seed)
     with warnings.catch_warnings():
         # Of loss of precision, where the values of a sample are nearly equal.
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -134,3 +194,29 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     factors = np.arange(len(order), 0, -1)
     corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
     return corrected
+
+
+def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) -> float:
+    """
+    Compute the share of regroupings of all values whose means differ at least as much as those of the samples.
+
+    Random regroupings count the samples' own as one more (Phipson & Smyth, "Permutation p-values should never be zero", 2010).
+    """
+    together = np.concatenate([first, second])
+    # The values sum to 0, so the difference of the means is proportional to the sum over one group.
+    together = together - together.mean()
+    sums = np.concatenate([together[chosen].sum(axis=1) for chosen in _regroupings(len(first), len(together), seed)])
+    # Sums of the same values in another order differ by rounding.
+    as_large = np.abs(sums) >= np.abs(together[: len(first)].sum()) - 1e-9 * np.abs(together).sum()
+    exact = math.comb(len(together), len(first)) <= N_PERMUTATIONS
+    return float(as_large.mean() if exact else (1 + as_large.sum()) / (1 + len(sums)))
+
+
+def _regroupings(n_chosen: int, n: int, seed: int) -> Iterator[np.ndarray]:
+    """Yield the places of the first group's values, shape (n_regroupings, n_chosen), in blocks."""
+    if math.comb(n, n_chosen) <= N_PERMUTATIONS:
+        yield np.array(list(combinations(range(n), n_chosen)))
+        return
+    rng = np.random.default_rng(seed)
+    for _ in range(N_PERMUTATIONS // 1000):
+        yield rng.permuted(np.tile(np.arange(n), (1000, 1)), axis=1)[:, :n_chosen]
