@@ -91,6 +91,7 @@ class TranslationScratch(NamedTuple):
     :param at: float64, same shape: where the state lies along each; ``periodic``: bool, whether it wraps there
     :param gap: float64, shape (n_blocks,): squared distances of the blocks' boxes
     :param full: bool, shape (1,): an instance that was needed did not fit
+    :param enters: float64, shape (1,): an instance of no higher rank than this is not needed
     """
 
     number: np.ndarray
@@ -100,6 +101,7 @@ class TranslationScratch(NamedTuple):
     periodic: np.ndarray
     gap: np.ndarray
     full: np.ndarray
+    enters: np.ndarray
 
     @classmethod
     def empty(cls, max_instances: int, n_variables: int, n_blocks: int) -> TranslationScratch:
@@ -112,6 +114,7 @@ class TranslationScratch(NamedTuple):
             periodic=np.zeros(n_variables, dtype=np.bool_),
             gap=np.empty(n_blocks),
             full=np.zeros(1, dtype=np.bool_),
+            enters=np.zeros(1),
         )
 
 
@@ -180,6 +183,7 @@ def consider(j, candidate, weight, rank, own, kept, rules, scratch):
             return k, min(enters, value[k - 1, _WEIGHT]) if k > 0 else enters
         total += value[k, _WEIGHT]
         if total >= rules.threshold:
+            scratch.enters[0] = value[k, _RANK]
             return k + 1, value[k, _WEIGHT]
     if kept + 1 > room:
         scratch.full[0] = True
@@ -222,6 +226,8 @@ def gather(state, own, candidate, arrays, kept):
         if turn == nearest_block or scratch.gap[block] > nearest:
             continue
         for j in range(block * BLOCK, min(size, (block + 1) * BLOCK)):
+            if rules.by_relevance and arrays.relevance[candidate, j] <= scratch.enters[0]:
+                continue
             apart = 0.0
             for m in range(n_mapped):
                 along = difference(scratch.at[m], source.state[action, j, scratch.variable[m]], scratch.periodic[m])
@@ -298,6 +304,7 @@ def translate(states, own, ranges, arrays, transferred):
         if own[s] >= arrays.rules.threshold:
             continue
         kept = np.int64(0)
+        arrays.scratch.enters[0] = -np.inf
         for candidate in range(first[s], last[s]):
             kept = gather(states[s], own[s], candidate, arrays, kept)
         write_row(s, own[s], kept, arrays, transferred)
