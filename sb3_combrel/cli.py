@@ -78,7 +78,39 @@ def record(
     console.print(f"written to {source.save(file)}; use it as COMBREL({str(file)!r})", soft_wrap=True)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record}
+def reproduce(
+    target: str,
+    /,
+    setting: str = "paper",
+    runs: int | None = None,
+    episodes: int | None = None,
+    jobs: int | None = None,
+    output: Path | None = None,
+    backend: str = "joblib",
+    address: str | None = None,
+) -> None:
+    """
+    Reproduce a figure or table of the COMBREL paper, with controls.
+
+    It can be stopped at any time; the same command continues from there.
+
+    :param target: fig2, fig3, fig4, fig5, fig6, table2, table4, table5, table6, or all
+    :param setting: paper (the paper's parameters), explore (a narrow kernel, where exploration is expensive) or best (this
+        package's defaults)
+    :param runs: of each method; by default 15 for Mountain Car and 10 for the iCub
+    :param episodes: of each run; by default 200 and 300
+    :param jobs: local processes at a time; one a core by default
+    :param output: folder for all results; by default reproduction/ and the name of the setting
+    :param backend: joblib (local processes), or ray or dask: a cluster that is running
+    :param address: of the cluster, such as 10.0.0.1:6379 (ray) or tcp://10.0.0.1:8786 (dask)
+    """
+    from sb3_combrel.experiments.paper.reproduce import Engine
+    from sb3_combrel.experiments.paper.reproduce import reproduce as run
+
+    run(target, setting=setting, runs=runs, episodes=episodes, output=output, engine=Engine(backend, jobs, address))
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record, "reproduce": reproduce}
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -85,9 +85,7 @@ class Method:
         return setting.learner
 
 
-def combrel(
-    setting: Setting, source: SourceInstances, mappings: str | None = None, **arguments: Any
-) -> COMBREL:
+def combrel(setting: Setting, source: SourceInstances, mappings: str | None = None, **arguments: Any) -> COMBREL:
     """Make COMBREL as the setting says; ``mappings`` and ``arguments`` come before the setting's own."""
     make = COMBREL.paper if setting.paper else COMBREL
     return make(source, mappings or setting.mappings, **{**setting.combrel, **arguments})
@@ -135,7 +133,9 @@ def _pooled(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Tr
 _CAR, _ROBOT = (MOUNTAIN_CAR.name,), (ICUB.name,)
 _METHODS: Sequence[Method] = (
     Method(NO_TRANSFER, "Fitted R-Max alone", None),
-    Method(TIMBREL_INTUITIVE, "TIMBREL with the mapping that a person would choose; also the oracle", _intuitive, domains=_CAR),
+    Method(
+        TIMBREL_INTUITIVE, "TIMBREL with the mapping that a person would choose; also the oracle", _intuitive, domains=_CAR
+    ),
     Method(COMBREL_PLAIN, "COMBREL without relevance", lambda d, s, sources, seed: combrel(s, sources.own)),
     Method(
         COMBREL_RELEVANCE,

@@ -101,9 +101,7 @@ def methods_of(targets: Iterable[Target], domain: Domain, setting: str) -> list[
     return [method.name for method in methods_in(domain, domain.settings[setting]) if method.name in needed]
 
 
-def jobs_of(
-    domain: Domain, setting: str, methods: Sequence[str], sources: Sources, n_runs: int, n_episodes: int
-) -> list[Job]:
+def jobs_of(domain: Domain, setting: str, methods: Sequence[str], sources: Sources, n_runs: int, n_episodes: int) -> list[Job]:
     """
     Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete.
 

@@ -1,0 +1,139 @@
+"""Figures 2, 3, 5 and 6: learning curves, and the training needed to reach a threshold; with the controls beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.experiments.bootstrap import bootstrap_band
+from sb3_combrel.experiments.figures import COLOURS
+from sb3_combrel.experiments.paper.domains import Domain
+from sb3_combrel.experiments.statistics import steps_to_reach
+
+#: Moving average, and the median for thresholds, over so many episodes.
+WINDOW = 5
+_COLOURS = (*COLOURS, "#56B4E9", "#E69F00", "#F0E442")
+
+
+def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
+    """
+    Draw learning curves, one panel beside the other: mean over the runs of the moving average, 95% bootstrap bands.
+
+    :param panels: for each panel's title the steps of each method's runs, shape (n_runs, n_episodes)
+    :param domain: the domain
+    :param title: title of the figure
+    :param path: file to write, without its suffix
+    :return: the PNG and the SVG file
+    """
+    figure, all_axes = _panels(len(panels), title)
+    for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
+        for (method, samples), colour in zip(steps.items(), _COLOURS, strict=False):
+            smooth = _moving_average(samples)
+            band = bootstrap_band(smooth)
+            episodes = np.arange(samples.shape[1] - smooth.shape[1] + 1, samples.shape[1] + 1)
+            axes.plot(episodes, band.mean, color=colour, label=f"{method} ({len(samples)} runs)")
+            axes.fill_between(episodes, band.low, band.high, color=colour, alpha=0.15, linewidth=0)
+        axes.set_title(name, fontsize="medium")
+        # The methods differ in the first tenth of the episodes.
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        _readable_ticks(axes.yaxis)
+        axes.set_xlabel("episode")
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize="small")
+    all_axes[0].set_ylabel(f"{domain.unit} (mean of {WINDOW} episodes)")
+    return _save(figure, path)
+
+
+def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
+    """
+    Draw the environment steps until the median of the last episodes is at most a threshold; median over the runs.
+
+    A method whose median run never gets there has no point; the band is the bootstrap's 95% interval of the median.
+
+    Parameters: see :func:`draw_curves`.
+    """
+    figure, all_axes = _panels(len(panels), title)
+    places = np.arange(len(domain.thresholds))
+    for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
+        for (method, samples), colour in zip(steps.items(), _COLOURS, strict=False):
+            needed = np.array([steps_to_reach(samples, threshold, WINDOW) for threshold in domain.thresholds]).T
+            band = bootstrap_band(needed, "median")
+            reached = np.isfinite(band.mean)
+            axes.plot(places[reached], band.mean[reached], color=colour, marker="o", markersize=4, label=method)
+            shown = reached & np.isfinite(band.low) & np.isfinite(band.high)
+            axes.fill_between(places[shown], band.low[shown], band.high[shown], color=colour, alpha=0.12, linewidth=0)
+        axes.set_title(name, fontsize="medium")
+        axes.set_xticks(places, [str(threshold) for threshold in domain.thresholds])
+        axes.set_yscale("log")
+        _readable_ticks(axes.yaxis)
+        axes.set_xlabel(f"threshold: {domain.unit} an episode (median of {WINDOW})")
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize="small")
+    all_axes[0].set_ylabel("environment steps until the threshold")
+    return _save(figure, path)
+
+
+def draw_selection(
+    panels: Mapping[str, tuple[np.ndarray, np.ndarray, Sequence[str]]], labels: tuple[str, str], title: str, path: Path
+) -> list[Path]:
+    """
+    Draw which source action is selected over a plane of the state space (Figure 4).
+
+    :param panels: for each title the coordinates of points along both variables, shape (n, 2), the place of each point's
+        source action in the names, -1 for none, shape (n,), and the names
+    :param labels: names of the two variables
+    :param title: title of the figure
+    :param path: file to write, without its suffix
+    :return: the PNG and the SVG file
+    """
+    figure, all_axes = _panels(len(panels), title)
+    for axes, (name, (points, action, names)) in zip(all_axes, panels.items(), strict=True):
+        for k, (label, marker) in enumerate(zip(("nothing", *names), (".", "<", "o", ">", "^", "v"), strict=False), start=-1):
+            here = action == k
+            if here.any():
+                colour = "#BBBBBB" if k < 0 else _COLOURS[k + 1]
+                axes.scatter(*points[here].T, color=colour, marker=marker, s=8 if k < 0 else 40, label=label)
+        axes.set_title(name, fontsize="medium")
+        axes.set_xlabel(labels[0])
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4, frameon=False, fontsize="small")
+    all_axes[0].set_ylabel(labels[1])
+    return _save(figure, path)
+
+
+def _moving_average(samples: np.ndarray) -> np.ndarray:
+    """The mean of ``WINDOW`` episodes, or of all where there are fewer, shape (n_runs, n_episodes - window + 1)."""
+    window = min(WINDOW, samples.shape[1])
+    return np.lib.stride_tricks.sliding_window_view(samples.astype(np.float64), window, axis=1).mean(axis=-1)
+
+
+def _panels(n: int, title: str) -> tuple[Any, list[Any]]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # The object-oriented interface leaves the caller's pyplot and its backend alone.
+    figure = Figure(figsize=(6.2 * n, 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    return figure, list(figure.subplots(1, n, sharey=True, squeeze=False)[0])
+
+
+def _readable_ticks(axis: Any) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:,.0f}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _save(figure: Any, path: Path) -> list[Path]:
+    """Save as PNG and SVG; without the date, which would make every file differ."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
+    figure.savefig(png, dpi=110)
+    figure.savefig(svg, metadata={"Date": None})
+    return [png, svg]

@@ -1,0 +1,66 @@
+"""Taylor & Stone's measures of transfer for every method of a domain, against no transfer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_combrel.experiments.paper.domains import Domain
+from sb3_combrel.experiments.paper.methods import NO_TRANSFER
+from sb3_combrel.experiments.paper.runs import Result
+from sb3_combrel.experiments.paper.verdicts import p_text
+from sb3_combrel.experiments.report import Table
+from sb3_combrel.experiments.statistics import holm
+from sb3_combrel.experiments.transfer_measures import Comparison, LearningCurves, compare_learning
+
+#: Columns of the table, and the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`.
+_COLUMNS = {
+    "jumpstart": "jumpstart",
+    "asymptotic performance": "asymptotic_performance",
+    "total reward": "total_reward",
+    "transfer ratio": "transfer_ratio",
+    "time to threshold": "time_to_threshold",
+}
+
+
+def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
+    """
+    Make a table of jumpstart, asymptotic performance, total reward, transfer ratio and time to threshold of each method.
+
+    Each cell has the effect against no transfer and, in brackets, its p-value by Holm's method over the column.
+
+    :param domain: the domain
+    :param results: of its runs, with no transfer among them
+    """
+    curves = {method: _curves(results, method) for method in dict.fromkeys(result.method for result in results)}
+    without = curves.pop(NO_TRANSFER)
+    # The least return that an episode can have, the same for all rows: of a step it is -1 in both domains.
+    floor = float(min(result_curves.returns.min() for result_curves in (without, *curves.values())))
+    threshold = -float(domain.thresholds[-1]) if domain.name != "icub" else 100.0 - domain.thresholds[-1]
+    found = {
+        method: compare_learning(its_own, without, threshold=threshold, floor=floor) for method, its_own in curves.items()
+    }
+    columns = []
+    for field in _COLUMNS.values():
+        comparisons: list[Comparison] = [getattr(measures, field) for measures in found.values()]
+        p_values = holm(np.array([comparison.p_value for comparison in comparisons]))
+        percent = field == "transfer_ratio"
+        columns.append([_cell(each, p, percent) for each, p in zip(comparisons, p_values.tolist(), strict=True)])
+    rows = [(method, *cells) for method, cells in zip(found, zip(*columns, strict=True), strict=True)]
+    title = (
+        f"{domain.title}: measures of transfer against no transfer; p by Holm's method (threshold: a return of {threshold:g})"
+    )
+    return Table(title, ("method", *_COLUMNS), rows)
+
+
+def _curves(results: Sequence[Result], method: str) -> LearningCurves:
+    runs = sorted((result for result in results if result.method == method), key=lambda result: result.seed)
+    return LearningCurves.from_rows([run.returns for run in runs], [run.steps for run in runs])
+
+
+def _cell(comparison: Comparison, p_value: float, percent: bool) -> str:
+    if not np.isfinite(comparison.effect):
+        return "-"
+    effect = f"{comparison.effect:+.0%}" if percent else f"{comparison.effect:+,.0f}"
+    return f"{effect} ({p_text(p_value)})"

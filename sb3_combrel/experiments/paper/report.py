@@ -1,0 +1,182 @@
+"""The files that ``sb3-combrel reproduce`` makes of the results: figures, tables, and all runs as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from sb3_combrel import FittedRMax
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.experiments.paper import methods as m
+from sb3_combrel.experiments.paper.curves import draw_curves, draw_selection, draw_times
+from sb3_combrel.experiments.paper.domains import DOMAINS, Domain
+from sb3_combrel.experiments.paper.measures import measures_table
+from sb3_combrel.experiments.paper.methods import target_names
+from sb3_combrel.experiments.paper.plan import CONTROLS, Target
+from sb3_combrel.experiments.paper.runs import Result, steps_by_method, write_whole
+from sb3_combrel.experiments.paper.selections import (
+    Selection,
+    action_mapping_table,
+    dependence_table,
+    joint_action_table,
+    state_mapping_table,
+)
+from sb3_combrel.experiments.paper.verdicts import CONTROL, PAPERS, judge, summary_table, verdict_table
+from sb3_combrel.experiments.report import Table
+from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+
+#: Minutes that the paper gives for 200 episodes (Table 5).
+PAPERS_MINUTES = {m.NO_TRANSFER: 24.0, m.TIMBREL_INTUITIVE: 28.1, m.COMBREL_PLAIN: 40.9}
+EAST = "East"
+
+
+def write_report(
+    targets: Sequence[Target], setting: str, results: Mapping[str, Sequence[Result]], output: Path, console: Console
+) -> list[Path]:
+    """
+    Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs to one CSV file a domain.
+
+    :param targets: figures and tables to make
+    :param setting: name of the setting
+    :param results: of all runs that they need, by domain
+    :param output: folder to write to
+    :param console: where to show the tables
+    :return: the files
+    """
+    made: list[Path] = []
+    for name, of_domain in results.items():
+        made.append(_write_runs(of_domain, output / f"{name}.csv"))
+    for target in targets:
+        for name, wanted in target.methods.items():
+            have = [result for result in results[name] if result.method in wanted]
+            if target.name.startswith("fig"):
+                made += _draw(target, DOMAINS[name], setting, have, output)
+        tables = _tables(target, setting, {name: results[name] for name in target.methods})
+        if tables:
+            made += write_tables(tables, output / target.name, console)
+    if any(target.name == "table6" for target in targets):
+        tables = [measures_table(DOMAINS[name], of_domain) for name, of_domain in results.items()]
+        made += write_tables(tables, output / "measures", console)
+    return made
+
+
+def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[Path]:
+    """
+    Write tables as Markdown, into one file, and as CSV, one file each; and show them.
+
+    :param tables: the tables
+    :param path: file to write, without its suffix
+    """
+    made = [path.with_suffix(".md")]
+    write_whole(made[0], "\n".join(table.as_markdown() for table in tables))
+    for number, table in enumerate(tables, 1):
+        console.print(table.for_terminal())
+        file = path.with_name(f"{path.name}{'' if len(tables) == 1 else f'_{number}'}.csv")
+        write_whole(file, _csv_text([table.header, *table.rows]))
+        made.append(file)
+    return made
+
+
+def _draw(target: Target, domain: Domain, setting: str, results: Sequence[Result], output: Path) -> list[Path]:
+    path = output / target.name
+    title = f"{target.title} (setting: {setting})"
+    if target.name == "fig4":
+        return _draw_east(domain, setting, results, title, path)
+    steps = {name: samples for name, samples in steps_by_method(results).items() if name in target.methods[domain.name]}
+    panels = {"methods": {name: samples for name, samples in steps.items() if name not in CONTROLS}}
+    controls = {name: samples for name, samples in steps.items() if name in CONTROLS}
+    if m.TIMBREL_RANDOM in controls and domain.n_episodes == DOMAINS["icub"].n_episodes:
+        # One of the paper's own methods there.
+        panels["methods"][m.TIMBREL_RANDOM] = controls[m.TIMBREL_RANDOM]
+    if controls:
+        panels["controls"] = {m.COMBREL_PLAIN: steps[m.COMBREL_PLAIN], **controls}
+    draw = draw_times if target.name == "fig6" else draw_curves
+    return draw(panels, domain, title, path)
+
+
+def _draw_east(domain: Domain, setting: str, results: Sequence[Result], title: str, path: Path) -> list[Path]:
+    """Draw what the first run has selected for East in the end, in two planes through the state at rest in the valley."""
+    chosen = np.array(min(results, key=lambda result: result.seed).at_sample[EAST])
+    points, scaling = _sample_of(domain, setting)
+    rest = scaling.to_unit(np.array([-np.pi / 6, -np.pi / 6, 0.0, 0.0]))
+    nearest = np.abs(points - rest).min(axis=0)
+    at_rest = np.abs(points - rest) <= nearest + 1e-9
+    names = sorted(set(chosen.tolist()) - {""})
+    place = {name: k for k, name in enumerate(names)} | {"": -1}
+    panels = {}
+    for label, (a, b) in {"x and y, at rest": (0, 1), "x and vx, y at rest": (0, 2)}.items():
+        others = [k for k in range(points.shape[1]) if k not in (a, b)]
+        here = at_rest[:, others].all(axis=1)
+        panels[label] = (
+            scaling.to_raw(points[here])[:, [a, b]],
+            np.array([place[name] for name in chosen[here].tolist()]),
+            names,
+        )
+    return draw_selection(panels, ("x", "y or vx"), title, path)
+
+
+def _sample_of(domain: Domain, setting: str) -> tuple[np.ndarray, StateScaling]:
+    """The finite sample of states that the learner plans with, unit coordinates, and the scaling."""
+    learner = domain.settings[setting].learner
+    with coarse_on_purpose():
+        model = FittedRMax(make_task(domain.target_id), **learner)
+    return model.agent.grid.points(), model.agent.task.scaling
+
+
+def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]]) -> list[Table]:
+    if target.name == "table6":
+        steps = {name: steps_by_method(of_domain) for name, of_domain in results.items()}
+        papers, controls = judge(steps, PAPERS), judge(steps, CONTROL)
+        tables = [verdict_table(papers, f"Table 6: what the paper claims, in setting {setting!r}")]
+        tables.append(verdict_table(controls, f"Controls, in setting {setting!r}"))
+        return [*tables, summary_table(steps)]
+    (name, of_domain), *_ = results.items()
+    have = [result for result in of_domain if result.method in target.methods[name]]
+    variables, actions = target_names(DOMAINS[name])
+    if target.name == "table2":
+        return [
+            action_mapping_table(have, actions),
+            state_mapping_table(have),
+            dependence_table(Selection.of_results(have), variables),
+        ]
+    if target.name == "table4":
+        return [joint_action_table(have, actions), state_mapping_table(have)]
+    if target.name == "table5":
+        return [running_times_table(have)]
+    return []
+
+
+def running_times_table(results: Sequence[Result]) -> Table:
+    """Make a table of the running times of all episodes and of the first (the paper's Table 5), mean of the runs."""
+    rows = []
+    for method in dict.fromkeys(result.method for result in results):
+        seconds = np.array([result.seconds for result in results if result.method == method])
+        steps = np.array([sum(result.steps) for result in results if result.method == method])
+        papers = f"{PAPERS_MINUTES[method]:.1f}" if method in PAPERS_MINUTES else ""
+        mean = seconds.mean(axis=0)
+        per_step = f"{1000.0 * seconds[:, 0].sum() / steps.sum():.2f}"
+        rows.append((method, papers, f"{mean[0] / 60:.2f}", f"{mean[1]:.1f}", per_step, f"{steps.mean():,.0f}"))
+    n_episodes = len(results[0].steps) if results else 0
+    header = ("method", "paper, minutes", "minutes", "first episode, seconds", "ms a step", "steps")
+    return Table(f"Processor time of {n_episodes} episodes, mean of the runs", header, rows)
+
+
+def _write_runs(results: Sequence[Result], path: Path) -> Path:
+    """Write one line for each run: the steps of its episodes, and how many of them ended in a terminal state."""
+    rows: list[tuple[object, ...]] = [("method", "seed", "steps", "episodes_terminated", "steps_of_episodes")]
+    for result in sorted(results, key=lambda each: (each.method, each.seed)):
+        of_episodes = " ".join(map(str, result.steps))
+        rows.append((result.method, result.seed, sum(result.steps), sum(result.terminated), of_episodes))
+    write_whole(path, _csv_text(rows))
+    return path
+
+
+def _csv_text(rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
