@@ -133,9 +133,7 @@ def _pooled(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Tr
 _CAR, _ROBOT = (MOUNTAIN_CAR.name,), (ICUB.name,)
 _METHODS: Sequence[Method] = (
     Method(NO_TRANSFER, "Fitted R-Max alone", None),
-    Method(
-        TIMBREL_INTUITIVE, "TIMBREL with the mapping that a person would choose; also the oracle", _intuitive, domains=_CAR
-    ),
+    Method(TIMBREL_INTUITIVE, "TIMBREL with the mapping that a person would choose, the oracle", _intuitive, domains=_CAR),
     Method(COMBREL_PLAIN, "COMBREL without relevance", lambda d, s, sources, seed: combrel(s, sources.own)),
     Method(
         COMBREL_RELEVANCE,

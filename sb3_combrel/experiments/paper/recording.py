@@ -25,7 +25,7 @@ class SelectionRecorder(BaseCallback):
     def _on_step(self) -> bool:
         # The model was asked about the state in which the step was made, before it was made.
         assert self._state is not None
-        uses = self.model.agent.transfer.uses()  # type: ignore[union-attr]
+        uses = self.model.agent.transfer.uses()  # type: ignore[attr-defined]
         if uses != self._before:
             new = (number for number, n in uses.items() if n != self._before.get(number, 0))
             self._rows += [(number, self._state) for number in new]

@@ -45,6 +45,9 @@ class Engine:
         return carry_out_on(self.name, carry_out, jobs, n_jobs=self.n_jobs, address=self.address)
 
 
+LOCAL = Engine()
+
+
 def reproduce(
     target: str,
     *,
@@ -52,7 +55,7 @@ def reproduce(
     runs: int | None = None,
     episodes: int | None = None,
     output: Path | None = None,
-    engine: Engine = Engine(),  # noqa: B008 - it cannot be changed
+    engine: Engine = LOCAL,
     console: Console | None = None,
 ) -> list[Path]:
     """
@@ -149,8 +152,7 @@ def _progress_of(jobs: Sequence[Job], missing: Sequence[Job], console: Console) 
             progress.advance(bars[job.method])
             if not console.is_terminal:
                 console.print(
-                    f"  {job.domain}, {job.method}, seed {job.seed}: {sum(result.steps):,} steps in {job.n_episodes} episodes, "
-                    f"{result.seconds[0]:.0f} s"
+                    f"  {job.domain}, {job.method}, seed {job.seed}: {sum(result.steps):,} steps, {result.seconds[0]:.0f} s"
                 )
 
         yield advance

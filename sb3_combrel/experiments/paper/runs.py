@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.experiments.paper.recording import SelectionRecorder, selections_at_sample, uses_of
 from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
@@ -114,7 +115,7 @@ def carry_out(job: Job) -> Result:
     with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, coarse_on_purpose():
         model = FittedRMax(env, transfer=job.transfer, seed=job.seed, **job.learner)
         start = time.process_time()
-        callbacks = [episodes, selections] if job.records_selections else [episodes]
+        callbacks: list[BaseCallback] = [episodes, selections] if job.records_selections else [episodes]
         model.learn(UNLIMITED, callbacks, log_interval=None)
         end = time.process_time()
     learnt = episodes.episodes

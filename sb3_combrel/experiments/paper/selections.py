@@ -1,4 +1,4 @@
-"""Tables 2 and 4 and Figure 4: the mappings that COMBREL selected, and whether they depend on state and action (Section 5.1)."""
+"""Tables 2 and 4: the mappings that COMBREL selected, and whether they depend on state and action (Section 5.1)."""
 
 from __future__ import annotations
 

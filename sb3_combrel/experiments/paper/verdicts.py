@@ -75,7 +75,7 @@ class Verdict(NamedTuple):
     What the runs say of a claim.
 
     :param claim: the claim
-    :param saved: environment steps of all episodes that the better method saves, as a fraction of the other's; mean of the runs
+    :param saved: environment steps of all episodes that the better method saves, as a fraction of the other's; means
     :param low: lower bound of its 95% bootstrap interval; ``high``: upper bound
     :param delta: Cliff's delta: the probability that a run of the better method takes fewer steps than one of the other, less
         that of the reverse
