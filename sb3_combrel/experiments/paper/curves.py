@@ -28,7 +28,7 @@ def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, 
     :param path: file to write, without its suffix
     :return: the PNG and the SVG file
     """
-    figure, all_axes = _panels(len(panels), title)
+    figure, all_axes = panels_of(len(panels), title)
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
         for (method, samples), colour in zip(steps.items(), _COLOURS, strict=False):
             smooth = _moving_average(samples)
@@ -41,12 +41,12 @@ def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, 
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.xaxis.set_major_formatter("{x:g}")
-        _readable_ticks(axes.yaxis)
+        readable_ticks(axes.yaxis)
         axes.set_xlabel("episode")
         axes.grid(alpha=0.3)
         axes.legend(frameon=False, fontsize="small")
     all_axes[0].set_ylabel(f"{domain.unit} (mean of {WINDOW} episodes)")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
@@ -57,7 +57,7 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
 
     Parameters: see :func:`draw_curves`.
     """
-    figure, all_axes = _panels(len(panels), title)
+    figure, all_axes = panels_of(len(panels), title)
     places = np.arange(len(domain.thresholds))
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
         for (method, samples), colour in zip(steps.items(), _COLOURS, strict=False):
@@ -70,12 +70,12 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
         axes.set_title(name, fontsize="medium")
         axes.set_xticks(places, [str(threshold) for threshold in domain.thresholds])
         axes.set_yscale("log")
-        _readable_ticks(axes.yaxis)
+        readable_ticks(axes.yaxis)
         axes.set_xlabel(f"threshold: {domain.unit} an episode (median of {WINDOW})")
         axes.grid(alpha=0.3)
         axes.legend(frameon=False, fontsize="small")
     all_axes[0].set_ylabel("environment steps until the threshold")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def draw_selection(
@@ -91,7 +91,7 @@ def draw_selection(
     :param path: file to write, without its suffix
     :return: the PNG and the SVG file
     """
-    figure, all_axes = _panels(len(panels), title)
+    figure, all_axes = panels_of(len(panels), title)
     for axes, (name, (points, action, names)) in zip(all_axes, panels.items(), strict=True):
         for k, (label, marker) in enumerate(zip(("nothing", *names), (".", "<", "o", ">", "^", "v"), strict=False), start=-1):
             here = action == k
@@ -102,7 +102,7 @@ def draw_selection(
         axes.set_xlabel(labels[0])
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4, frameon=False, fontsize="small")
     all_axes[0].set_ylabel(labels[1])
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def _moving_average(samples: np.ndarray) -> np.ndarray:
@@ -111,7 +111,8 @@ def _moving_average(samples: np.ndarray) -> np.ndarray:
     return np.lib.stride_tricks.sliding_window_view(samples.astype(np.float64), window, axis=1).mean(axis=-1)
 
 
-def _panels(n: int, title: str) -> tuple[Any, list[Any]]:
+def panels_of(n: int, title: str) -> tuple[Any, list[Any]]:
+    """Make a figure with ``n`` panels side by side; the figure and their axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -122,7 +123,8 @@ def _panels(n: int, title: str) -> tuple[Any, list[Any]]:
     return figure, list(figure.subplots(1, n, sharey=True, squeeze=False)[0])
 
 
-def _readable_ticks(axis: Any) -> None:
+def readable_ticks(axis: Any) -> None:
+    """Write numbers such as 200 on a logarithmic axis, not powers of ten."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -130,7 +132,7 @@ def _readable_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _save(figure: Any, path: Path) -> list[Path]:
+def save(figure: Any, path: Path) -> list[Path]:
     """Save as PNG and SVG; without the date, which would make every file differ."""
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")

@@ -14,10 +14,11 @@ from sb3_combrel import FittedRMax
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.curves import draw_curves, draw_selection, draw_times
+from sb3_combrel.experiments.paper.diagnosis import diagnosis_table, draw_diagnosis
 from sb3_combrel.experiments.paper.domains import DOMAINS, Domain
 from sb3_combrel.experiments.paper.measures import measures_table
 from sb3_combrel.experiments.paper.methods import target_names
-from sb3_combrel.experiments.paper.plan import CONTROLS, Target
+from sb3_combrel.experiments.paper.plan import CONTROLS, DIAGNOSIS, Target
 from sb3_combrel.experiments.paper.runs import Result, steps_by_method, write_whole
 from sb3_combrel.experiments.paper.selections import (
     Selection,
@@ -54,13 +55,16 @@ def write_report(
     for target in targets:
         for name, wanted in target.methods.items():
             have = [result for result in results[name] if result.method in wanted]
-            if target.name.startswith("fig"):
+            if target.name == DIAGNOSIS:
+                made += draw_diagnosis(steps_by_method(results[name]), DOMAINS[name], output / target.name)
+            elif target.name.startswith("fig"):
                 made += _draw(target, DOMAINS[name], setting, have, output)
         tables = _tables(target, setting, {name: results[name] for name in target.methods})
         if tables:
             made += write_tables(tables, output / target.name, console)
     if any(target.name == "table6" for target in targets):
-        tables = [measures_table(DOMAINS[name], of_domain) for name, of_domain in results.items()]
+        own = {name: [each for each in of_domain if each.method in m.METHODS] for name, of_domain in results.items()}
+        tables = [measures_table(DOMAINS[name], of_domain) for name, of_domain in own.items()]
         made += write_tables(tables, output / "measures", console)
     return made
 
@@ -146,6 +150,8 @@ def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]
         ]
     if target.name == "table4":
         return [joint_action_table(have, actions), state_mapping_table(have)]
+    if target.name == DIAGNOSIS:
+        return [diagnosis_table(steps_by_method(of_domain))]
     if target.name == "table5":
         return [running_times_table(have)]
     return []

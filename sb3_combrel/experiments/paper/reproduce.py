@@ -16,8 +16,9 @@ from sb3_combrel import __version__
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments.engines import carry_out_on
 from sb3_combrel.experiments.paper import methods as m
+from sb3_combrel.experiments.paper.diagnosis import diagnosis_jobs
 from sb3_combrel.experiments.paper.domains import DOMAINS, SETTINGS, Domain
-from sb3_combrel.experiments.paper.plan import frequent_mapping, jobs_of, methods_of, targets_of
+from sb3_combrel.experiments.paper.plan import DIAGNOSIS, frequent_mapping, jobs_of, methods_of, targets_of
 from sb3_combrel.experiments.paper.report import write_report
 from sb3_combrel.experiments.paper.runs import Job, Result, ResultFiles, carry_out, write_whole
 from sb3_combrel.experiments.paper.sources import prepare_sources
@@ -86,6 +87,10 @@ def reproduce(
         methods = methods_of(targets, domain, setting)
         counts = runs or domain.n_runs, episodes or domain.n_episodes
         results[domain.name] = _results_of(domain, setting, methods, counts, files, engine, console)
+        if any(each.name == DIAGNOSIS and domain.name in each.methods for each in targets):
+            jobs = diagnosis_jobs(domain, setting, prepare_sources(domain, output, console), *counts)
+            carry_out_missing(jobs, files, engine, console)
+            results[domain.name] += files.read_all(jobs)
     return write_report(targets, setting, results, output, console)
 
 
