@@ -10,12 +10,30 @@ import numpy as np
 
 from sb3_combrel.experiments.bootstrap import bootstrap_band
 from sb3_combrel.experiments.figures import COLOURS
+from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.statistics import steps_to_reach
 
 #: Moving average, and the median for thresholds, over so many episodes.
 WINDOW = 5
-_COLOURS = (*COLOURS, "#56B4E9", "#E69F00", "#F0E442")
+_GREY, _BLUE, _VERMILLION, _GREEN, _PURPLE = COLOURS
+_SKY, _ORANGE = "#56B4E9", "#E69F00"
+#: Colour and line of each method, the same in all figures; controls have no solid line.
+STYLES = {
+    m.NO_TRANSFER: (_GREY, "-"),
+    m.TIMBREL_INTUITIVE: (_BLUE, "-"),
+    m.COMBREL_PLAIN: (_VERMILLION, "-"),
+    m.COMBREL_RELEVANCE: (_ORANGE, "-"),
+    m.TIMBREL_RELEVANCE: (_SKY, "-"),
+    m.COMBREL_WHOLE: (_GREEN, "-"),
+    m.TIMBREL_RANDOM: (_PURPLE, "-"),
+    m.ONE_RANDOM: (_PURPLE, "--"),
+    m.TIMBREL_FREQUENT: (_BLUE, "-"),
+    m.ORACLE: (_GREEN, "--"),
+    m.UNRELATED: ("black", ":"),
+    m.NO_TRANSFER_BEST: (_GREY, "--"),
+}
+_MARKS = (_BLUE, _VERMILLION, _GREEN, _PURPLE, _SKY, _ORANGE)
 
 
 def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
@@ -30,11 +48,12 @@ def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, 
     """
     figure, all_axes = panels_of(len(panels), title)
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
-        for (method, samples), colour in zip(steps.items(), _COLOURS, strict=False):
+        for method, samples in steps.items():
+            colour, line = STYLES[method]
             smooth = _moving_average(samples)
             band = bootstrap_band(smooth)
             episodes = np.arange(samples.shape[1] - smooth.shape[1] + 1, samples.shape[1] + 1)
-            axes.plot(episodes, band.mean, color=colour, label=f"{method} ({len(samples)} runs)")
+            axes.plot(episodes, band.mean, line, color=colour, label=f"{method} ({len(samples)} runs)")
             axes.fill_between(episodes, band.low, band.high, color=colour, alpha=0.15, linewidth=0)
         axes.set_title(name, fontsize="medium")
         # The methods differ in the first tenth of the episodes.
@@ -60,11 +79,12 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
     figure, all_axes = panels_of(len(panels), title)
     places = np.arange(len(domain.thresholds))
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
-        for (method, samples), colour in zip(steps.items(), _COLOURS, strict=False):
+        for method, samples in steps.items():
+            colour, line = STYLES[method]
             needed = np.array([steps_to_reach(samples, threshold, WINDOW) for threshold in domain.thresholds]).T
             band = bootstrap_band(needed, "median")
             reached = np.isfinite(band.mean)
-            axes.plot(places[reached], band.mean[reached], color=colour, marker="o", markersize=4, label=method)
+            axes.plot(places[reached], band.mean[reached], line, color=colour, marker="o", markersize=4, label=method)
             shown = reached & np.isfinite(band.low) & np.isfinite(band.high)
             axes.fill_between(places[shown], band.low[shown], band.high[shown], color=colour, alpha=0.12, linewidth=0)
         axes.set_title(name, fontsize="medium")
@@ -96,7 +116,7 @@ def draw_selection(
         for k, (label, marker) in enumerate(zip(("nothing", *names), (".", "<", "o", ">", "^", "v"), strict=False), start=-1):
             here = action == k
             if here.any():
-                colour = "#BBBBBB" if k < 0 else _COLOURS[k + 1]
+                colour = "#BBBBBB" if k < 0 else _MARKS[k]
                 axes.scatter(*points[here].T, color=colour, marker=marker, s=8 if k < 0 else 40, label=label)
         axes.set_title(name, fontsize="medium")
         axes.set_xlabel(labels[0])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_combrel.experiments.paper.domains import Domain
-from sb3_combrel.experiments.paper.methods import NO_TRANSFER
+from sb3_combrel.experiments.paper.methods import METHODS, NO_TRANSFER
 from sb3_combrel.experiments.paper.runs import Result
 from sb3_combrel.experiments.paper.verdicts import p_text
 from sb3_combrel.experiments.report import Table
@@ -33,7 +33,8 @@ def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
     :param domain: the domain
     :param results: of its runs, with no transfer among them
     """
-    curves = {method: _curves(results, method) for method in dict.fromkeys(result.method for result in results)}
+    have = {result.method for result in results}
+    curves = {method: _curves(results, method) for method in METHODS if method in have}
     without = curves.pop(NO_TRANSFER)
     # The least return that an episode can have, the same for all rows: of a step it is -1 in both domains.
     floor = float(min(result_curves.returns.min() for result_curves in (without, *curves.values())))

@@ -15,7 +15,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.curves import draw_curves, draw_selection, draw_times
 from sb3_combrel.experiments.paper.diagnosis import diagnosis_table, draw_diagnosis
-from sb3_combrel.experiments.paper.domains import DOMAINS, Domain
+from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
 from sb3_combrel.experiments.paper.measures import measures_table
 from sb3_combrel.experiments.paper.methods import target_names
 from sb3_combrel.experiments.paper.plan import CONTROLS, DIAGNOSIS, Target
@@ -91,11 +91,12 @@ def _draw(target: Target, domain: Domain, setting: str, results: Sequence[Result
     title = f"{target.title} (setting: {setting})"
     if target.name == "fig4":
         return _draw_east(domain, setting, results, title, path)
-    steps = {name: samples for name, samples in steps_by_method(results).items() if name in target.methods[domain.name]}
+    found = steps_by_method(results)
+    steps = {name: found[name] for name in m.METHODS if name in found and name in target.methods[domain.name]}
     panels = {"methods": {name: samples for name, samples in steps.items() if name not in CONTROLS}}
     controls = {name: samples for name, samples in steps.items() if name in CONTROLS}
-    if m.TIMBREL_RANDOM in controls and domain.n_episodes == DOMAINS["icub"].n_episodes:
-        # One of the paper's own methods there.
+    if m.TIMBREL_RANDOM in controls and domain.name == ICUB.name:
+        # It is one of the paper's own methods there.
         panels["methods"][m.TIMBREL_RANDOM] = controls[m.TIMBREL_RANDOM]
     if controls:
         panels["controls"] = {m.COMBREL_PLAIN: steps[m.COMBREL_PLAIN], **controls}

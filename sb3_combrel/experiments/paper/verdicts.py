@@ -164,7 +164,8 @@ def summary_table(steps: Mapping[str, Mapping[str, np.ndarray]]) -> Table:
     for domain_name, of_methods in steps.items():
         domain = DOMAINS[domain_name]
         hardest = domain.thresholds[-1]
-        for method, samples in of_methods.items():
+        for method in (name for name in m.METHODS if name in of_methods):
+            samples = of_methods[method]
             needed = steps_to_reach(samples, hardest, WINDOW)
             reached = np.isfinite(needed).sum()
             median = f"{np.median(needed):,.0f}" if np.isfinite(np.median(needed)) else "never"
