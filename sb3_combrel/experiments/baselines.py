@@ -132,9 +132,7 @@ class BaselineJob:
         if self.algorithm in OF_SOURCE and not isinstance(self.source, SourceInstances):
             raise ValueError(f"source must be SourceInstances with algorithm={self.algorithm!r}, got {self.source!r}")
         if self.algorithm not in OF_SOURCE and self.source is not None:
-            raise ValueError(
-                f"source must be None with algorithm={self.algorithm!r}, which does not use it, got {self.source!r}"
-            )
+            raise ValueError(f"source must be None with algorithm={self.algorithm!r}, got {self.source!r}")
 
 
 class Evaluations(NamedTuple):
@@ -209,9 +207,8 @@ def learn(job: BaselineJob) -> Learnt:
             assert model.replay_buffer is not None
             fill(model.replay_buffer, prefilled, env)
         recorder = EpisodeRecorder()
-        evaluator = GreedyEvaluator(
-            evaluation_steps(job.total_timesteps), evaluation_env, EVALUATION_SEED + job.seed, n_before
-        )
+        at = evaluation_steps(job.total_timesteps)
+        evaluator = GreedyEvaluator(at, evaluation_env, EVALUATION_SEED + job.seed, n_before)
         model.learn(job.total_timesteps - n_before, [recorder, evaluator], log_interval=None)
     both = (np.concatenate(columns) for columns in zip(before, recorder.episodes, strict=True))
     return Learnt(Episodes(*both), evaluator.evaluations, prefilled)
@@ -249,7 +246,12 @@ def prefill(job: BaselineJob) -> tuple[Episodes, Transitions]:
 
     :param job: one of :data:`OF_SOURCE`
     :return: these episodes, and what to fill the replay buffer with, raw units
+    :raises ValueError: if the job's algorithm is another
     """
+    if job.source is None:
+        raise ValueError(
+            f"algorithm must be one of {', '.join(OF_SOURCE)}, got {job.algorithm!r}: there is nothing to transfer"
+        )
     settings = PREFILLINGS[job.env_id]
     recorder, transitions = EpisodeRecorder(settings.n_episodes), TransitionRecorder()
     with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, coarse_on_purpose():

@@ -171,10 +171,8 @@ def test_an_instance_is_translated_as_by_hand():
     # instance; the third one is the second instance's.
     visited_states = np.array([[0.8, 20.0, 2.0], [3.9, 20.0, 2.9], [2.0, -10.0, 1.5]])
     ignored = np.zeros(3)
-    visited = Transitions(
-        visited_states, np.zeros(3, dtype=np.int64), ignored, visited_states, ignored > 0, low, high, 3, (), (), {}
-    )
-    found = translate(transfer, visited)
+    outcomes = ignored, visited_states, ignored > 0
+    found = translate(transfer, Transitions(visited_states, np.zeros(3, dtype=np.int64), *outcomes, low, high, 3, (), (), {}))
     # Effects: 0.25 of the first variable's range, -0.1 of the second's; and 0.05 of the second's.
     expected = {
         (0.8, 1): ([0.8 - 0.4, 20.0, 2.0 + 0.5], -3.0, False),
@@ -352,12 +350,17 @@ def test_a_source_that_would_not_be_used_is_refused(source):
 
 
 def test_prefilling_must_leave_steps(prefilled_job):
-    with pytest.raises(ValueError, match="total_timesteps must be more than the 100 steps .*got 60"):
+    with pytest.raises(ValueError, match=r"total_timesteps must be more than the 100 steps .*got 60"):
         learn(replace(prefilled_job, total_timesteps=60))
 
 
+def test_without_a_source_there_is_nothing_to_fill_in():
+    with pytest.raises(ValueError, match="algorithm must be one of DQN prefilled, DQN prefilled with own, got 'DQN'"):
+        prefill(SHORT)
+
+
 def test_there_is_no_source_for_other_tasks():
-    with pytest.raises(ValueError, match="env_id must be one of .*got 'CartPole-v1'"):
+    with pytest.raises(ValueError, match=r"env_id must be one of .*got 'CartPole-v1'"):
         baselines.learn_source("CartPole-v1")
 
 
