@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import closing
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.experiments.paper.recording import SelectionRecorder, selections_at_sample, uses_of
-from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.experiments.suite_runs import UNLIMITED, EpisodeRecorder
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.transfer.base import Transfer
@@ -112,7 +113,7 @@ def carry_out(job: Job) -> Result:
     """
     episodes = TimedRecorder(job.n_episodes)
     selections = SelectionRecorder()
-    with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, coarse_on_purpose():
+    with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, _on_purpose():
         model = FittedRMax(env, transfer=job.transfer, seed=job.seed, **job.learner)
         start = time.process_time()
         callbacks: list[BaseCallback] = [episodes, selections] if job.records_selections else [episodes]
@@ -135,6 +136,15 @@ def carry_out(job: Job) -> Result:
         selections_at_sample(transfer) if job.records_selections else {},
         (end - start, first - start),
     )
+
+
+@contextmanager
+def _on_purpose() -> Iterator[None]:
+    """Suppress warnings of what an experiment has chosen, a grid of many or few points, or a source that misleads."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="resolution=.* (is coarse|means)")
+        warnings.filterwarnings("ignore", message="what was transferred from")
+        yield
 
 
 class ResultFiles:
