@@ -131,7 +131,7 @@ def _moving_average(samples: np.ndarray) -> np.ndarray:
     return np.lib.stride_tricks.sliding_window_view(samples.astype(np.float64), window, axis=1).mean(axis=-1)
 
 
-def panels_of(n: int, title: str) -> tuple[Any, list[Any]]:
+def panels_of(n: int, title: str, sharey: bool = True) -> tuple[Any, list[Any]]:
     """Make a figure with ``n`` panels side by side; the figure and their axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -140,7 +140,7 @@ def panels_of(n: int, title: str) -> tuple[Any, list[Any]]:
     figure = Figure(figsize=(6.2 * n, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
-    return figure, list(figure.subplots(1, n, sharey=True, squeeze=False)[0])
+    return figure, list(figure.subplots(1, n, sharey=sharey, squeeze=False)[0])
 
 
 def readable_ticks(axis: Any) -> None:

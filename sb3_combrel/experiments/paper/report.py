@@ -13,12 +13,13 @@ from rich.console import Console
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments.paper import methods as m
+from sb3_combrel.experiments.paper.baseline_runs import baselines_table, draw_baselines
 from sb3_combrel.experiments.paper.curves import draw_curves, draw_selection, draw_times
 from sb3_combrel.experiments.paper.diagnosis import diagnosis_table, draw_diagnosis
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
 from sb3_combrel.experiments.paper.measures import measures_table
 from sb3_combrel.experiments.paper.methods import target_names
-from sb3_combrel.experiments.paper.plan import CONTROLS, DIAGNOSIS, Target
+from sb3_combrel.experiments.paper.plan import BASELINES, CONTROLS, DIAGNOSIS, Target
 from sb3_combrel.experiments.paper.runs import Result, steps_by_method, write_whole
 from sb3_combrel.experiments.paper.selections import (
     Selection,
@@ -59,6 +60,9 @@ def write_report(
                 made += draw_diagnosis(steps_by_method(results[name]), DOMAINS[name], output / target.name)
             elif target.name.startswith("fig"):
                 made += _draw(target, DOMAINS[name], setting, have, output)
+        if target.name == BASELINES:
+            drawn = (m.NO_TRANSFER, m.COMBREL_PLAIN)
+            made += draw_baselines({name: results[name] for name in target.methods}, drawn, target.title, output / target.name)
         tables = _tables(target, setting, {name: results[name] for name in target.methods})
         if tables:
             made += write_tables(tables, output / target.name, console)
@@ -151,6 +155,8 @@ def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]
         ]
     if target.name == "table4":
         return [joint_action_table(have, actions), state_mapping_table(have)]
+    if target.name == BASELINES:
+        return [baselines_table(results)]
     if target.name == DIAGNOSIS:
         return [diagnosis_table(steps_by_method(of_domain))]
     if target.name == "table5":

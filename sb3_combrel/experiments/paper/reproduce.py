@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +16,12 @@ from sb3_combrel import __version__
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments.engines import carry_out_on
 from sb3_combrel.experiments.paper import methods as m
+from sb3_combrel.experiments.paper.baseline_runs import baseline_runs, carry_out_baseline
 from sb3_combrel.experiments.paper.diagnosis import diagnosis_jobs
 from sb3_combrel.experiments.paper.domains import DOMAINS, SETTINGS, Domain
-from sb3_combrel.experiments.paper.plan import DIAGNOSIS, frequent_mapping, jobs_of, methods_of, targets_of
+from sb3_combrel.experiments.paper.plan import BASELINES, DIAGNOSIS, frequent_mapping, jobs_of, methods_of, targets_of
 from sb3_combrel.experiments.paper.report import write_report
-from sb3_combrel.experiments.paper.runs import Job, Result, ResultFiles, carry_out, write_whole
+from sb3_combrel.experiments.paper.runs import AnyJob, Result, ResultFiles, carry_out, write_whole
 from sb3_combrel.experiments.paper.sources import prepare_sources
 
 SETTINGS_FILE = "settings.json"
@@ -41,9 +42,9 @@ class Engine:
     n_jobs: int | None = None
     address: str | None = None
 
-    def carry_out(self, jobs: Sequence[Job]) -> Iterator[tuple[int, Result]]:
-        """Carry out jobs; yield the place of each and its result as it is done."""
-        return carry_out_on(self.name, carry_out, jobs, n_jobs=self.n_jobs, address=self.address)
+    def carry_out(self, function: Callable[[Any], Result], jobs: Sequence[Any]) -> Generator[tuple[int, Result], None, None]:
+        """Carry out jobs by a function of one; yield the place of each and its result as it is done."""
+        return carry_out_on(self.name, function, jobs, n_jobs=self.n_jobs, address=self.address)
 
 
 LOCAL = Engine()
@@ -87,10 +88,15 @@ def reproduce(
         methods = methods_of(targets, domain, setting)
         counts = runs or domain.n_runs, episodes or domain.n_episodes
         results[domain.name] = _results_of(domain, setting, methods, counts, files, engine, console)
-        if any(each.name == DIAGNOSIS and domain.name in each.methods for each in targets):
+        wanted = {each.name for each in targets if domain.name in each.methods}
+        if DIAGNOSIS in wanted:
             jobs = diagnosis_jobs(domain, setting, prepare_sources(domain, output, console), *counts)
             carry_out_missing(jobs, files, engine, console)
             results[domain.name] += files.read_all(jobs)
+        if BASELINES in wanted:
+            others = baseline_runs(domain, setting, prepare_sources(domain, output, console), runs, counts[1])
+            carry_out_missing(others, files, engine, console, carry_out_baseline)
+            results[domain.name] += files.read_all(others)
     return write_report(targets, setting, results, output, console)
 
 
@@ -118,7 +124,13 @@ def _results_of(
     return files.read_all(jobs)
 
 
-def carry_out_missing(jobs: Sequence[Job], files: ResultFiles, engine: Engine, console: Console) -> None:
+def carry_out_missing(
+    jobs: Sequence[AnyJob],
+    files: ResultFiles,
+    engine: Engine,
+    console: Console,
+    function: Callable[[Any], Result] = carry_out,
+) -> None:
     """
     Carry out the jobs that have no result yet, and write each result as it arrives.
 
@@ -126,20 +138,23 @@ def carry_out_missing(jobs: Sequence[Job], files: ResultFiles, engine: Engine, c
     :param files: where results are
     :param engine: where to carry them out
     :param console: where to show the progress
+    :param function: carries out one job
     """
     missing = [job for job in jobs if not files.is_complete(job)]
     if len(missing) < len(jobs):
         console.print(f"{len(jobs) - len(missing)} of {len(jobs)} runs were complete already.")
     if not missing:
         return
-    with _progress_of(jobs, missing, console) as advance, closing(engine.carry_out(missing)) as results:  # type: ignore[type-var]
+    with _progress_of(jobs, missing, console) as advance, closing(engine.carry_out(function, missing)) as results:
         for place, result in results:
             files.write(result)
             advance(missing[place], result)
 
 
 @contextmanager
-def _progress_of(jobs: Sequence[Job], missing: Sequence[Job], console: Console) -> Iterator[Callable[[Job, Result], None]]:
+def _progress_of(
+    jobs: Sequence[AnyJob], missing: Sequence[AnyJob], console: Console
+) -> Iterator[Callable[[AnyJob, Result], None]]:
     """Show a bar for each method; where no bars can be drawn, as in a log file, a line for each run."""
     columns = (
         TextColumn("{task.description:<26}"),
@@ -153,7 +168,7 @@ def _progress_of(jobs: Sequence[Job], missing: Sequence[Job], console: Console) 
         n_missing = {method: sum(job.method == method for job in missing) for method in n_runs}
         bars = {method: progress.add_task(method, total=n, completed=n - n_missing[method]) for method, n in n_runs.items()}
 
-        def advance(job: Job, result: Result) -> None:
+        def advance(job: AnyJob, result: Result) -> None:
             progress.advance(bars[job.method])
             if not console.is_terminal:
                 console.print(

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -55,6 +55,10 @@ class Job:
         """Name of the run in files."""
         return f"{self.domain}_{self.method.lower().replace(',', '').replace(' ', '_')}_seed{self.seed}"
 
+    def answered_by(self, result: Result) -> bool:
+        """Whether a result is that of this job: of as many episodes."""
+        return len(result.steps) == self.n_episodes
+
 
 @dataclass(frozen=True)
 class Result:
@@ -70,6 +74,7 @@ class Result:
     :param selections: each such use with the state, raw units: [number in ``uses``, *state]; [] unless asked for
     :param at_sample: source action selected in the end for each state of the finite sample, by target action; {} unless
         asked for
+    :param evaluations: of a baseline: [environment steps, mean greedy return, fraction of episodes that ended in a terminal state]
     :param seconds: processor time: of learning, and of the first episode
     """
 
@@ -83,12 +88,36 @@ class Result:
     uses: list[list[Any]] = field(default_factory=list)
     selections: list[list[float]] = field(default_factory=list)
     at_sample: dict[str, list[str]] = field(default_factory=dict)
+    evaluations: list[list[float]] = field(default_factory=list)
     seconds: tuple[float, float] = (0.0, 0.0)
 
     def text(self) -> str:
         """Return all but the times as JSON, the same to the byte for the same run."""
         content = {key: value for key, value in vars(self).items() if key != "seconds"}
         return json.dumps(content) + "\n"
+
+
+class AnyJob(Protocol):
+    """What is asked of a job besides being carried out."""
+
+    @property
+    def domain(self) -> str:
+        """Name of the domain."""
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+
+    @property
+    def name(self) -> str:
+        """Name of the run in files."""
+
+    def answered_by(self, result: Result) -> bool:
+        """Whether a result is that of this job."""
 
 
 class TimedRecorder(EpisodeRecorder):
@@ -134,7 +163,7 @@ def carry_out(job: Job) -> Result:
         [row for _, row in uses],
         selections.rows([number for number, _ in uses]) if job.records_selections else [],
         selections_at_sample(transfer) if job.records_selections else {},
-        (end - start, first - start),
+        seconds=(end - start, first - start),
     )
 
 
@@ -171,15 +200,15 @@ class ResultFiles:
         except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError, TypeError):
             return None
 
-    def read_all(self, jobs: Iterable[Job]) -> list[Result]:
+    def read_all(self, jobs: Iterable[AnyJob]) -> list[Result]:
         """Read the results of all jobs that have one."""
         found = (self.read(job.name) for job in jobs)
         return [result for result in found if result is not None]
 
-    def is_complete(self, job: Job) -> bool:
-        """Whether a job's result is there, of as many episodes as it asks for."""
+    def is_complete(self, job: AnyJob) -> bool:
+        """Whether a job's result is there."""
         result = self.read(job.name)
-        return result is not None and len(result.steps) == job.n_episodes
+        return result is not None and job.answered_by(result)
 
 
 def steps_by_method(results: Iterable[Result]) -> dict[str, np.ndarray]:
