@@ -74,7 +74,7 @@ class Result:
     :param selections: each such use with the state, raw units: [number in ``uses``, *state]; [] unless asked for
     :param at_sample: source action selected in the end for each state of the finite sample, by target action; {} unless
         asked for
-    :param evaluations: of a baseline: [environment steps, mean greedy return, fraction of episodes that ended in a terminal state]
+    :param evaluations: of a baseline: [steps, mean greedy return, fraction of episodes that ended in a terminal state]
     :param seconds: processor time: of learning, and of the first episode
     """
 
