@@ -2,7 +2,8 @@
 # make test    all tests, the slow ones too    make test-fast    unit tests, in a minute
 # make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
-# make icub    the arm of the iCub with and without transfer from its torso; tables and figure in icub_experiment/
+# make reproduce   the figures and tables of the COMBREL paper, with controls, in reproduction/; REPRODUCE_ARGS="fig2 --runs 2"
+# make icub    of these Figure 5, the arm of the iCub with and without transfer from its torso, in setting "explore"
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make suite   the learner on all tasks, as in docs/results/learner.md (hours); SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
@@ -16,6 +17,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST_WORKERS ?= 2
 DEMO_ARGS ?=
+REPRODUCE_ARGS ?= all
 ICUB_ARGS ?=
 SUITE_ARGS ?=
 LINTED := sb3_combrel envs tests
@@ -30,7 +32,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard suite icub icub-figures icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard suite reproduce icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -46,18 +48,15 @@ dashboard: $(VENV)/.installed-demo
 	cp dashboard/custom_scalars.png docs/figures/tensorboard_custom_scalars.png
 	cp dashboard/images.png docs/figures/tensorboard_images.png
 
-# Half an hour on two cores; a later call goes on with what is there. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
+# A later call goes on with what is there.
+reproduce: $(VENV)/.installed-demo
+	$(BIN)/sb3-combrel reproduce $(REPRODUCE_ARGS)
+
+# A later call goes on with what is there. ICUB_ARGS="--runs 3 --episodes 100", for instance.
 icub: $(VENV)/.installed-demo
-	$(BIN)/python -m sb3_combrel.experiments.ball_striking $(ICUB_ARGS)
+	$(BIN)/sb3-combrel reproduce fig5 --setting explore $(ICUB_ARGS)
 
-# Takes the results of `make icub` into the documentation.
-icub-figures: icub
-	mkdir -p docs/figures docs/results
-	cp icub_experiment/learning_curves.png docs/figures/icub_learning_curves.png
-	cp icub_experiment/summary.csv docs/results/icub.csv
-	cp icub_experiment/tables.md docs/results/icub.md
-
-# Takes its table into the documentation as well.
+# Takes its table into the documentation as well. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
 icub-breadths: $(VENV)/.installed-demo
 	$(BIN)/python -m sb3_combrel.experiments.breadths $(ICUB_ARGS)
 	mkdir -p docs/results

@@ -22,7 +22,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments import ball_striking, mountain_car
+from sb3_combrel.experiments import icub_arm, mountain_car
+from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB
 from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 from sb3_combrel.experiments.suite_measures import Episodes
 from sb3_combrel.experiments.suite_runs import EVALUATION_SEED, EpisodeRecorder, play
@@ -53,7 +54,7 @@ _CAR: dict[str, Any] = {
 }
 HYPERPARAMETERS: dict[str, dict[str, Any]] = {
     mountain_car.TARGET_ID: _CAR,
-    ball_striking.TARGET_ID: {**_CAR, "learning_rate": 0.001, "buffer_size": 50_000},
+    icub_arm.TARGET_ID: {**_CAR, "learning_rate": 0.001, "buffer_size": 50_000},
 }
 #: What the networks are given lies between these. Of the type of the observations: with Python's floats Gymnasium warns.
 OBSERVATION_RANGE = (np.float32(-1.0), np.float32(1.0))
@@ -85,16 +86,20 @@ class Prefilling:
     n_episodes: int
 
 
+_ARM = ICUB.settings[EXPLORE]
+# As in zoo_configs/combrel.yml.
 PREFILLINGS: dict[str, Prefilling] = {
-    # As in zoo_configs/combrel.yml.
     mountain_car.TARGET_ID: Prefilling(
         mountain_car.learn_source,
         {"degree": 0, "model_breadth": 0.1, "resolution": 3},
         {"mappings": "injective", "use": "instances"},
         n_episodes=2,
     ),
-    ball_striking.TARGET_ID: Prefilling(
-        ball_striking.learn_source, ball_striking.LEARNER, {**ball_striking.OF_ALL, "use": "instances"}, n_episodes=5
+    icub_arm.TARGET_ID: Prefilling(
+        icub_arm.learn_source,
+        _ARM.learner,
+        {"mappings": _ARM.mappings, **_ARM.combrel, "use": "instances"},
+        n_episodes=5,
     ),
 }
 

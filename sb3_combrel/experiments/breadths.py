@@ -17,8 +17,9 @@ from joblib import cpu_count
 from rich.console import Console
 
 from sb3_combrel.common.checks import check_count, check_positive
-from sb3_combrel.experiments.ball_striking import MAX_EPISODE_STEPS, SOURCE_ID, TARGET_ID, WINDOW
+from sb3_combrel.experiments import icub_arm
 from sb3_combrel.experiments.demo import prepare_folder
+from sb3_combrel.experiments.icub_arm import MAX_EPISODE_STEPS, SOURCE_ID, TARGET_ID
 from sb3_combrel.experiments.parallel import carry_out_all
 from sb3_combrel.experiments.report import Table
 from sb3_combrel.experiments.runs import Run
@@ -26,17 +27,19 @@ from sb3_combrel.experiments.statistics import episodes_to_reach
 from sb3_combrel.experiments.warm_up import warm_up
 
 BREADTHS = (0.05, 0.1, 0.2)
-#: A hit by the first command returns 99. The resolution is the default one.
-LEARNER: dict[str, Any] = {"degree": 0, "max_value": 100.0}
+#: The resolution is the default one.
+LEARNER: dict[str, Any] = {"degree": 0, **icub_arm.LEARNER}
 #: Commands in which a task counts as learnt; the shortest plans that were found have 25 and 27.
 LEARNT = {SOURCE_ID: 27, TARGET_ID: 32}
+#: Median of so many episodes must not exceed that.
+WINDOW = 5
 
 
 class Outcome(NamedTuple):
     """
     The outcome of one run.
 
-    :param episodes: until the median of five episodes was as in :data:`LEARNT`; inf if it never was
+    :param episodes: until the median of :data:`WINDOW` episodes was as in :data:`LEARNT`; inf if it never was
     :param in_the_end: median of the last ten episodes
     :param steps: environment steps of all episodes
     :param milliseconds: time of a step, simulation included, under whatever other load there was

@@ -87,14 +87,14 @@ def run_demo(
     _epilogue(output, n_seeds, console)
 
 
-def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool = False) -> None:
+def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool | None = None) -> None:
     """
     Prepare the folder for results; those of an earlier call with the same settings are kept.
 
     :param output: the folder
     :param settings: what the results depend on, as data that JSON can represent
-    :param fresh: delete earlier results; nothing else is ever deleted
-    :raises ValueError: if there are results of other settings, or files that are not the demonstration's
+    :param fresh: delete earlier results of the demonstration; nothing else is ever deleted. None: the command has no --fresh
+    :raises ValueError: if there are results of other settings, or files that are not results of the command
     """
     file = output / SETTINGS
     if output.exists() and not file.exists() and any(output.iterdir()):
@@ -108,7 +108,8 @@ def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool = False) 
         other = sorted(key for key in {*before, *settings} if before.get(key) != settings.get(key))
         if other:
             differences = ", ".join(f"{key} was {before.get(key)!r} and is {settings.get(key)!r}" for key in other)
-            raise ValueError(f"{output} has results of other settings ({differences}); use --fresh or another --output")
+            remedy = "use another --output" if fresh is None else "use --fresh or another --output"
+            raise ValueError(f"{output} has results of other settings ({differences}); {remedy}")
     output.mkdir(parents=True, exist_ok=True)
     unfinished = file.with_suffix(".part")
     unfinished.write_text(json.dumps(settings, indent=2) + "\n")

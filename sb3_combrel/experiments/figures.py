@@ -49,38 +49,3 @@ def draw_learning_curves(steps: Mapping[str, np.ndarray], path: Path, title: str
     axes.legend(frameon=False)
     figure.savefig(path, dpi=120)
     return path
-
-
-def draw_smoothed_curves(steps: Mapping[str, np.ndarray], path: Path, title: str, window: int = 5) -> Path:
-    """
-    Draw learning curves of many episodes: the median of ``window`` episodes, mean of the runs with its 95% confidence.
-
-    :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
-    :param path: PNG file to write
-    :param title: title of the figure
-    :return: the path
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    for (method, samples), colour in zip(steps.items(), (*COLOURS, "#56B4E9"), strict=False):
-        smooth = np.median(np.lib.stride_tricks.sliding_window_view(samples, window, axis=1), axis=-1)
-        mean, low, high = mean_of_runs(smooth)
-        episodes = np.arange(window, samples.shape[1] + 1)
-        axes.plot(episodes, mean, color=colour, label=f"{method} ({len(samples)} runs)")
-        axes.fill_between(episodes, np.maximum(low, 0), high, color=colour, alpha=0.15, linewidth=0)
-    # The curves differ in the first tenth of the episodes.
-    axes.set_xscale("log")
-    axes.set_xlim(window, samples.shape[1])
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.set_xlabel("episode")
-    axes.set_ylabel(f"commands (median of {window} episodes)")
-    axes.set_title(title)
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=110)
-    return path

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeAction
 
-from sb3_combrel.experiments import ball_striking, cart_pole, mountain_car
+from sb3_combrel.experiments import cart_pole, icub_arm, mountain_car
 from sb3_combrel.experiments.point_robot import make_point_robot
 from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.experiments.suite_measures import (
@@ -130,7 +130,7 @@ ACROBOT: dict[str, Any] = {
 SLIGHT_NOISE = 0.003
 
 CAR_2D = Source("mountain_car_2d", mountain_car.learn_source)
-TORSO = Source("icub_torso", ball_striking.learn_source)
+TORSO = Source("icub_torso", icub_arm.learn_source)
 CART_POLE = Source("cart_pole", cart_pole.learn_source)
 
 _car_2d = partial(make_task, mountain_car.SOURCE_ID, max_episode_steps=CAP)

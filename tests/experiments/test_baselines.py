@@ -13,7 +13,7 @@ from stable_baselines3 import DQN
 
 from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.experiments import ball_striking, baselines, mountain_car
+from sb3_combrel.experiments import baselines, icub_arm, mountain_car
 from sb3_combrel.experiments.baselines import (
     ALGORITHMS,
     HYPERPARAMETERS,
@@ -36,7 +36,7 @@ from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import TargetTask
 
-CAR, ARM = mountain_car.TARGET_ID, ball_striking.TARGET_ID
+CAR, ARM = mountain_car.TARGET_ID, icub_arm.TARGET_ID
 CONFIGURATIONS = Path(__file__).resolve().parents[2] / "zoo_configs"
 # Long enough for some updates of the network, which begin after 1000 steps.
 SHORT = BaselineJob(PLAIN, CAR, seed=3, total_timesteps=1200, max_episode_steps=50)

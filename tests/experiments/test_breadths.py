@@ -1,6 +1,7 @@
 """The iCub's tasks at several breadths, with few episodes."""
 
 import csv
+import sys
 
 import numpy as np
 import pytest
@@ -29,6 +30,14 @@ def test_bad_input_is_refused(tmp_path, change):
     with pytest.raises(ValueError, match=next(iter(change))):
         breadths.run_experiment(**arguments)
     assert not (tmp_path / "results").exists()
+
+
+def test_results_of_another_learner_are_refused_with_a_remedy_that_the_command_has(tmp_path, monkeypatch):
+    (tmp_path / "settings.json").write_text('{"tasks": [], "learner": {"degree": 1}}')
+    monkeypatch.setattr(sys, "argv", ["breadths", "--output", str(tmp_path)])
+    with pytest.raises(ValueError, match=r"learner was {'degree': 1} and is .*; use another --output$"):
+        breadths.main()
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
 
 
 def test_episodes_and_steps_until_a_threshold():

@@ -16,6 +16,7 @@ from sb3_combrel.experiments.statistics import (
     mean_of_runs,
     p_value_of_difference,
     saving,
+    steps_to_reach,
 )
 
 few_whole = st.lists(st.integers(-9, 9), min_size=2, max_size=5)
@@ -140,3 +141,9 @@ def test_values_that_are_no_sample_are_refused(values, message):
 def test_a_curve_without_runs_has_no_area():
     with pytest.raises(ValueError, match=r"n_runs, n_points.*\(3,\)"):
         area_under_curve(np.ones(3))
+
+
+def test_steps_to_reach_counts_up_to_the_end_of_the_first_good_window():
+    steps = np.array([[400, 30, 400, 30, 30, 30], [400, 400, 400, 400, 400, 400]])
+    np.testing.assert_array_equal(steps_to_reach(steps, 50, 3), [860, np.inf])
+    np.testing.assert_array_equal(steps_to_reach(steps, 50, 7), [np.inf, np.inf])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.experiments import ball_striking, mountain_car
+from sb3_combrel.experiments import icub_arm, mountain_car
 
 #: As in the paper; where exploration is expensive, with this package's instance transfer; and this package's defaults.
 PAPER, EXPLORE, BEST = SETTINGS = ("paper", "explore", "best")
@@ -87,25 +87,28 @@ _CAR_EXPLORE = Setting(
 )
 _CAR_BEST = Setting(learner={}, max_episode_steps=2000, mappings="factored", timbrel={"use": "prior"})
 
-# Table 3. A hit by the first command returns 99.
+# Table 3.
 _ICUB_PAPER = Setting(
-    learner={"degree": 0, "model_breadth": 0.1, "min_fraction": 0.01, "min_weight": 0.01, "max_value": 100.0},
-    max_episode_steps=ball_striking.MAX_EPISODE_STEPS,
+    learner={"degree": 0, "model_breadth": 0.1, "min_fraction": 0.01, "min_weight": 0.01, **icub_arm.LEARNER},
+    max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
     mappings="paper_icub",
     combrel={"breadth": 0.1, "n_neighbors": 3},
     timbrel={"breadth": 0.1, "breadth_decay": 1.0},
     paper=True,
 )
+# The paper's breadth of the model is 0.1; with 0.2 the arm is learnt in fewer steps. Of all signed injective mappings many
+# have about the same compliance. If only the best is used, its errors determine all predictions and are corrected slowly;
+# drawn mappings do not have that drawback, and may be used farther from transitions.
 _ICUB_EXPLORE = Setting(
-    learner=ball_striking.LEARNER,
-    max_episode_steps=ball_striking.MAX_EPISODE_STEPS,
+    learner={"degree": 0, "model_breadth": 0.2, **icub_arm.LEARNER},
+    max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
     mappings="signed_injective",
-    combrel={key: value for key, value in ball_striking.OF_ALL.items() if key != "mappings"},
-    timbrel={"breadth": ball_striking.OF_ALL["breadth"], "breadth_decay": 1.0},
+    combrel={"choice": "drawn", "neighbor_radius": 0.7, "breadth": 0.5, "breadth_decay": 1.0, "max_transitions": 20_000},
+    timbrel={"breadth": 0.5, "breadth_decay": 1.0},
 )
 _ICUB_BEST = Setting(
-    learner={"max_value": 100.0},
-    max_episode_steps=ball_striking.MAX_EPISODE_STEPS,
+    learner=icub_arm.LEARNER,
+    max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
     mappings="factored",
     timbrel={"use": "prior"},
 )
@@ -126,9 +129,9 @@ MOUNTAIN_CAR = Domain(
 ICUB = Domain(
     name="icub",
     title="iCub, arm",
-    source_id=ball_striking.SOURCE_ID,
-    target_id=ball_striking.TARGET_ID,
-    learn_source=ball_striking.learn_source,
+    source_id=icub_arm.SOURCE_ID,
+    target_id=icub_arm.TARGET_ID,
+    learn_source=icub_arm.learn_source,
     n_runs=10,
     n_episodes=300,
     first_seed=5000,

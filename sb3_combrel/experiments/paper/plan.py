@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from sb3_combrel import InterTaskMapping
-from sb3_combrel.experiments.mapping_tables import Use, most_frequent_mapping
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import BEST, DOMAINS, EXPLORE, ICUB, MOUNTAIN_CAR, Domain
 from sb3_combrel.experiments.paper.methods import METHODS, Sources, methods_in, target_names
+from sb3_combrel.experiments.paper.most_frequent import Use, most_frequent_mapping
 from sb3_combrel.experiments.paper.runs import Job, Result
 
 ALL = "all"
