@@ -137,7 +137,7 @@ def _connection_to_dask(address: str) -> Iterator[Any]:
 
     _check_reachable("dask", address)
     _check_that_a_cluster_answers("dask", address)
-    with Client(address, set_as_default=False) as client:
+    with _silent("distributed.client"), Client(address, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=SECONDS_TO_REACH)
         except TimeoutError as error:
@@ -146,6 +146,18 @@ def _connection_to_dask(address: str) -> Iterator[Any]:
             message = "Dask's workers with several threads carry out one job at a time; start them with --nthreads 1"
             warnings.warn(message, stacklevel=2)
         yield client
+
+
+@contextmanager
+def _silent(logger_name: str) -> Iterator[None]:
+    """Without this Dask prints tracebacks when the scheduler is lost, beside the exception that the caller gets."""
+    logger = logging.getLogger(logger_name)
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _check_that_a_cluster_answers(engine: str, address: str) -> None:

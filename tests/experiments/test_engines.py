@@ -219,6 +219,25 @@ def test_a_cluster_without_workers(engine, cluster, tmp_path):
 
 
 @pytest.mark.integration
+def test_a_scheduler_of_dask_that_dies_is_one_error_without_noise(tmp_path, capfd):
+    with dask_cluster(n_workers=1) as address:
+        generator = carry_out_on(
+            "dask", sleep_but_the_first, [Job(name, tmp_path) for name in ("quick", "slow")], address=address
+        )
+        assert next(generator) == (0, "quick")
+        port = int(address.rpartition(":")[2])
+        [scheduler] = {c.pid for c in psutil.net_connections("tcp") if c.status == "LISTEN" and c.laddr.port == port}
+        os.kill(scheduler, signal.SIGKILL)
+        with pytest.raises(ConnectionError, match=f"the connection to the Dask scheduler at {address} was lost"):
+            next(generator)
+    assert capfd.readouterr() == ("", "")
+
+
+def sleep_but_the_first(job):
+    return job.name if job.name == "quick" else examples.sleep_long(job)
+
+
+@pytest.mark.integration
 def test_workers_of_dask_with_several_threads_do_one_job_at_a_time(tmp_path):
     with dask_cluster(n_workers=1, n_threads=3) as address:
         jobs = [Job(f"job{number}", tmp_path) for number in range(3)]
