@@ -18,17 +18,19 @@ from sb3_combrel import __version__
 from sb3_combrel.experiments.engine_jobs import MAX_DEATHS, Job, JobError, perform, stop, unpack
 
 ADDRESS_EXAMPLES = {
-    "ray": 'such as "10.0.0.1:6379", or "ray://10.0.0.1:10001" from a machine that is not in the cluster',
+    "ray": 'such as "10.0.0.1:6379"',
     "dask": 'such as "tcp://10.0.0.1:8786"',
 }
 HOW_TO_START = {
-    "ray": "Start one with: ray start --head --port=6379, and on each worker node: ray start --address=HEAD:6379",
+    "ray": "Start one with: ray start --head --port=6379, and on each worker node: ray start --address=HEAD:6379; "
+    "run this command on one of these nodes",
     "dask": "Start one with: dask scheduler --port 8786, and on each worker node: "
-    "dask worker tcp://SCHEDULER:8786 --nworkers auto --nthreads 1",
+    "dask worker tcp://SCHEDULER:8786 --nworkers -1 --nthreads 1",
 }
-SCHEMES = {"ray": ("", "ray"), "dask": ("", "tcp", "tls")}
+# Not "ray://": Ray's client server forks while gRPC's threads run, and its first connections often hang (Ray 2.60).
+SCHEMES = {"ray": ("",), "dask": ("", "tcp", "tls")}
 SECONDS_TO_REACH = 5.0
-SECONDS_TO_CONNECT = 12.0
+SECONDS_TO_CONNECT = 15.0
 
 # Where something else listens than a cluster, Ray tries for minutes and then ends its whole process, and Dask waits for ever.
 _CONNECT = {
@@ -42,7 +44,7 @@ def on_ray(jobs: Sequence[Job], address: str) -> Generator[tuple[int, Any], None
     See :func:`~sb3_combrel.experiments.engines.carry_out_on`.
 
     :param jobs: what to carry out
-    :param address: address of the head, "auto", or "ray://" and that of Ray's client server
+    :param address: address of the head
     """
     if not jobs:
         return
@@ -118,8 +120,7 @@ def _connection_to_ray(address: str) -> Iterator[None]:
 
     if ray.is_initialized():
         raise ValueError("this process is connected to Ray already; call ray.shutdown() before")
-    if address != "auto":
-        _check_reachable("ray", address)
+    _check_reachable("ray", address)
     _check_that_a_cluster_answers("ray", address)
     ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     try:
@@ -136,14 +137,27 @@ def _connection_to_dask(address: str) -> Iterator[Any]:
 
     _check_reachable("dask", address)
     _check_that_a_cluster_answers("dask", address)
-    with Client(address, set_as_default=False) as client:
+    with _silent("distributed.client"), Client(address, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=SECONDS_TO_REACH)
         except TimeoutError as error:
             raise _no_workers("dask", address) from error
         if any(n_threads > 1 for n_threads in client.nthreads().values()):
-            warnings.warn("Dask's workers with several threads carry out one job at a time; start them with --nthreads 1")
+            message = "Dask's workers with several threads carry out one job at a time; start them with --nthreads 1"
+            warnings.warn(message, stacklevel=2)
         yield client
+
+
+@contextmanager
+def _silent(logger_name: str) -> Iterator[None]:
+    """Without this Dask prints tracebacks when the scheduler is lost, beside the exception that the caller gets."""
+    logger = logging.getLogger(logger_name)
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _check_that_a_cluster_answers(engine: str, address: str) -> None:

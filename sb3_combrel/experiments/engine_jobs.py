@@ -1,8 +1,8 @@
 """
 What goes to a worker of an engine and comes back from it: bytes, the same on all engines.
 
-The engines have picklers of their own, and some hand out arrays that cannot be written to, or keep large ones in files. With bytes
-a job and its result go through one and the same pickler once, wherever the job is carried out.
+The engines have picklers of their own, and some hand out arrays that cannot be written to, or keep large ones in files. With
+bytes a job and its result go through one and the same pickler once, wherever the job is carried out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ THREAD_VARIABLES = (
 )
 """Environment variables that limit the threads of numerical libraries."""
 
-# A learning run seeds the random numbers of its whole process, so runs in several threads of a process would disturb each other.
+# A learning run seeds the random numbers of its whole process, so runs in several threads of one would disturb each other.
 _one_at_a_time = threading.Lock()
 _running: set[tuple[str, int]] = set()
 _running_lock = threading.Lock()

@@ -34,21 +34,21 @@ def carry_out_on(
     """
     Carry out jobs, each in one thread of a process that does nothing else meanwhile.
 
-    Results are the same on all engines, to the byte, if a job's result depends on the job alone. A job whose worker process dies
-    is begun again, up to :data:`~sb3_combrel.experiments.engine_jobs.MAX_DEATHS` times; results of other jobs are not lost. An
-    exception that a job raises ends everything at once and is not tried again. When the generator is closed, or on
+    Results are the same on all engines, to the byte, if a job's result depends on the job alone. A job whose worker process
+    dies is begun again, up to :data:`~sb3_combrel.experiments.engine_jobs.MAX_DEATHS` times; other results are not lost.
+    An exception that a job raises ends everything at once and is not tried again. When the generator is closed, or on
     KeyboardInterrupt, unfinished jobs are ended and the connection to the cluster is closed.
 
     :param engine: "joblib" (processes of this machine), "ray" or "dask" (a running cluster)
     :param function: a function of a module that the workers can import
     :param jobs: its arguments, which must be picklable, as the results must be; an attribute ``name`` is used in messages
     :param n_jobs: for joblib: processes at a time, one a core by default
-    :param address: for Ray and Dask: where the cluster answers, such as "10.0.0.1:6379" (Ray), "ray://10.0.0.1:10001" (Ray from
-        a machine that is not in the cluster), "tcp://10.0.0.1:8786" (Dask)
+    :param address: for Ray and Dask: where the cluster answers, such as "10.0.0.1:6379" (Ray; the caller runs on a node of the
+        cluster) or "tcp://10.0.0.1:8786" (Dask)
     :return: generator of the index of a job and its result, in the order in which jobs finish; the first ``next`` connects
     :raises ValueError: if an argument is wrong or a job cannot be pickled
     :raises ModuleNotFoundError: if the engine is not installed; names the extra to install
-    :raises ConnectionError: while iterating, if no cluster answers at the address, it has no workers, or the connection is lost
+    :raises ConnectionError: while iterating, if no cluster answers at the address, it has no workers, or it is lost
     :raises JobError: while iterating, if a job raised an exception or its workers died too often
     """
     _check(engine, n_jobs, address)
@@ -68,8 +68,10 @@ def _check(engine: str, n_jobs: int | None, address: str | None) -> None:
         raise ValueError(f"address is for the engines ray and dask; joblib uses processes of this machine, got {address!r}")
     if engine != "joblib":
         if not address:
-            raise ValueError(f"engine {engine} needs the address of a running cluster, {ADDRESS_EXAMPLES[engine]}, "
-                             f"got {address!r}. {HOW_TO_START[engine]}")
+            raise ValueError(
+                f"engine {engine} needs the address of a running cluster, {ADDRESS_EXAMPLES[engine]}, "
+                f"got {address!r}. {HOW_TO_START[engine]}"
+            )
         if n_jobs is not None:
             raise ValueError(f"n_jobs is for the engine joblib; with {engine} the cluster decides, got {n_jobs}")
     package, extra = _NEEDS[engine]

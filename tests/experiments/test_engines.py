@@ -1,6 +1,7 @@
 """The engines: same results to the byte, dead workers, errors. Ray and Dask run as clusters of separate processes."""
 
 import inspect
+import itertools
 import os
 import pickle
 import signal
@@ -47,7 +48,7 @@ def where(request):
     if request.param == "joblib":
         yield "joblib", {"n_jobs": 2}
     elif request.param == "ray":
-        with ray_cluster() as (address, _):
+        with ray_cluster() as address:
             yield "ray", {"address": address}
     else:
         with dask_cluster() as address:
@@ -210,19 +211,30 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.integration
-def test_ray_from_a_machine_that_is_not_in_the_cluster(tmp_path):
-    with ray_cluster(n_workers=1) as (_, client_address):
-        [result] = results_of(carry_out_on("ray", examples.double, [Job("a", tmp_path, np.ones(2))], address=client_address))
-    np.testing.assert_array_equal(result, [2.0, 2.0])
+@pytest.mark.parametrize(("engine", "cluster"), [("ray", ray_cluster), ("dask", dask_cluster)])
+def test_a_cluster_without_workers(engine, cluster, tmp_path):
+    with cluster(n_workers=0) as address:
+        with pytest.raises(ConnectionError, match=f"the {engine} cluster at {address} has no workers. Start"):
+            list(carry_out_on(engine, examples.double, [Job("a", tmp_path)], address=address))
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize(("engine", "cluster"), [("ray", ray_cluster), ("dask", dask_cluster)])
-def test_a_cluster_without_workers(engine, cluster, tmp_path):
-    with cluster(n_workers=0) as found:
-        address = found if isinstance(found, str) else found[0]
-        with pytest.raises(ConnectionError, match=f"the {engine} cluster at {address} has no workers. Start"):
-            list(carry_out_on(engine, examples.double, [Job("a", tmp_path)], address=address))
+def test_a_scheduler_of_dask_that_dies_is_one_error_without_noise(tmp_path, capfd):
+    with dask_cluster(n_workers=1) as address:
+        generator = carry_out_on(
+            "dask", sleep_but_the_first, [Job(name, tmp_path) for name in ("quick", "slow")], address=address
+        )
+        assert next(generator) == (0, "quick")
+        port = int(address.rpartition(":")[2])
+        [scheduler] = {c.pid for c in psutil.net_connections("tcp") if c.status == "LISTEN" and c.laddr.port == port}
+        os.kill(scheduler, signal.SIGKILL)
+        with pytest.raises(ConnectionError, match=f"the connection to the Dask scheduler at {address} was lost"):
+            next(generator)
+    assert capfd.readouterr() == ("", "")
+
+
+def sleep_but_the_first(job):
+    return job.name if job.name == "quick" else examples.sleep_long(job)
 
 
 @pytest.mark.integration
@@ -232,7 +244,7 @@ def test_workers_of_dask_with_several_threads_do_one_job_at_a_time(tmp_path):
         with pytest.warns(UserWarning, match="start them with --nthreads 1"):
             found = results_of(carry_out_on("dask", time_of, jobs, address=address))
     intervals = sorted(found)
-    assert all(end <= next_begin for (_, end), (next_begin, _) in zip(intervals, intervals[1:], strict=False))
+    assert all(end <= next_begin for (_, end), (next_begin, _) in itertools.pairwise(intervals))
 
 
 def time_of(job):
@@ -277,27 +289,35 @@ class TestBadInput:
             carry_out_on(engine, examples.double, [], address="127.0.0.1:1")
 
     def test_job_that_cannot_be_pickled(self, tmp_path):
-        with pytest.raises(ValueError, match="bound cannot be sent to a worker, its pickling failed: .*lock"):
+        with pytest.raises(ValueError, match=r"bound cannot be sent to a worker, its pickling failed: .*lock"):
             carry_out_on("joblib", examples.double, [Job("bound", tmp_path, examples.return_a_lock(None))])
 
     @pytest.mark.parametrize("engine", CLUSTERS)
-    @pytest.mark.parametrize("address", ["localhost", "127.0.0.1:no", "http://127.0.0.1:80", ":8786", "127.0.0.1:99999"])
+    @pytest.mark.parametrize(
+        "address", ["localhost", "127.0.0.1:no", "http://127.0.0.1:80", "ray://127.0.0.1", ":8786", "127.0.0.1:99999"]
+    )
     def test_address_that_cannot_be_one(self, engine, address):
         with pytest.raises(ValueError, match=f"address of {engine} must be a host and a port, such as .*got '{address}'"):
             list(carry_out_on(engine, examples.double, [1], address=address))
+
+    def test_address_of_the_client_server_of_ray(self):
+        with pytest.raises(ValueError, match=r'address of ray must be .* such as "10.0.0.1:6379", got \'ray://'):
+            list(carry_out_on("ray", examples.double, [1], address="ray://127.0.0.1:10001"))
 
     @pytest.mark.parametrize("engine", CLUSTERS)
     def test_address_where_nothing_listens(self, engine, capfd):
         address = f"{HOST}:{free_port()}"
         begin = time.monotonic()
-        with pytest.raises(ConnectionError, match=f"no {engine} cluster answers at {address} .*refused.*Start one with: ") as e:
+        with pytest.raises(
+            ConnectionError, match=f"no {engine} cluster answers at {address} .*refused.*Start one with: "
+        ) as e:
             list(carry_out_on(engine, examples.double, [1], address=address))
         assert time.monotonic() - begin < 10
         assert "\n" not in str(e.value)
         assert capfd.readouterr() == ("", "")
 
     @pytest.mark.integration
-    @pytest.mark.parametrize("address", ["{}", "ray://{}", "tcp://{}"])
+    @pytest.mark.parametrize("address", ["{}", "tcp://{}"])
     def test_address_where_something_else_listens(self, address, capfd):
         engine = "dask" if "tcp" in address else "ray"
         with silent_port() as port:
@@ -313,7 +333,9 @@ class TestBadInput:
 class TestJobs:
     def test_another_version_of_the_package_on_the_worker(self):
         packed = engine_jobs.pack(examples.double, np.ones(1), 0)
-        with pytest.raises(JobError, match=r"^job 0: RuntimeError: the worker has sb3-combrel .*, the caller 0\.0\.0; install"):
+        with pytest.raises(
+            JobError, match=r"^job 0: RuntimeError: the worker has sb3-combrel .*, the caller 0\.0\.0; install"
+        ):
             engine_jobs.unpack(packed.name, engine_jobs.perform(packed.payload, "0.0.0", "test"))
 
     def test_a_caller_that_has_stopped_gets_no_result(self):

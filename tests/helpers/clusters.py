@@ -23,23 +23,22 @@ def ray_cluster(n_workers=2):
     """
     A head without CPUs, and worker nodes with one CPU each.
 
-    :return: address of the head, address for Ray's client
+    :return: address of the head
     """
-    port, client_port = free_port(), free_port()
+    port = free_port()
     common = ("--block", "--node-ip-address", HOST, "--object-store-memory", "100000000")
-    head = ("--head", "--port", port, "--ray-client-server-port", client_port, "--num-cpus", 0)
+    head = ("--head", "--port", port, "--ray-client-server-port", free_port(), "--num-cpus", 0)
     quiet = ("--include-dashboard", "false", "--disable-usage-stats")
     with ExitStack() as stack:
         # Not pytest's folder: the paths of Ray's sockets would be too long.
         folder = stack.enter_context(short_folder())
-        # Where the caller's threads are limited, Ray's would be by the same variable.
         begin = ("-m", "ray.scripts.scripts", "start", *common)
         options = [(*head, *quiet, "--temp-dir", folder)] + n_workers * [("--address", f"{HOST}:{port}", "--num-cpus", 1)]
         for number, own in enumerate(options):
             log = folder / f"start{number}.log"
             process = stack.enter_context(running(*begin, *own, log=log))
             wait_until(lambda log=log: "Ray runtime started" in log.read_text(), process, log)
-        yield f"{HOST}:{port}", f"ray://{HOST}:{client_port}"
+        yield f"{HOST}:{port}"
 
 
 @contextmanager
@@ -118,9 +117,9 @@ def wait_until(ready, process, log):
 
 
 def free_port():
-    """Above the ports that Ray gives its workers, 10002 to 19999, and below those that systems give out."""
+    """Above the ports that Ray gives its workers and clients, 10002 to 24000, and below those that systems give out."""
     while True:
-        port = random.randint(20_000, 32_000)
+        port = random.randint(25_000, 32_000)
         with socket.socket() as probe:
             if probe.connect_ex((HOST, port)):
                 return port

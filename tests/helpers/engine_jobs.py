@@ -106,9 +106,9 @@ class Learning:
 
 def learn(job):
     """What is learned, as arrays and numbers."""
-    import combrel_envs  # noqa: F401
     import gymnasium as gym
 
+    import combrel_envs  # noqa: F401
     from sb3_combrel import COMBREL, FittedRMax
 
     env = gym.make("combrel/MountainCar2D-v0", max_episode_steps=100)
