@@ -143,7 +143,7 @@ def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]
         papers, controls = judge(steps, PAPERS), judge(steps, CONTROL)
         tables = [verdict_table(papers, f"Table 6: what the paper claims, in setting {setting!r}")]
         tables.append(verdict_table(controls, f"Controls, in setting {setting!r}"))
-        return [*tables, summary_table(steps)]
+        return [*tables, summary_table(steps), uses_table(results)]
     (name, of_domain), *_ = results.items()
     have = [result for result in of_domain if result.method in target.methods[name]]
     variables, actions = target_names(DOMAINS[name])
@@ -162,6 +162,28 @@ def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]
     if target.name == "table5":
         return [running_times_table(have)]
     return []
+
+
+def uses_table(results: Mapping[str, Sequence[Result]]) -> Table:
+    """
+    Make a table of how often transferred instances were used at the agent's states: what they change is at most that.
+
+    :param results: by domain
+    """
+    rows = []
+    for name, of_domain in results.items():
+        for method in m.METHODS:
+            runs = [result for result in of_domain if result.method == method and result.uses]
+            if runs:
+                n_uses = np.array([sum(row[-1] for row in result.uses) for result in runs])
+                n_mappings = np.array([len({tuple(row[1:4]) for row in result.uses}) for result in runs])
+                per_step = np.mean(n_uses / [sum(result.steps) for result in runs])
+                row = DOMAINS[name].title, method, f"{n_uses.mean():,.0f}", f"{per_step:.3f}", f"{n_mappings.mean():,.0f}"
+                rows.append(row)
+    header = ("domain", "method", "uses", "uses a step", "mappings used")
+    return Table(
+        "State-action pairs at the agent's states for which transferred instances were used, mean of the runs", header, rows
+    )
 
 
 def running_times_table(results: Sequence[Result]) -> Table:
