@@ -289,6 +289,19 @@ class MappingTransfer(Transfer):
             return np.repeat(self._prior.choices(), len(self.task.sample_states))
         return self._selector.choices()
 
+    def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """
+        Return the candidate selected for states and actions, whether or not its instances are needed there.
+
+        :param states: unit coordinates, shape (n, n_variables)
+        :param actions: int64, shape (n,)
+        :return: int64, shape (n,); -1 where there is none, or not a single one
+        """
+        if self.use == "prior":
+            return self._prior.choices()[actions]
+        first, last = self._selector.select(states, actions, np.zeros(len(actions)))
+        return np.where(last - first == 1, first, -1)
+
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions of all sources, each name once."""
         return self._prior.source_action_names() if self.use == "prior" else self.candidates.source_action_names()

@@ -152,10 +152,10 @@ def mean_compliances(method, sample, source, near, action, guard):
 def test_combrel_selects_the_best_mapping_of_the_equations(seed, k, guard):
     method, sample, source, rng = combrel_and_its_sample(seed, n_neighbors=k, min_evidence=guard)
     states, actions, first = rng.random((6, 3)), np.tile(np.arange(2), 3), method.candidates.arrays.first
-    chosen, last = (each.copy() for each in method._selector.select(states, actions, np.zeros(6)))
+    chosen = method.selected(states, actions)
     changed_pairs(method)
     on_grid = method.choices().reshape(2, -1)
-    asked = [(s, a, c if c < e else -1) for s, a, c, e in zip(states, actions, chosen, last, strict=True)]
+    asked = list(zip(states, actions, chosen, strict=True))
     asked += [(GRID[p], a, on_grid[a, p]) for a in (0, 1) for p in rng.choice(len(GRID), 3)]
     for state, action, candidate in asked:
         near = equations.nearest_transitions(state, action, sample, k)

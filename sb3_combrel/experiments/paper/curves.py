@@ -99,29 +99,29 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
 
 
 def draw_selection(
-    panels: Mapping[str, tuple[np.ndarray, np.ndarray, Sequence[str]]], labels: tuple[str, str], title: str, path: Path
+    panels: Mapping[str, tuple[np.ndarray, np.ndarray, Sequence[str]]], *labels: tuple[str, str], title: str, path: Path
 ) -> list[Path]:
     """
-    Draw which source action is selected over a plane of the state space (Figure 4).
+    Draw which source action is selected over planes of the state space (Figure 4).
 
     :param panels: for each title the coordinates of points along both variables, shape (n, 2), the place of each point's
         source action in the names, -1 for none, shape (n,), and the names
-    :param labels: names of the two variables
+    :param labels: of each panel the names of the two variables
     :param title: title of the figure
     :param path: file to write, without its suffix
     :return: the PNG and the SVG file
     """
-    figure, all_axes = panels_of(len(panels), title)
-    for axes, (name, (points, action, names)) in zip(all_axes, panels.items(), strict=True):
+    figure, all_axes = panels_of(len(panels), title, sharey=False)
+    for axes, (name, (points, action, names)), (below, beside) in zip(all_axes, panels.items(), labels, strict=True):
         for k, (label, marker) in enumerate(zip(("nothing", *names), (".", "<", "o", ">", "^", "v"), strict=False), start=-1):
             here = action == k
             if here.any():
                 colour = "#BBBBBB" if k < 0 else _MARKS[k]
-                axes.scatter(*points[here].T, color=colour, marker=marker, s=8 if k < 0 else 40, label=label)
+                axes.scatter(*points[here].T, color=colour, marker=marker, s=8 if k < 0 else 60, label=label)
         axes.set_title(name, fontsize="medium")
-        axes.set_xlabel(labels[0])
+        axes.set_xlabel(below)
+        axes.set_ylabel(beside)
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4, frameon=False, fontsize="small")
-    all_axes[0].set_ylabel(labels[1])
     return save(figure, path)
 
 

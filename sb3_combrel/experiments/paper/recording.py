@@ -65,10 +65,10 @@ def selections_at_sample(transfer: Transfer | None) -> dict[str, list[str]]:
     if transfer is None or not transfer.makes_choices:  # type: ignore[attr-defined]
         return {}
     assert transfer.task is not None
-    names = transfer.task.action_names
-    choices = transfer.choices().reshape(len(names), -1)  # type: ignore[attr-defined]
+    points = transfer.task.sample_states
     found = {}
-    for name, of_action in zip(names, choices.tolist(), strict=True):
-        known = {number: transfer.candidate(number).source_action for number in set(of_action) - {-1}}  # type: ignore[attr-defined]
-        found[name] = [known.get(number, "") for number in of_action]
+    for action, name in enumerate(transfer.task.action_names):
+        numbers = transfer.selected(points, np.full(len(points), action)).tolist()  # type: ignore[attr-defined]
+        known = {number: transfer.candidate(number).source_action for number in set(numbers) - {-1}}  # type: ignore[attr-defined]
+        found[name] = [known.get(number, "") for number in numbers]
     return found

@@ -118,7 +118,7 @@ def _draw_east(domain: Domain, setting: str, results: Sequence[Result], title: s
     names = sorted(set(chosen.tolist()) - {""})
     place = {name: k for k, name in enumerate(names)} | {"": -1}
     panels = {}
-    for label, (a, b) in {"x and y, at rest": (0, 1), "x and vx, y at rest": (0, 2)}.items():
+    for label, (a, b) in {"at rest": (0, 1), "y at rest in the valley": (0, 2)}.items():
         others = [k for k in range(points.shape[1]) if k not in (a, b)]
         here = at_rest[:, others].all(axis=1)
         panels[label] = (
@@ -126,7 +126,7 @@ def _draw_east(domain: Domain, setting: str, results: Sequence[Result], title: s
             np.array([place[name] for name in chosen[here].tolist()]),
             names,
         )
-    return draw_selection(panels, ("x", "y or vx"), title, path)
+    return draw_selection(panels, ("x", "y"), ("x", "vx"), title=title, path=path)
 
 
 def _sample_of(domain: Domain, setting: str) -> tuple[np.ndarray, StateScaling]:
