@@ -66,7 +66,7 @@ N_EVALUATIONS = 10
 FIRST_EVALUATION = 0.01
 EVALUATION_EPISODES = 5
 
-NEEDS_EXTRA = "QR-DQN needs sb3-contrib, which is not installed: pip install 'sb3-combrel[zoo]'"
+NEEDS_EXTRA = "QR-DQN needs sb3-contrib, which is not installed: pip install 'sb3-combrel[experiments]'"
 
 
 @dataclass(frozen=True)
