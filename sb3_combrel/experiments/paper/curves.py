@@ -153,9 +153,12 @@ def readable_ticks(axis: Any) -> None:
 
 
 def save(figure: Any, path: Path) -> list[Path]:
-    """Save as PNG and SVG; without the date, which would make every file differ."""
+    """Save as PNG and SVG; without the date and random names, which would make every file differ."""
+    from matplotlib import rc_context
+
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
     figure.savefig(png, dpi=110)
-    figure.savefig(svg, metadata={"Date": None})
+    with rc_context({"svg.hashsalt": path.name}):
+        figure.savefig(svg, metadata={"Date": None})
     return [png, svg]
