@@ -176,6 +176,11 @@ class ResultFiles:
         found = (self.read(job.name) for job in jobs)
         return [result for result in found if result is not None]
 
+    def read_domain(self, domain: str) -> list[Result]:
+        """Read all results of a domain that are in the folder, whichever call they are from."""
+        found = (self.read(path.stem) for path in sorted((self.folder / RESULTS).glob(f"{domain}_*.json")))
+        return [result for result in found if result is not None]
+
     def is_complete(self, job: Job) -> bool:
         """Whether a job's result is there, of as many episodes as it asks for."""
         result = self.read(job.name)
