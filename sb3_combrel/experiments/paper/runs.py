@@ -166,9 +166,9 @@ class ResultFiles:
         """Read a result; None if there is none, or a file that is not whole, as after a power failure."""
         try:
             content = json.loads((self.folder / RESULTS / f"{name}.json").read_text())
-            seconds = json.loads((self.folder / TIMES / f"{name}.json").read_text())
-            return Result(**content, seconds=tuple(seconds))
-        except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError, TypeError):
+            learning, first_episode = map(float, json.loads((self.folder / TIMES / f"{name}.json").read_text()))
+            return Result(**content, seconds=(learning, first_episode))
+        except (FileNotFoundError, ValueError, TypeError):
             return None
 
     def read_all(self, jobs: Iterable[Job]) -> list[Result]:
