@@ -14,6 +14,8 @@ from sb3_combrel.experiments.paper.diagnosis import (
     method_at,
 )
 from sb3_combrel.experiments.paper.domains import EXPLORE, MOUNTAIN_CAR
+from sb3_combrel.experiments.paper.verdicts import p_text
+from sb3_combrel.experiments.statistics import holm, p_value_of_difference
 
 MEANS = dict(zip(METHODS, (400, 200, 300), strict=True))
 
@@ -35,6 +37,17 @@ def test_what_is_saved_at_each_breadth():
         assert row[1:4] == ("2,400", "50% (50% to 50%)", "25% (25% to 25%)")
         # Of five tests, each of 2 in 12,870 regroupings at 10,000 draws.
         assert float(row[4]) < 0.01
+
+
+def test_p_values_are_corrected_over_the_breadths():
+    rng = np.random.default_rng(1)
+    made = {name: rng.integers(290, 330, size=(8, 6)) for name in steps()}
+    raw = [
+        p_value_of_difference(*(made[method_at(method, breadth)].sum(axis=1) for method in METHODS[1:]), "permutation")
+        for breadth in BREADTHS
+    ]
+    assert len(set(raw)) == 5 and min(raw) < 0.2
+    assert [row[4] for row in diagnosis_table(made).rows] == [p_text(p) for p in holm(np.array(raw))]
 
 
 def test_a_single_run():

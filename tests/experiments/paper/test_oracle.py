@@ -84,7 +84,9 @@ def test_the_mapping_found_is_that_of_the_least_error_of_a_plain_loop():
     rng = np.random.default_rng(3)
 
     def anything(states, actions):
-        return 0.1 * np.sin(7.0 * states + actions[:, None]) + 0.02 * rng.normal(size=states.shape)
+        # Of different size in each variable: errors are in parts of it.
+        size = np.array([0.1, 0.03, 0.003])[: states.shape[1]]
+        return size * (np.sin(7.0 * states + actions[:, None]) + 0.2 * rng.normal(size=states.shape))
 
     source = from_equations(60, 4, effects=anything)
     target = from_equations(50, 5, n_actions=3, d=3, effects=anything)

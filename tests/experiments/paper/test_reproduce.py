@@ -1,4 +1,4 @@
-"""``sb3-combrel reproduce``: figures and tables, resuming, engines, bad input. Most runs are cut off early: they take a second."""
+"""``sb3-combrel reproduce``: figures, tables, resuming, engines, bad input. Most runs are cut off early, to take a second."""
 
 import contextlib
 import io

@@ -173,6 +173,7 @@ class TestFiles:
         assert again == result
         assert files.is_complete(job)
         assert not files.is_complete(replace(job, n_episodes=3))
+        assert not files.is_complete(replace(job, n_episodes=1))
         assert files.read_all([job, replace(job, seed=1)]) == [again]
         assert files.read_domain(job.domain) == [again]
         assert files.read_domain("other") == []
