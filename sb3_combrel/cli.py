@@ -107,7 +107,8 @@ def reproduce(
     from sb3_combrel.experiments.paper.reproduce import Engine
     from sb3_combrel.experiments.paper.reproduce import reproduce as run
 
-    run(target, setting=setting, runs=runs, episodes=episodes, output=output, engine=Engine(backend, jobs, address))
+    made = run(target, setting=setting, runs=runs, episodes=episodes, output=output, engine=Engine(backend, jobs, address))
+    print("Written:", *made, sep="\n  ")
 
 
 COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record, "reproduce": reproduce}
@@ -118,7 +119,7 @@ def main(args: Sequence[str] | None = None) -> int:
     Run the command line.
 
     :param args: arguments, those of the process by default
-    :return: exit status: 0, or 1 if something was wrong with the arguments, or 130 if the user stopped it
+    :return: exit status: 0, or 1 if something was wrong with the arguments or a run failed, or 130 if the user stopped it
     """
     try:
         import tyro
@@ -126,6 +127,8 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"sb3-combrel: {NEEDS_EXTRA.format(missing='tyro')}", file=sys.stderr)
         return 1
     from gymnasium.error import Error as GymnasiumError
+
+    from sb3_combrel.experiments.engine_jobs import JobError
 
     try:
         tyro.extras.subcommand_cli_from_dict(
@@ -135,7 +138,7 @@ def main(args: Sequence[str] | None = None) -> int:
             args=args,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-    except (ValueError, OSError, GymnasiumError, ModuleNotFoundError) as error:
+    except (ValueError, OSError, GymnasiumError, ModuleNotFoundError, JobError) as error:
         if isinstance(error, ModuleNotFoundError) and error.name in OF_EXTRA:
             error = ModuleNotFoundError(NEEDS_EXTRA.format(missing=error.name))
         print(f"sb3-combrel: {error}", file=sys.stderr)

@@ -78,6 +78,7 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
     """
     figure, all_axes = panels_of(len(panels), title)
     places = np.arange(len(domain.thresholds))
+    anything = False
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
         for method, samples in steps.items():
             colour, line = STYLES[method]
@@ -87,14 +88,20 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
             axes.plot(places[reached], band.mean[reached], line, color=colour, marker="o", markersize=4, label=method)
             shown = reached & np.isfinite(band.low) & np.isfinite(band.high)
             axes.fill_between(places[shown], band.low[shown], band.high[shown], color=colour, alpha=0.12, linewidth=0)
+            anything = anything or bool(reached.any())
         axes.set_title(name, fontsize="medium")
         axes.set_xticks(places, [str(threshold) for threshold in domain.thresholds])
-        axes.set_yscale("log")
-        readable_ticks(axes.yaxis)
         axes.set_xlabel(f"threshold: {domain.unit} an episode (median of {WINDOW})")
         axes.grid(alpha=0.3)
         axes.legend(frameon=False, fontsize="small")
     all_axes[0].set_ylabel("environment steps until the threshold")
+    for axes in all_axes:
+        if anything:
+            axes.set_yscale("log")
+            readable_ticks(axes.yaxis)
+        else:
+            # As in a short trial. A logarithmic axis cannot be drawn without data.
+            axes.text(0.5, 0.5, "no threshold was reached", transform=axes.transAxes, ha="center")
     return save(figure, path)
 
 
@@ -153,9 +160,12 @@ def readable_ticks(axis: Any) -> None:
 
 
 def save(figure: Any, path: Path) -> list[Path]:
-    """Save as PNG and SVG; without the date, which would make every file differ."""
+    """Save as PNG and SVG; without the date and random names, which would make every file differ."""
+    from matplotlib import rc_context
+
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
     figure.savefig(png, dpi=110)
-    figure.savefig(svg, metadata={"Date": None})
+    with rc_context({"svg.hashsalt": f"sb3_combrel {path.name}"}):
+        figure.savefig(svg, metadata={"Date": None})
     return [png, svg]

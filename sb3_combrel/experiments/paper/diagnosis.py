@@ -17,7 +17,7 @@ from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.paper.methods import Sources
 from sb3_combrel.experiments.paper.plan import jobs_of
 from sb3_combrel.experiments.paper.runs import Job
-from sb3_combrel.experiments.paper.verdicts import p_text
+from sb3_combrel.experiments.paper.verdicts import interval_text, p_text, share_text
 from sb3_combrel.experiments.report import Table
 from sb3_combrel.experiments.statistics import holm, p_value_of_difference
 
@@ -61,7 +61,7 @@ def diagnosis_table(steps: Mapping[str, np.ndarray]) -> Table:
     for breadth in BREADTHS:
         none, combrel, random = (steps[method_at(method, breadth)].sum(axis=1).astype(float) for method in METHODS)
         savings = [bootstrap_relative_difference(each, none) for each in (combrel, random)]
-        cells = [f"{-each.value:.0%} ({-each.high:.0%} to {-each.low:.0%})" for each in savings]
+        cells = [f"{share_text(-each.value)} ({interval_text(-each.high, -each.low)})" for each in savings]
         p_values.append(p_value_of_difference(combrel, random, "permutation"))
         rows.append((f"{breadth:g}", f"{none.mean():,.0f}", *cells))
     corrected = holm(np.array(p_values)).tolist()
@@ -95,7 +95,8 @@ def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) 
     axes.set_yscale("log")
     readable_ticks(axes.yaxis)
     axes.set_xlabel("model_breadth")
-    axes.set_ylabel(f"{domain.unit} in {next(iter(steps.values())).shape[1]} episodes")
+    n_episodes = steps[method_at(METHODS[0], BREADTHS[0])].shape[1]
+    axes.set_ylabel(f"{domain.unit} in {n_episodes} episodes")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     return save(figure, path)

@@ -9,11 +9,13 @@ import numpy as np
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.paper.methods import METHODS, NO_TRANSFER
 from sb3_combrel.experiments.paper.runs import Result
-from sb3_combrel.experiments.paper.verdicts import p_text
+from sb3_combrel.experiments.paper.verdicts import p_text, without_minus_zero
 from sb3_combrel.experiments.report import Table
 from sb3_combrel.experiments.statistics import holm
 from sb3_combrel.experiments.transfer_measures import Comparison, LearningCurves, compare_learning
 
+#: Episodes of the jumpstart and of the asymptotic performance.
+N_FIRST, N_LAST = 5, 10
 #: Columns of the table, and the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`.
 _COLUMNS = {
     "jumpstart": "jumpstart",
@@ -39,8 +41,12 @@ def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
     # The least return that an episode can have, the same for all rows: of a step it is -1 in both domains.
     floor = float(min(result_curves.returns.min() for result_curves in (without, *curves.values())))
     threshold = -float(domain.thresholds[-1]) if domain.name != "icub" else 100.0 - domain.thresholds[-1]
+    n_episodes = without.returns.shape[1]
+    # In a short trial all episodes are the first, and the last.
+    counts = {"n_first": min(N_FIRST, n_episodes), "n_last": min(N_LAST, n_episodes)}
     found = {
-        method: compare_learning(its_own, without, threshold=threshold, floor=floor) for method, its_own in curves.items()
+        method: compare_learning(its_own, without, threshold=threshold, floor=floor, **counts)
+        for method, its_own in curves.items()
     }
     columns = []
     for field in _COLUMNS.values():
@@ -63,5 +69,6 @@ def _curves(results: Sequence[Result], method: str) -> LearningCurves:
 def _cell(comparison: Comparison, p_value: float, percent: bool) -> str:
     if not np.isfinite(comparison.effect):
         return "-"
-    effect = f"{comparison.effect:+.0%}" if percent else f"{comparison.effect:+,.0f}"
-    return f"{effect} ({p_text(p_value)})"
+    effect = without_minus_zero(comparison.effect, 2 if percent else 0)
+    text = f"{effect:+.0%}" if percent else f"{effect:+,.0f}"
+    return f"{text} ({p_text(p_value)})"

@@ -42,7 +42,8 @@ def most_frequent_mapping(
         with_these = Counter({source: uses.get(Use(target, source, variables), 0) for source in source_actions})
         if not with_these.total():
             # Never used with this state mapping: count over all state mappings.
-            with_these.update({u.source_action: n for u, n in uses.items() if u.target_action == target})
+            for use, n in uses.items():
+                with_these[use.source_action] += n * (use.target_action == target)
         action.append(source_actions.index(with_these.most_common(1)[0][0]))
     pairs = dict(pair.split("<-", 1) for pair in variables.split(", "))
     state = [source_variables.index(pairs[name].strip("()-")) if name in pairs else None for name in target_variables]

@@ -44,6 +44,8 @@ def _error(
     variable, sign = mappings.state_mappings[row], mappings.state_signs[row]
     mapped = np.flatnonzero(variable >= 0)
     of_action = source.actions == source_action
+    if not of_action.any():
+        return np.inf
     starts = source.scaling.to_unit(source.states[of_action])
     moves = source.scaling.to_unit(source.next_states[of_action]) - starts
     mirrored = sign[mapped] < 0

@@ -162,10 +162,17 @@ def frequent_mapping(results: Iterable[Result], domain: Domain, sources: Sources
     :param results: of the domain's runs, COMBREL's among them
     :raises ValueError: if COMBREL has used none
     """
+    results = list(results)
     uses: Counter[Use] = Counter()
     for result in results:
         if result.method == m.COMBREL_PLAIN:
             for target_action, source_action, state_mapping, _, n in result.uses:
                 uses[Use(target_action, source_action, state_mapping)] += n
+    if not uses:
+        n_episodes = max((len(result.steps) for result in results), default=0)
+        raise ValueError(
+            f"{m.COMBREL_PLAIN} has used no mapping within episodes={n_episodes}, so {m.TIMBREL_FREQUENT} has no mapping; "
+            "use more --episodes"
+        )
     variables, actions = target_names(domain)
     return most_frequent_mapping(uses, sources.own.state_names, variables, sources.own.action_names, actions)

@@ -20,7 +20,7 @@ from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
 from sb3_combrel.experiments.paper.measures import measures_table
 from sb3_combrel.experiments.paper.methods import target_names
 from sb3_combrel.experiments.paper.plan import BASELINES, CONTROLS, DIAGNOSIS, Target
-from sb3_combrel.experiments.paper.runs import Result, steps_by_method, write_whole
+from sb3_combrel.experiments.paper.runs import Result, ResultFiles, steps_by_method, write_whole
 from sb3_combrel.experiments.paper.selections import (
     Selection,
     action_mapping_table,
@@ -41,7 +41,7 @@ def write_report(
     targets: Sequence[Target], setting: str, results: Mapping[str, Sequence[Result]], output: Path, console: Console
 ) -> list[Path]:
     """
-    Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs to one CSV file a domain.
+    Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs in the folder to one CSV file a domain.
 
     :param targets: figures and tables to make
     :param setting: name of the setting
@@ -51,8 +51,9 @@ def write_report(
     :return: the files
     """
     made: list[Path] = []
-    for name, of_domain in results.items():
-        made.append(_write_runs(of_domain, output / f"{name}.csv"))
+    for name in results:
+        # With the runs of earlier calls: they may have been for other figures.
+        made.append(_write_runs(ResultFiles(output).read_domain(name), output / f"{name}.csv"))
     for target in targets:
         for name, wanted in target.methods.items():
             have = [result for result in results[name] if result.method in wanted]

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sb3_combrel import __version__
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments.engines import carry_out_on
+from sb3_combrel.experiments.engines import JobError, carry_out_on
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baseline_runs, carry_out_baseline
 from sb3_combrel.experiments.paper.diagnosis import diagnosis_jobs
@@ -25,6 +25,8 @@ from sb3_combrel.experiments.paper.runs import AnyJob, Result, ResultFiles, carr
 from sb3_combrel.experiments.paper.sources import prepare_sources
 
 SETTINGS_FILE = "settings.json"
+#: Where a run's exception is kept with its traceback: on the worker it is lost.
+TRACEBACK_FILE = "error.txt"
 OUTPUT = "reproduction"
 
 
@@ -72,11 +74,15 @@ def reproduce(
     :param console: where to write; None for the standard output
     :return: the files made
     :raises ValueError: if an argument is unknown or out of range, or the folder has results of other settings
+    :raises ConnectionError: if no cluster answers at the engine's address
+    :raises JobError: if a run raises an exception, or its workers died too often
     """
     if setting not in SETTINGS:
         raise ValueError(f"setting must be one of {', '.join(SETTINGS)}, got {setting!r}")
     for name, number in (("runs", runs), ("episodes", episodes), ("jobs", engine.n_jobs)):
         check_count(name, number, none_allowed=True)
+    # Checks the engine's arguments before anything is learned or written.
+    engine.carry_out(carry_out, [])
     targets = targets_of(target, setting)
     console = console or Console()
     output = output or Path(OUTPUT) / setting
@@ -145,6 +151,22 @@ def carry_out_missing(
         console.print(f"{len(jobs) - len(missing)} of {len(jobs)} runs were complete already.")
     if not missing:
         return
+    try:
+        _carry_out(jobs, missing, files, engine, console, function)
+    except JobError as error:
+        path = files.folder / TRACEBACK_FILE
+        write_whole(path, f"{error}\n")
+        raise JobError(error.name, f"{' '.join(error.reason.split())} (traceback: {path})") from error
+
+
+def _carry_out(
+    jobs: Sequence[AnyJob],
+    missing: Sequence[AnyJob],
+    files: ResultFiles,
+    engine: Engine,
+    console: Console,
+    function: Callable[[Any], Result],
+) -> None:
     with _progress_of(jobs, missing, console) as advance, closing(engine.carry_out(function, missing)) as results:
         for place, result in results:
             files.write(result)
@@ -190,7 +212,7 @@ def prepare_folder(output: Path, setting: str, episodes: dict[str, int]) -> None
     file = output / SETTINGS_FILE
     if output.exists() and not file.exists() and any(output.iterdir()):
         raise ValueError(f"{output} has files that are not results of this command; choose another --output")
-    before = json.loads(file.read_text()) if file.exists() else {}
+    before = _settings_in(file) if file.exists() else {}
     now: dict[str, Any] = {"version": __version__, "setting": setting}
     now |= {f"episodes of {name}": n for name, n in episodes.items()}
     now |= {f"arguments in {name}": _plain(DOMAINS[name], setting) for name in episodes}
@@ -198,6 +220,15 @@ def prepare_folder(output: Path, setting: str, episodes: dict[str, int]) -> None
     if other:
         raise ValueError(f"{output} has results of other settings ({'; '.join(other)}); use another --output")
     write_whole(file, json.dumps({**before, **now}, indent=2) + "\n")
+
+
+def _settings_in(file: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(file.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ValueError(
+            f"{file} is damaged ({error}), so nobody knows of which settings its folder has results; use another --output"
+        ) from error
 
 
 def _plain(domain: Domain, setting: str) -> dict[str, Any]:

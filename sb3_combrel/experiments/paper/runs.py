@@ -195,14 +195,19 @@ class ResultFiles:
         """Read a result; None if there is none, or a file that is not whole, as after a power failure."""
         try:
             content = json.loads((self.folder / RESULTS / f"{name}.json").read_text())
-            seconds = json.loads((self.folder / TIMES / f"{name}.json").read_text())
-            return Result(**content, seconds=tuple(seconds))
-        except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError, TypeError):
+            learning, first_episode = map(float, json.loads((self.folder / TIMES / f"{name}.json").read_text()))
+            return Result(**content, seconds=(learning, first_episode))
+        except (FileNotFoundError, ValueError, TypeError):
             return None
 
     def read_all(self, jobs: Iterable[AnyJob]) -> list[Result]:
         """Read the results of all jobs that have one."""
         found = (self.read(job.name) for job in jobs)
+        return [result for result in found if result is not None]
+
+    def read_domain(self, domain: str) -> list[Result]:
+        """Read all results of a domain that are in the folder, whichever call they are from."""
+        found = (self.read(path.stem) for path in sorted((self.folder / RESULTS).glob(f"{domain}_*.json")))
         return [result for result in found if result is not None]
 
     def is_complete(self, job: AnyJob) -> bool:

@@ -23,7 +23,7 @@ THINNED = 25
 
 class Selection(NamedTuple):
     """
-    Selections of mappings, one a step, of all runs.
+    Selections of mappings, at most one for each step and target action, of all runs.
 
     :param state: raw units, shape (n, n_variables)
     :param action: target action, shape (n,)
@@ -38,12 +38,20 @@ class Selection(NamedTuple):
     def of_results(cls, results: Sequence[Result]) -> Selection:
         """Collect the selections of runs that have recorded them; the mapping is the source action where none is whole."""
         rows = [(result.uses[int(row[0])], row[1:]) for result in results for row in result.selections]
-        state = np.array([state for _, state in rows], dtype=np.float64).reshape(len(rows), -1)
+        state = np.array([state for _, state in rows], dtype=np.float64) if rows else np.zeros((0, 0))
         return cls(state, np.array([use[0] for use, _ in rows]), np.array([use[3] or use[1] for use, _ in rows]))
 
     def thinned(self, n: int) -> Selection:
-        """One selection of ``n``."""
-        return Selection(*(column[::n] for column in self))
+        """
+        Return one of ``n`` selections of each action.
+
+        In most steps there is one for every action, so one of ``n`` of them all, in their order, could always be of the same.
+        """
+        places = [np.flatnonzero(self.action == action) for action in np.unique(self.action)]
+        # Not all in the same step.
+        kept = [place[k * n // len(places) :: n] for k, place in enumerate(places)]
+        chosen = np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)
+        return Selection(*(column[chosen] for column in self))
 
 
 def action_mapping_table(results: Sequence[Result], target_actions: Sequence[str]) -> Table:
@@ -115,7 +123,7 @@ def dependence_table(selection: Selection, variables: Sequence[str]) -> Table:
 
     The effect is epsilon squared of the former and Cramer's V of the latter, both from 0, no relation, to 1. Successive steps
     have successive states, so that p-values of all selections are too low; the last columns have one selection in
-    :data:`THINNED`.
+    :data:`THINNED` of each target action.
 
     :param selection: selections of all runs
     :param variables: names of the state variables
@@ -123,7 +131,7 @@ def dependence_table(selection: Selection, variables: Sequence[str]) -> Table:
     thinned = selection.thinned(THINNED)
     rows = []
     for k, name in enumerate(variables):
-        whole, part = (_kruskal(each.state[:, k], each.mapping) for each in (selection, thinned))
+        whole, part = (_kruskal(each, k) for each in (selection, thinned))
         rows.append((f"{name} (Kruskal & Wallis)", *_cells(whole), *_cells(part)))
     whole, part = (_chi_square(each.action, each.mapping) for each in (selection, thinned))
     rows.append(("target action (chi-square)", *_cells(whole), *_cells(part)))
@@ -141,8 +149,12 @@ class _Test(NamedTuple):
 _NO_TEST = _Test(np.nan, np.nan, np.nan)
 
 
-def _kruskal(values: np.ndarray, mapping: np.ndarray) -> _Test:
+def _kruskal(selection: Selection, variable: int) -> _Test:
+    mapping = selection.mapping
     kept = _frequent(mapping)
+    if not kept.any():
+        return _NO_TEST
+    values = selection.state[:, variable]
     groups = [values[kept & (mapping == name)] for name in np.unique(mapping[kept])]
     if len(groups) < 2 or np.ptp(values[kept]) == 0.0:
         return _NO_TEST

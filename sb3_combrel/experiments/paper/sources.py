@@ -44,7 +44,10 @@ def _record_target(domain: Domain) -> SourceInstances:
 
 def _load_or(path: Path, learn: Callable[[], SourceInstances], console: Console) -> SourceInstances:
     if path.exists():
-        return SourceInstances.load(path)
+        try:
+            return SourceInstances.load(path)
+        except ValueError as error:
+            console.print(f"{error}: they are learned again.", markup=False, soft_wrap=True)
     with console.status(f"Learning {path.stem} ..."):
         found = learn()
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -141,9 +141,9 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
         (
             verdict.claim.text,
             DOMAINS[verdict.claim.domain].title,
-            f"{verdict.saved:.0%}",
-            "-" if np.isnan(verdict.low) else f"{verdict.low:.0%} to {verdict.high:.0%}",
-            f"{verdict.delta:+.2f}",
+            share_text(verdict.saved),
+            interval_text(verdict.low, verdict.high),
+            f"{without_minus_zero(verdict.delta, 2):+.2f}",
             p_text(verdict.p_value),
             p_text(verdict.corrected),
             p_text(verdict.p_threshold),
@@ -195,6 +195,21 @@ def summary_table(steps: Mapping[str, Mapping[str, np.ndarray]]) -> Table:
 def _mean(values: np.ndarray) -> str:
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return f"{values.mean():,.0f}" if np.isnan(error) else f"{values.mean():,.0f} ± {error:,.0f}"
+
+
+def share_text(share: float) -> str:
+    """A share in percent for a table."""
+    return f"{without_minus_zero(share, 2):.0%}"
+
+
+def interval_text(low: float, high: float) -> str:
+    """An interval of shares for a table: "-" where there is none."""
+    return "-" if np.isnan(low) else f"{share_text(low)} to {share_text(high)}"
+
+
+def without_minus_zero(number: float, digits: int = 0) -> float:
+    """Round so that what is shown as zero has no minus sign."""
+    return round(number, digits) + 0.0
 
 
 def p_text(p_value: float) -> str:
