@@ -101,7 +101,7 @@ def test_selection_over_a_plane(tmp_path):
     names = ["Left", "Neutral", "Right"]
     nothing = np.full(len(grid), -1)
     panels = {"x and y": (grid, action, names), "x and vx": (grid, nothing, names)}
-    check(
-        draw_selection(panels, ("x", "y or vx"), "title", tmp_path / "fig4"), "Left", "Neutral", "Right", "nothing", "y or vx"
-    )
-    check(draw_selection({"x and y": (grid, nothing, [])}, ("x", "y"), "title", tmp_path / "none"), "nothing")
+    drawn = draw_selection(panels, ("x", "y"), ("x", "vx"), title="title", path=tmp_path / "fig4")
+    check(drawn, "Left", "Neutral", "Right", "nothing", "vx")
+    none = {"x and y": (grid, nothing, [])}
+    check(draw_selection(none, ("x", "y"), title="title", path=tmp_path / "none"), "nothing")
