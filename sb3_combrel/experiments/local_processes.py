@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import signal
+import threading
+import time
 from collections import Counter, deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from sb3_combrel import __version__
@@ -71,15 +74,19 @@ class _Processes:
         """Begin a job."""
         from joblib.externals.loky.process_executor import BrokenProcessPool
 
-        pool = self._idle.pop() if self._idle else _new_pool()
-        try:
-            future = pool.submit(perform, payload, __version__, CALLER)
-        except BrokenProcessPool:
-            # The process died while it was idle.
-            pool.shutdown(kill_workers=True)
-            self.submit(index, payload)
-        else:
+        with _interrupts_later():
+            pool = self._idle.pop() if self._idle else _new_pool()
+            try:
+                future = pool.submit(perform, payload, __version__, CALLER)
+            except BrokenProcessPool:
+                # The process died while it was idle.
+                pool.shutdown(kill_workers=True)
+                self.submit(index, payload)
+                return
             self.running[future] = (index, pool)
+            # When a pool is ended before its thread has passed the job on, that thread raises KeyError.
+            while not (future.running() or future.done()):
+                time.sleep(0.001)
 
     def wait(self) -> tuple[list[tuple[int, bytes]], list[int]]:
         """
@@ -106,6 +113,23 @@ class _Processes:
         """End all processes, whatever they do."""
         for pool in [*self._idle, *(pool for _, pool in self.running.values())]:
             pool.shutdown(kill_workers=True)
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Ctrl-C has its effect when this is over."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    interrupted = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: interrupted.set())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupted.is_set():
+        signal.raise_signal(signal.SIGINT)
 
 
 def _new_pool() -> ProcessPoolExecutor:

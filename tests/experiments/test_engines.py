@@ -20,7 +20,7 @@ from helpers.engine_jobs import Job, Learning
 from threadpoolctl import threadpool_limits
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.experiments import engine_jobs
+from sb3_combrel.experiments import engine_jobs, local_processes
 from sb3_combrel.experiments.engines import ENGINES, JobError, carry_out_on
 from sb3_combrel.experiments.runs import make_task
 
@@ -216,6 +216,30 @@ def test_a_cluster_without_workers(engine, cluster, tmp_path):
     with cluster(n_workers=0) as address:
         with pytest.raises(ConnectionError, match=f"the {engine} cluster at {address} has no workers. Start"):
             list(carry_out_on(engine, examples.double, [Job("a", tmp_path)], address=address))
+
+
+@pytest.mark.integration
+def test_an_interrupt_while_a_job_is_begun_leaves_no_process_that_nobody_ends(tmp_path, monkeypatch):
+    new_pool = local_processes._new_pool
+
+    def interrupted():
+        signal.raise_signal(signal.SIGINT)
+        return new_pool()
+
+    monkeypatch.setattr(local_processes, "_new_pool", interrupted)
+    packed = engine_jobs.pack(examples.double, Job("a", tmp_path, np.ones(2)), 0)
+    processes = local_processes._Processes(1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            processes.submit(0, packed.payload)
+        [(future, (index, pool))] = processes.running.items()
+        assert index == 0
+        # Before that loky's thread would raise an exception if the pool were ended.
+        assert future.running() or future.done()
+    finally:
+        processes.kill()
+    assert not pool._processes
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.integration
