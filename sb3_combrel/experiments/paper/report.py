@@ -51,6 +51,8 @@ def write_report(
     :return: the files
     """
     made: list[Path] = []
+    # Without baselines, and without methods at other breadths.
+    own = {name: [each for each in of_domain if each.method in m.METHODS] for name, of_domain in results.items()}
     for name in results:
         # With the runs of earlier calls: they may have been for other figures.
         made.append(_write_runs(ResultFiles(output).read_domain(name), output / f"{name}.csv"))
@@ -64,11 +66,11 @@ def write_report(
         if target.name == BASELINES:
             drawn = (m.NO_TRANSFER, m.COMBREL_PLAIN)
             made += draw_baselines({name: results[name] for name in target.methods}, drawn, target.title, output / target.name)
-        tables = _tables(target, setting, {name: results[name] for name in target.methods})
+        of_others = target.name in (BASELINES, DIAGNOSIS)
+        tables = _tables(target, setting, {name: (results if of_others else own)[name] for name in target.methods})
         if tables:
             made += write_tables(tables, output / target.name, console)
     if any(target.name == "table6" for target in targets):
-        own = {name: [each for each in of_domain if each.method in m.METHODS] for name, of_domain in results.items()}
         tables = [measures_table(DOMAINS[name], of_domain) for name, of_domain in own.items()]
         made += write_tables(tables, output / "measures", console)
     return made
