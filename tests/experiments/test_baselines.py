@@ -366,5 +366,5 @@ def test_there_is_no_source_for_other_tasks():
 
 def test_without_sb3_contrib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)
-    with pytest.raises(ImportError, match=r"pip install 'sb3-combrel\[zoo\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'sb3-combrel\[experiments\]'"):
         learn(replace(SHORT, algorithm=QUANTILE))

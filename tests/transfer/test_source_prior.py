@@ -369,7 +369,8 @@ def test_it_says_which_copies_each_action_moves():
         "a2: Up on (s0, s2), Wait on (s1, s3); a3: Wait on (s0, s2), Down on (s1, s3); a4: Wait on (s0, s2), Up on (s1, s3)"
     )
     [first, *_] = transfer.choices().reshape(5, -1)[3]
-    assert transfer.candidate(first) == (3, "Wait + Down", "(s0, s2) + (s1, s3)")
+    assert transfer.candidate(first) == (3, "Wait + Down", "(s0, s2) + (s1, s3)", ())
+    assert (transfer.selected(np.zeros((2, 4)), np.array([3, 3])) == first).all()
     assert transfer.describe(first) == "a3<-Wait + Down with (s0, s2) + (s1, s3)"
     assert "Wait + Down" in transfer.source_action_names()
     assert sum(transfer.uses().values()) > 250

@@ -134,10 +134,11 @@ def test_the_selection_at_the_sample_is_that_of_the_transfer_method(job_and_resu
     transfer = replay[0].agent.transfer
     names = transfer.task.action_names
     assert tuple(result.at_sample) == names
-    choices = transfer.choices().reshape(len(names), -1)
+    points = transfer.task.sample_states
     rng = np.random.default_rng(0)
-    for action, point in zip(rng.integers(len(names), size=40), rng.integers(choices.shape[1], size=40), strict=True):
-        number = choices[action, point]
+    for action, point in zip(rng.integers(len(names), size=40), rng.integers(len(points), size=40), strict=True):
+        # One after the other; for the result all were asked for at once.
+        [number] = transfer.selected(points[point][None], np.array([action]))
         expected = "" if number < 0 else transfer.candidate(number).source_action
         assert result.at_sample[names[action]][point] == expected
 
