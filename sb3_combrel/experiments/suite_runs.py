@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
-import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.runs import coarse_on_purpose, outside_bounds_on_purpose
 from sb3_combrel.experiments.suite_measures import Episodes, summary_of_evaluation, summary_of_learning
 from sb3_combrel.experiments.suite_tasks import Source, Task
@@ -177,7 +178,7 @@ def carry_out(run: SuiteRun) -> SuiteRun:
         **summary_of_learning(learnt, run.task.failure_return),
     }
     row |= evaluate(run, model, row["last10_return"])
-    _write_whole(run.file, json.dumps({"settings": run.settings(), "row": row, "episodes": _rows_of(run, learnt)}))
+    write_whole(run.file, json.dumps({"settings": run.settings(), "row": row, "episodes": _rows_of(run, learnt)}).encode())
     return run
 
 
@@ -262,22 +263,6 @@ def _compile(run: SuiteRun) -> None:
 
 
 def _write_rows(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    def write(file: Any) -> None:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(rows)
-
-    _write(path, write)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    _write(path, lambda file: file.write(text))
-
-
-def _write(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write a file that is never seen half written, not by another call for the same folder either."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
-    with unfinished.open("w", newline="") as file:
-        write(file)
-    os.replace(unfinished, path)
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([header, *rows])
+    write_whole(path, text.getvalue().encode())

@@ -9,12 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_combrel.experiments.baselines import ALGORITHMS, OF_SOURCE, OWN, PLAIN, PREFILLED, QUANTILE, BaselineJob, learn
+from sb3_combrel.experiments.baselines import (
+    ALGORITHMS,
+    OF_SOURCE,
+    OWN,
+    PLAIN,
+    PREFILLED,
+    QUANTILE,
+    BaselineJob,
+    Evaluations,
+    learn,
+)
 from sb3_combrel.experiments.bootstrap import bootstrap_band
 from sb3_combrel.experiments.paper.curves import STYLES, panels_of, save
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR, Domain
 from sb3_combrel.experiments.paper.methods import Sources
-from sb3_combrel.experiments.paper.runs import Result
+from sb3_combrel.experiments.paper.runs import Result, run_name
 from sb3_combrel.experiments.report import Table
 
 N_RUNS = 5
@@ -49,7 +59,7 @@ class BaselineRun:
     @property
     def name(self) -> str:
         """Name of the run in files."""
-        return f"{self.domain}_{self.method.lower().replace(' ', '_')}_seed{self.seed}"
+        return run_name(self.domain, self.method, self.seed)
 
     def answered_by(self, result: Result) -> bool:
         """Whether a result is that of this run: its last evaluation was after the last step."""
@@ -107,9 +117,7 @@ def carry_out_baseline(run: BaselineRun) -> Result:
 
 def always_reached_from(result: Result) -> float:
     """Return the steps from which on every evaluation reached the goal always; inf if the last did not."""
-    failed = [k for k, (_, _, reached) in enumerate(result.evaluations) if reached < 1.0]
-    first = failed[-1] + 1 if failed else 0
-    return result.evaluations[first][0] if first < len(result.evaluations) else np.inf
+    return Evaluations(*np.array(result.evaluations).T).always_reached_from()
 
 
 def baselines_table(results: Mapping[str, Sequence[Result]]) -> Table:

@@ -7,9 +7,9 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.paper.domains import SETTINGS
 from sb3_combrel.experiments.paper.reproduce import OUTPUT
-from sb3_combrel.experiments.paper.runs import write_whole
 
 #: What is copied of a setting's folder. Runs, sources and SVG figures stay where they are.
 COPIED = ("*.md", "*.csv", "fig*.png", "diagnosis.png", "baselines.png")
@@ -54,7 +54,7 @@ def fill_in(page: Path) -> int:
         return f"{match[1]}{tables[number - 1]}\n{match[4]}"
 
     text, n = _MARKED.subn(table_of, page.read_text())
-    write_whole(page, text)
+    write_whole(page, text.encode())
     return n
 
 

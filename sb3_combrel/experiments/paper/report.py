@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from sb3_combrel import FittedRMax
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baselines_table, draw_baselines
@@ -20,7 +21,7 @@ from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
 from sb3_combrel.experiments.paper.measures import measures_table
 from sb3_combrel.experiments.paper.methods import target_names
 from sb3_combrel.experiments.paper.plan import BASELINES, CONTROLS, DIAGNOSIS, Target
-from sb3_combrel.experiments.paper.runs import Result, ResultFiles, steps_by_method, write_whole
+from sb3_combrel.experiments.paper.runs import Result, ResultFiles, steps_by_method
 from sb3_combrel.experiments.paper.selections import (
     Selection,
     action_mapping_table,
@@ -84,11 +85,11 @@ def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[
     :param path: file to write, without its suffix
     """
     made = [path.with_suffix(".md")]
-    write_whole(made[0], "\n".join(table.as_markdown() for table in tables))
+    write_whole(made[0], "\n".join(table.as_markdown() for table in tables).encode())
     for number, table in enumerate(tables, 1):
         console.print(table.for_terminal())
         file = path.with_name(f"{path.name}{'' if len(tables) == 1 else f'_{number}'}.csv")
-        write_whole(file, _csv_text([table.header, *table.rows]))
+        write_whole(file, _csv_text([table.header, *table.rows]).encode())
         made.append(file)
     return made
 
@@ -211,7 +212,7 @@ def _write_runs(results: Sequence[Result], path: Path) -> Path:
     for result in sorted(results, key=lambda each: (each.method, each.seed)):
         of_episodes = " ".join(map(str, result.steps))
         rows.append((result.method, result.seed, sum(result.steps), sum(result.terminated), of_episodes))
-    write_whole(path, _csv_text(rows))
+    write_whole(path, _csv_text(rows).encode())
     return path
 
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from sb3_combrel import __version__
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.engines import JobError, carry_out_on
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baseline_runs, carry_out_baseline
@@ -21,7 +22,7 @@ from sb3_combrel.experiments.paper.diagnosis import diagnosis_jobs
 from sb3_combrel.experiments.paper.domains import DOMAINS, SETTINGS, Domain
 from sb3_combrel.experiments.paper.plan import BASELINES, DIAGNOSIS, frequent_mapping, jobs_of, methods_of, targets_of
 from sb3_combrel.experiments.paper.report import write_report
-from sb3_combrel.experiments.paper.runs import AnyJob, Result, ResultFiles, carry_out, write_whole
+from sb3_combrel.experiments.paper.runs import AnyJob, Result, ResultFiles, carry_out
 from sb3_combrel.experiments.paper.sources import prepare_sources
 
 SETTINGS_FILE = "settings.json"
@@ -155,7 +156,7 @@ def carry_out_missing(
         _carry_out(jobs, missing, files, engine, console, function)
     except JobError as error:
         path = files.folder / TRACEBACK_FILE
-        write_whole(path, f"{error}\n")
+        write_whole(path, f"{error}\n".encode())
         raise JobError(error.name, f"{' '.join(error.reason.split())} (traceback: {path})") from error
 
 
@@ -219,7 +220,7 @@ def prepare_folder(output: Path, setting: str, episodes: dict[str, int]) -> None
     other = [f"{key} was {before[key]!r} and is {now[key]!r}" for key in now if key in before and before[key] != now[key]]
     if other:
         raise ValueError(f"{output} has results of other settings ({'; '.join(other)}); use another --output")
-    write_whole(file, json.dumps({**before, **now}, indent=2) + "\n")
+    write_whole(file, (json.dumps({**before, **now}, indent=2) + "\n").encode())
 
 
 def _settings_in(file: Path) -> dict[str, Any]:

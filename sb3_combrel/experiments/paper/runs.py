@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.paper.recording import SelectionRecorder, selections_at_sample, uses_of
 from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.experiments.suite_runs import UNLIMITED, EpisodeRecorder
@@ -22,6 +22,11 @@ from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.transfer.base import Transfer
 
 RESULTS, TIMES = "runs", "times"
+
+
+def run_name(domain: str, method: str, seed: int) -> str:
+    """Return the name of a run in files."""
+    return f"{domain}_{method.lower().replace(',', '').replace(' ', '_')}_seed{seed}"
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class Job:
     @property
     def name(self) -> str:
         """Name of the run in files."""
-        return f"{self.domain}_{self.method.lower().replace(',', '').replace(' ', '_')}_seed{self.seed}"
+        return run_name(self.domain, self.method, self.seed)
 
     def answered_by(self, result: Result) -> bool:
         """Whether a result is that of this job: of as many episodes."""
@@ -188,8 +193,8 @@ class ResultFiles:
 
     def write(self, result: Result) -> None:
         """Write a result, and its times apart: they differ from call to call."""
-        write_whole(self.folder / TIMES / f"{result.name}.json", json.dumps(result.seconds) + "\n")
-        write_whole(self.folder / RESULTS / f"{result.name}.json", result.text())
+        write_whole(self.folder / TIMES / f"{result.name}.json", (json.dumps(result.seconds) + "\n").encode())
+        write_whole(self.folder / RESULTS / f"{result.name}.json", result.text().encode())
 
     def read(self, name: str) -> Result | None:
         """Read a result; None if there is none, or a file that is not whole, as after a power failure."""
@@ -226,11 +231,3 @@ def steps_by_method(results: Iterable[Result]) -> dict[str, np.ndarray]:
     for result in sorted(results, key=lambda each: each.seed):
         by_method.setdefault(result.method, []).append(result)
     return {method: np.array([result.steps for result in its_own]) for method, its_own in by_method.items()}
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file that is never seen half written, not by another call for the same folder either."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
-    unfinished.write_text(text)
-    os.replace(unfinished, path)
