@@ -120,8 +120,7 @@ def _connection_to_ray(address: str) -> Iterator[None]:
 
     if ray.is_initialized():
         raise ValueError("this process is connected to Ray already; call ray.shutdown() before")
-    _check_reachable("ray", address)
-    _check_that_a_cluster_answers("ray", address)
+    check_cluster("ray", address)
     ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     try:
         if ray.cluster_resources().get("CPU", 0) < 1:
@@ -135,8 +134,7 @@ def _connection_to_ray(address: str) -> Iterator[None]:
 def _connection_to_dask(address: str) -> Iterator[Any]:
     from distributed import Client
 
-    _check_reachable("dask", address)
-    _check_that_a_cluster_answers("dask", address)
+    check_cluster("dask", address)
     with _silent("distributed.client"), Client(address, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=SECONDS_TO_REACH)
@@ -158,6 +156,19 @@ def _silent(logger_name: str) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
+
+
+def check_cluster(engine: str, address: str) -> None:
+    """
+    Check that a cluster answers.
+
+    :param engine: "ray" or "dask"
+    :param address: of the head or the scheduler
+    :raises ValueError: if the address cannot be one
+    :raises ConnectionError: if nothing answers there, or something else than such a cluster
+    """
+    _check_reachable(engine, address)
+    _check_that_a_cluster_answers(engine, address)
 
 
 def _check_that_a_cluster_answers(engine: str, address: str) -> None:

@@ -11,13 +11,13 @@ from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments.clusters import ADDRESS_EXAMPLES, HOW_TO_START, on_dask, on_ray
+from sb3_combrel.experiments.clusters import ADDRESS_EXAMPLES, HOW_TO_START, check_cluster, on_dask, on_ray
 from sb3_combrel.experiments.engine_jobs import JobError, pack
 from sb3_combrel.experiments.local_processes import in_local_processes
 
 ENGINES = ("joblib", "ray", "dask")
 
-__all__ = ["ENGINES", "JobError", "carry_out_on"]
+__all__ = ["ENGINES", "JobError", "carry_out_on", "check_engine"]
 
 # Of each engine: the package it needs, and the extra that brings it.
 _NEEDS = {"joblib": ("joblib", "experiments"), "ray": ("ray", "ray"), "dask": ("distributed", "dask")}
@@ -51,7 +51,7 @@ def carry_out_on(
     :raises ConnectionError: while iterating, if no cluster answers at the address, it has no workers, or it is lost
     :raises JobError: while iterating, if a job raised an exception or its workers died too often
     """
-    _check(engine, n_jobs, address)
+    _check_arguments(engine, n_jobs, address)
     packed = [pack(function, job, index) for index, job in enumerate(jobs)]
     if engine == "ray":
         return on_ray(packed, str(address))
@@ -60,22 +60,36 @@ def carry_out_on(
     return in_local_processes(packed, n_jobs)
 
 
-def _check(engine: str, n_jobs: int | None, address: str | None) -> None:
+def check_engine(engine: str, *, n_jobs: int | None = None, address: str | None = None) -> None:
+    """
+    Check that an engine can be used, before work is prepared for it: its arguments, and that its cluster answers.
+
+    :param engine: as of :func:`carry_out_on`, like the others
+    :raises ValueError: if an argument is wrong
+    :raises ModuleNotFoundError: if the engine is not installed; names the extra to install
+    :raises ConnectionError: if no cluster answers at the address
+    """
+    _check_arguments(engine, n_jobs, address)
+    if engine != "joblib":
+        check_cluster(engine, str(address))
+
+
+def _check_arguments(engine: str, n_jobs: int | None, address: str | None) -> None:
     if engine not in ENGINES:
-        raise ValueError(f"engine must be one of {', '.join(ENGINES)}, got {engine!r}")
-    check_count("n_jobs", n_jobs, none_allowed=True)
+        raise ValueError(f"backend must be one of {', '.join(ENGINES)}, got {engine!r}")
+    check_count("jobs", n_jobs, none_allowed=True)
     if engine == "joblib" and address is not None:
-        raise ValueError(f"address is for the engines ray and dask; joblib uses processes of this machine, got {address!r}")
+        raise ValueError(f"address is for the backends ray and dask; joblib uses processes of this machine, got {address!r}")
     if engine != "joblib":
         if not address:
             raise ValueError(
-                f"engine {engine} needs the address of a running cluster, {ADDRESS_EXAMPLES[engine]}, "
+                f"backend {engine} needs the address of a running cluster, {ADDRESS_EXAMPLES[engine]}, "
                 f"got {address!r}. {HOW_TO_START[engine]}"
             )
         if n_jobs is not None:
-            raise ValueError(f"n_jobs is for the engine joblib; with {engine} the cluster decides, got {n_jobs}")
+            raise ValueError(f"jobs is for the backend joblib; with {engine} the cluster decides, got {n_jobs}")
     package, extra = _NEEDS[engine]
     if importlib.util.find_spec(package) is None:
         raise ModuleNotFoundError(
-            f"engine {engine} needs {package}, which is not installed: pip install 'sb3-combrel[{extra}]'", name=package
+            f"backend {engine} needs {package}, which is not installed: pip install 'sb3-combrel[{extra}]'", name=package
         )

@@ -283,27 +283,27 @@ cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
 class TestBadInput:
     def test_unknown_engine(self):
-        with pytest.raises(ValueError, match="engine must be one of joblib, ray, dask, got 'spark'"):
+        with pytest.raises(ValueError, match="backend must be one of joblib, ray, dask, got 'spark'"):
             carry_out_on("spark", examples.double, [])
 
     def test_address_for_local_processes(self):
-        with pytest.raises(ValueError, match=r"address is for the engines ray and dask.*got '127.0.0.1:1'"):
+        with pytest.raises(ValueError, match=r"address is for the backends ray and dask.*got '127.0.0.1:1'"):
             carry_out_on("joblib", examples.double, [], address="127.0.0.1:1")
 
     @pytest.mark.parametrize("engine", CLUSTERS)
     @pytest.mark.parametrize("address", [None, ""])
     def test_cluster_without_address(self, engine, address):
-        with pytest.raises(ValueError, match=f"engine {engine} needs the address of a running cluster, such as .*Start one"):
+        with pytest.raises(ValueError, match=f"backend {engine} needs the address of a running cluster, such as .*Start one"):
             carry_out_on(engine, examples.double, [], address=address)
 
     @pytest.mark.parametrize("engine", CLUSTERS)
     def test_number_of_jobs_for_a_cluster(self, engine):
-        with pytest.raises(ValueError, match=f"n_jobs is for the engine joblib; with {engine} the cluster decides, got 3"):
+        with pytest.raises(ValueError, match=f"jobs is for the backend joblib; with {engine} the cluster decides, got 3"):
             carry_out_on(engine, examples.double, [], address="127.0.0.1:1", n_jobs=3)
 
     @pytest.mark.parametrize("n_jobs", [0, -1, 1.5, True])
     def test_number_of_jobs_that_is_none(self, n_jobs):
-        with pytest.raises(ValueError, match="n_jobs must be a whole number of at least 1 or None"):
+        with pytest.raises(ValueError, match="jobs must be a whole number of at least 1 or None"):
             carry_out_on("joblib", examples.double, [], n_jobs=n_jobs)
 
     @pytest.mark.parametrize(("engine", "package", "extra"), [("ray", "ray", "ray"), ("dask", "distributed", "dask")])

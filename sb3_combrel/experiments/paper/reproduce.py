@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sb3_combrel import __version__
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.common.files import write_whole
-from sb3_combrel.experiments.engines import JobError, carry_out_on
+from sb3_combrel.experiments.engines import JobError, carry_out_on, check_engine
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baseline_runs, carry_out_baseline
 from sb3_combrel.experiments.paper.diagnosis import diagnosis_jobs
@@ -82,9 +82,9 @@ def reproduce(
         raise ValueError(f"setting must be one of {', '.join(SETTINGS)}, got {setting!r}")
     for name, number in (("runs", runs), ("episodes", episodes), ("jobs", engine.n_jobs)):
         check_count(name, number, none_allowed=True)
-    # Checks the engine's arguments before anything is learned or written.
-    engine.carry_out(carry_out, [])
     targets = targets_of(target, setting)
+    # Before anything is learned or written.
+    check_engine(engine.name, n_jobs=engine.n_jobs, address=engine.address)
     console = console or Console()
     output = output or Path(OUTPUT) / setting
     domains = [domain for domain in DOMAINS.values() if any(domain.name in each.methods for each in targets)]
