@@ -25,7 +25,7 @@ from sb3_combrel.models.base import Model, Predictions
 STEPS = {"ICubTorso-noisy": 1500, "MountainCar-v0-noisy": 3000}
 RESOLUTION = 4
 EVALUATION_EPISODES = 100
-RIDGE = 0.01
+RIDGE = 0.001
 # The last of the nearest instances weighs exp(-3), about 0.05.
 LAST_EXPONENT = 3.0
 

@@ -14,7 +14,7 @@ from helpers.naive_fitted_rmax import Instance, NaiveGrid, apart
 # Figures of the definition, as the documentation states them.
 LAST_WEIGHT = 0.05
 NARROWEST = 0.02
-RIDGE = 0.01
+RIDGE = 0.001
 EXPLAINED_WEIGHT = 0.5
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 ON_GRID = 0.5
