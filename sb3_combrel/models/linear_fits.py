@@ -14,9 +14,8 @@ LAST_WEIGHT = 0.05
 PER_BREADTH = -np.log(LAST_WEIGHT)
 # No narrower than this fraction of ``model_breadth``: all instances may be at the very same state.
 NARROWEST = 0.02
-# On the slopes, in squared units of the kernel's breadth, as the sums of squared distances that it is added to are. Ten times as much
-# flattens the slopes across a trajectory once the kernel has narrowed: Mountain Car 4D then gets slower with more data. With a
-# tenth as much the first episodes take longer.
+# On the slopes, in squares of the kernel's breadth. Ten times as much flattens slopes across a trajectory once the kernel has
+# narrowed: Mountain Car 4D then gets slower with more data. With a tenth as much the first episodes take longer.
 RIDGE = 0.001
 # What the linear fit leaves unexplained of the instances nearest to a state, as at a wall, is added to its prediction, as if
 # there were so much weight of instances besides that it explains.
