@@ -162,8 +162,11 @@ class MappingExperts(Transfer):
 
     def action(self, state: np.ndarray) -> int | None:
         playing = self._playing.get(self.environment)
-        if playing is None or (playing.state is not None and not np.array_equal(playing.state, state)):
+        if playing is not None and playing.state is not None and not np.array_equal(playing.state, state):
             # An episode that was broken off, by a reset at the start of ``learn``, counts for nothing.
+            del self._playing[self.environment]
+            playing = None
+        if playing is None:
             playing = self._playing[self.environment] = Playing(self._choose())
         if playing.arm == AGENT or playing.acted >= self._most_steps():
             return None
@@ -194,7 +197,7 @@ class MappingExperts(Transfer):
         """Steps for which an expert may act in an episode."""
         if self.patience is None:
             return np.inf
-        return self.patience * next(steps for arm, _, steps, _ in reversed(self._episodes) if arm == AGENT)
+        return self.patience * next((steps for arm, _, steps, _ in reversed(self._episodes) if arm == AGENT), np.inf)
 
     def _choose(self) -> int:
         """Choose who acts in an episode."""
@@ -242,10 +245,8 @@ class MappingExperts(Transfer):
     def describe(self) -> list[tuple[str, float, int]]:
         """Return the name, the mean return and the number of episodes of all who may act, the agent first."""
         names = ["agent", *(repr(mapping) for _, mapping in self.experts)]
-        arms = [arm for arm, *_ in self._episodes]
-        return [
-            (name, float(mean), arms.count(k)) for k, (name, mean) in enumerate(zip(names, self.mean_returns(), strict=True))
-        ]
+        arms, means = [arm for arm, *_ in self._episodes], self.mean_returns().tolist()
+        return [(name, mean, arms.count(k)) for k, (name, mean) in enumerate(zip(names, means, strict=True))]
 
     def statistics(self) -> dict[str, float]:
         means = self.mean_returns()

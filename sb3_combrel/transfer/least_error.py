@@ -30,8 +30,8 @@ def check_action_mappings(sets: Sequence[MappingSet]) -> None:
         one_by_one = mappings.pairs is None and not isinstance(mappings.actions, AllActionMappings)
         if one_by_one and mappings.n_action_mappings > MAX_ACTION_MAPPINGS:
             raise ValueError(
-                f"mappings must have at most {MAX_ACTION_MAPPINGS:,} action mappings, or all there are, whose source actions are "
-                f'chosen one by one ("injective"), got {mappings.n_action_mappings:,}'
+                f"mappings must have at most {MAX_ACTION_MAPPINGS:,} action mappings, or all there are, whose source "
+                f'actions are chosen one by one ("injective"), got {mappings.n_action_mappings:,}'
             )
 
 
@@ -70,8 +70,8 @@ def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float,
         return float(of_member[best]), int(pairs[best, 0]), actions[best]
     actions = _action_table(mappings.actions, range(mappings.n_action_mappings))
     totals = np.array([of_row[each_action, actions].sum(axis=1) for of_row in errors])
-    row, number = np.unravel_index(int(totals.argmin()), totals.shape)
-    return float(totals[row, number]), int(row), actions[number]
+    row, number = divmod(int(totals.argmin()), totals.shape[1])
+    return float(totals[row, number]), row, actions[number]
 
 
 def _action_table(actions: ActionMappings, numbers: Sequence[int]) -> np.ndarray:
@@ -134,10 +134,8 @@ class LeastErrorSelector(Selector):
         self.copies.measure(seen.states[i], int(seen.actions[i]), seen.effects[i], self.sums, True)
         if i + 1 == self.n_transitions:
             self.choice = choose_least_error(self.copies, self.candidates.sets, self.sums)
-            for action in range(self.task.n_actions):
-                self._candidate[action] = self._find(
-                    action, int(self.choice.copies[action, 0]), self.choice.actions[action, 0]
-                )
+            for action, (row, source_action) in enumerate(np.hstack(self.choice).tolist()):
+                self._candidate[action] = self._find(action, row, source_action)
             self._just_chosen = True
 
     def _find(self, action: int, row: int, source_action: int) -> int:

@@ -54,7 +54,8 @@ class MASTER(MappingTransfer):
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too
     :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own model, seen
         through the mapping, is the prior of the target's. None: "prior" where the target's model takes one
-        (``FittedRMax(degree=1)``), unless ``breadth`` or ``breadth_decay``, which mean nothing then, differ from their defaults
+        (``FittedRMax(degree=1)``), unless ``breadth`` or ``breadth_decay``, which mean nothing then, differ from their
+        defaults
     :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """

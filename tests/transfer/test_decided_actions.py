@@ -6,7 +6,6 @@ from helpers.agents import make_agent
 from helpers.walk import OBSERVATIONS, Walk, same_parameters, small
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -89,5 +88,5 @@ def test_each_environment_has_its_number():
 @pytest.mark.parametrize("what", [-1, 3, 1.0, True, "left", np.nan, [1]], ids=repr)
 def test_whatever_is_no_action_is_refused(what):
     agent = make_agent(1, 3, Deciding(what, every=1))
-    with pytest.raises(ValueError, match="Deciding.action must return None or a whole number from 0 to 2, got"):
+    with pytest.raises(ValueError, match=r"Deciding\.action must return None or a whole number from 0 to 2, got"):
         agent.act(np.array([0.5]))

@@ -272,7 +272,7 @@ def test_what_does_not_fit_the_target_is_refused(use):
         small(transfer=MASTER(walk_source(), InterTaskMapping([0, None, 1], [0, 1]), use=use))
     # 12 target actions on 4 source actions, equally often: 369,600 ways.
     many = MappingSet.balanced(2, 2, 4, 12)
-    with pytest.raises(ValueError, match="mappings must have at most 100,000 action mappings, .* got 369,600"):
+    with pytest.raises(ValueError, match=r"mappings must have at most 100,000 action mappings, .* got 369,600"):
         bound(MASTER(source_of(0, 2, 4), many, use=use), naive.target_task(POINTS[:, :2].copy(), 12))
     # All ways, many more, are no problem.
     method = bound(MASTER(source_of(0, 2, 4), n_random_steps=5, use=use), naive.target_task(POINTS[:, :2].copy(), 12))
@@ -280,7 +280,7 @@ def test_what_does_not_fit_the_target_is_refused(use):
 
 
 def test_as_prior_it_needs_the_local_linear_model():
-    with pytest.raises(ValueError, match='MASTER.use="prior".* needs the local linear model'):
+    with pytest.raises(ValueError, match=r'MASTER\(use="prior"\) needs the local linear model'):
         small(transfer=MASTER(walk_source(), use="prior"), degree=0)
 
 
