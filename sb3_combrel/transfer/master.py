@@ -37,12 +37,12 @@ class MASTER(MappingTransfer):
       target's transitions: it has more data, and predicts in the same way as ``use="prior"`` does.
     - The paper's mappings give every target variable a source variable, as ``mappings="surjective"`` does. By default the
       variables that a mapping leaves out stay as they are, as in COMBREL.
-    - What is transferred is not the value function's weights or instances for another learner, but what TIMBREL transfers
-      through a mapping that is given.
+    - The learner is Fitted R-Max, and what is transferred is what TIMBREL transfers through a mapping that is given.
 
-    Cost: ``n_random_steps`` of the target; until then nothing is transferred. In each of these steps the source predicts once
-    for each state mapping and source action (Mountain Car 2D to 4D, 36 predictions: less than a millisecond). The number of
-    action mappings does not matter where all of them are in the set.
+    Cost: ``n_random_steps`` of the target, which are learned from as any others; until then nothing is transferred. In each of
+    these steps the source predicts once for each state mapping and source action: Mountain Car 2D to 4D, 36 predictions, 0.1
+    milliseconds. The number of action mappings does not matter where all of them are in the set. Which mapping is right there
+    was found with 20 steps in 12 of 12 seeds: that of one of the two axes. Noisy tasks need more.
 
     :param source: source instances, a path to them, or a list of several, of which one mapping to one is chosen
     :param mappings: the mappings to choose from: the name of a set ("injective", "surjective", "all", "balanced"), one of the

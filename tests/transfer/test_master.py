@@ -8,11 +8,15 @@ from helpers.agents import make_agent
 from helpers.asking import bound, changed_pairs, pairs_of, transferred_to_all, transferred_to_pairs
 from helpers.walk import Walk, same_parameters, small, walk_source
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_combrel
 from sb3_combrel import MASTER, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, MappingSet, SourceInstances
+from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel
+from sb3_combrel.zoo.algorithm import ZooFittedRMax
 
 USES = ["instances", "prior"]
 POINTS = np.random.default_rng(5).random((12, 3))
@@ -133,6 +137,15 @@ def test_as_prior_it_predicts_the_effects_that_timbrel_predicts_through_that_map
     assert method.prior(states, actions).effect.any()
 
 
+def test_all_random_transitions_count_however_many():
+    """A prior whose mapping may change later measures one in five of them from some time on."""
+    method = bound(MASTER(source_of(), n_random_steps=520, use="prior"), naive.target_task(POINTS, 2))
+    show(method, transitions_of(519, 3, 2))
+    assert method.chosen is None and method._prior.sums.n.sum() == 519
+    show(method, transitions_of(1, 3, 2))
+    assert method.chosen is not None
+
+
 @pytest.mark.parametrize("use", USES)
 def test_later_transitions_change_nothing(use):
     method = bound(MASTER(source_of(), n_random_steps=8, use=use), naive.target_task(POINTS, 2))
@@ -224,12 +237,33 @@ def test_on_the_walk_the_mapping_is_the_identity():
     assert model.policy.transfer.describe_prior() == "a0: a0 on (s0, s1); a1: a1 on (s0, s1)"
 
 
+def test_several_environments_act_at_random_together():
+    model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=MASTER(walk_source(), n_random_steps=20)).learn(120)
+    assert parts(model.policy.transfer.chosen)[:2] == ((0, 1), (0, 1))
+    assert model.agent.statistics()["transfer/steps_to_find_mapping"] == 20
+
+
+@pytest.mark.parametrize("use", USES)
+def test_it_is_shown_on_the_dashboard(use, tmp_path):
+    model = small(transfer=MASTER(walk_source(), n_random_steps=90, use=use), tensorboard_log=str(tmp_path))
+    model.learn(250, DashboardCallback(scalar_share=1.0), tb_log_name="run")
+    events = EventAccumulator(str(next(tmp_path.glob("run_*"))))
+    events.Reload()
+    found = [event.value for event in events.Scalars("transfer/mapping_found")]
+    assert found[0] == 0.0 and found[-1] == 1.0
+    assert events.Scalars("transfer/steps_to_find_mapping")[-1].value == 90.0
+
+
 def test_by_its_name_as_in_a_yaml_file(tmp_path):
     path = str(walk_source().save(tmp_path / "source.npz"))
     for name in ("MASTER", "sb3_combrel.MASTER", "sb3_combrel.transfer.master.MASTER"):
         model = small(transfer={name: {"source": path, "mappings": "surjective", "n_random_steps": 7}})
         assert type(model.policy.transfer) is MASTER is sb3_combrel.MASTER
         assert model.policy.transfer.n_random_steps == 7
+    of_zoo = ZooFittedRMax(
+        "FittedRMaxPolicy", Walk(), {"n_random_steps": 4}, transfer={"sb3_combrel.MASTER": {"source": path}}
+    )
+    assert of_zoo.policy.transfer.n_random_steps == 4
     with pytest.raises(ValueError, match=r"sb3_combrel\.MASTER and sb3_combrel\.MappingExperts"):
         small(transfer={"MASTERR": {"source": path}})
 
