@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_combrel
-from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, MappingSet
+from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, MappingSet, SourceInstances
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.transfer.experts import best_by_ucb1
 from sb3_combrel.transfer.source_policy import SourcePolicy
@@ -53,6 +53,45 @@ def test_values_of_the_walk_are_those_of_walking_to_the_goal():
         q = policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))
         assert q[1] == pytest.approx(value(place), abs=0.2)
         assert q[0] == pytest.approx(-1.0 + gamma * value(max(place - STRIDE, -1.0)), abs=0.2)
+
+
+def line_source(stride, reward_at_goal, n=400):
+    """As the walk, with another stride; each step costs 1, or only the goal gives a reward."""
+    at, action = np.linspace(-1.0, 0.89, n), np.arange(n) % 2
+    after = np.clip(at + stride * (2 * action - 1), -1.0, 1.0)
+    ends = after > GOAL
+    return SourceInstances(
+        np.column_stack([at, np.ones(n)]),
+        action,
+        np.where(ends, reward_at_goal, 0.0) if reward_at_goal else np.full(n, -1.0),
+        np.column_stack([after, np.ones(n)]),
+        ends,
+        [-1.0, 0.0],
+        [1.0, 2.0],
+        2,
+    )
+
+
+def test_values_where_a_step_is_shorter_than_a_cell_of_the_grid():
+    """The finite MDP leads several steps ahead, each of them discounted."""
+    gamma, stride = 0.98, 0.012
+    policy = SourcePolicy(line_source(stride, 0.0), gamma, 0.2)
+    for n in (20, 40, 80):
+        place = GOAL - stride * (n - 0.5)
+        expected = -(1.0 - gamma**n) / (1.0 - gamma)
+        # The end is averaged over a neighbourhood of several steps.
+        assert policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))[1] == pytest.approx(expected, rel=0.1)
+
+
+def test_values_are_of_ways_that_exist_even_if_rewards_are_bounded_by_much_more():
+    """Going to and fro for ever loses little: from above, the values would still be several times too high."""
+    gamma = 0.995
+    policy = SourcePolicy(line_source(STRIDE, 10.0), gamma, 0.2)
+    for n in range(1, 12):
+        place = GOAL - STRIDE * (n - 0.5)
+        q = policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))
+        assert q[1] == pytest.approx(10.0 * gamma ** (n - 1), rel=0.05)
+        assert q[0] < q[1]
 
 
 def test_without_data_an_action_has_no_value():

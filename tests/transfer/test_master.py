@@ -123,6 +123,23 @@ def test_nothing_is_transferred_before_and_then_what_timbrel_transfers_through_t
     assert {method.candidate(c).target_action for c in set(method.choices().tolist())} == {0, 1}
 
 
+def test_of_several_sources_the_instances_of_the_chosen_one_are_transferred():
+    # The second is the target itself, seen through a mapping.
+    mapping, rng = InterTaskMapping([1, None, 0], [1, 0]), np.random.default_rng(2)
+    sources, task = [source_of(3), source_of(4)], naive.target_task(POINTS, 2)
+    method = bound(MASTER(sources, n_random_steps=20, use="instances", breadth=0.4), task)
+    model = SourceModel(stacked_instances([sources[1]]), 0.2)
+    for state in rng.random((20, 3)):
+        action = int(rng.integers(2))
+        seen = mapping.target_to_source(state, 2)[None]
+        effect = model.predict(seen, np.array([mapping.action[action]])).effect[0]
+        method.observe(state, action, -1.0, state + mapping.displacement_to_target(effect), False)
+    assert parts(method.chosen) == parts(mapping)
+    expected = transferred_to_all(bound(TIMBREL(sources[1], mapping, breadth=0.4), task), task)
+    assert transferred_to_all(method, task) == expected
+    assert any(weights for weights, *_ in expected)
+
+
 def test_as_prior_it_predicts_the_effects_that_timbrel_predicts_through_that_mapping():
     source, task, transitions = source_of(), naive.target_task(POINTS, 2), transitions_of(12, 3, 2)
     method = bound(MASTER(source, n_random_steps=12, use="prior"), task)
@@ -246,7 +263,7 @@ def test_several_environments_act_at_random_together():
 @pytest.mark.parametrize("use", USES)
 def test_it_is_shown_on_the_dashboard(use, tmp_path):
     model = small(transfer=MASTER(walk_source(), n_random_steps=90, use=use), tensorboard_log=str(tmp_path))
-    model.learn(250, DashboardCallback(scalar_share=1.0), tb_log_name="run")
+    model.learn(250, DashboardCallback(scalar_share=1.0), log_interval=1, tb_log_name="run")
     events = EventAccumulator(str(next(tmp_path.glob("run_*"))))
     events.Reload()
     found = [event.value for event in events.Scalars("transfer/mapping_found")]
@@ -320,4 +337,7 @@ def test_as_prior_it_needs_the_local_linear_model():
 
 def test_arguments_of_instances_decide_for_instances():
     assert small(transfer=MASTER(walk_source(), breadth=0.2)).policy.transfer.use == "instances"
-    assert small(transfer=MASTER(walk_source())).policy.transfer.use == "prior"
+    undecided = MASTER(walk_source())
+    assert undecided.arguments()["use"] is None
+    assert small(transfer=undecided).policy.transfer.use == "prior"
+    assert small(transfer=undecided, degree=0).policy.transfer.use == "instances"
