@@ -9,6 +9,8 @@ from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.transfer.combrel import COMBREL
+from sb3_combrel.transfer.experts import MappingExperts
+from sb3_combrel.transfer.master import MASTER
 from sb3_combrel.transfer.timbrel import TIMBREL
 
 FittedRMax.default_callbacks.append(with_dashboard)
@@ -16,4 +18,14 @@ keep_old_names()
 register_fitted_rmax(FittedRMax)
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["COMBREL", "TIMBREL", "FactoredMapping", "FittedRMax", "InterTaskMapping", "MappingSet", "SourceInstances"]
+__all__ = [
+    "COMBREL",
+    "MASTER",
+    "TIMBREL",
+    "FactoredMapping",
+    "FittedRMax",
+    "InterTaskMapping",
+    "MappingExperts",
+    "MappingSet",
+    "SourceInstances",
+]

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping, SourceInstances
+from sb3_combrel import COMBREL, MASTER, TIMBREL, FactoredMapping, InterTaskMapping, MappingExperts, SourceInstances
 from sb3_combrel.experiments import cart_pole
 from sb3_combrel.experiments.misleading_sources import MISLEADING
 from sb3_combrel.experiments.mountain_car import factored_mapping, intuitive_mapping
@@ -46,6 +46,8 @@ _ORACLES_OF: dict[str, Mapping[str, object]] = {"oracle": ORACLES, "oracle-insta
 TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
     "COMBREL": lambda source, task: COMBREL(source),
     "COMBREL-instances": lambda source, task: COMBREL(source, "injective", use="instances"),
+    "MASTER": lambda source, task: MASTER(source),
+    "MappingExperts": lambda source, task: MappingExperts(source),
     "TIMBREL-random": lambda source, task: TIMBREL(source, "random"),
     "random": lambda source, task: TIMBREL(source, "random", mappings="factored", use="prior"),
     "oracle": lambda source, task: TIMBREL(source, ORACLES[task], use="prior"),

@@ -72,7 +72,8 @@ class FittedRMaxAgent:
         self.model_settings = settings.model_settings(d)
         breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
         self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight, self.periodic)
-        self.workload = workload(self.grid, task.n_actions, self.model_settings, transfer is not None)
+        transfers = transfer is not None and transfer.use != "actions"
+        self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
         warn_if_long(self.workload, self.grid)
         self.n_truncated = 0
         self.n_backups = 0
@@ -84,6 +85,8 @@ class FittedRMaxAgent:
         # One thread at a time: predicting in one while another learns must be safe.
         self._lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
+        # Most methods leave all actions to the agent: they are not asked at every step.
+        self._transfer_decides = transfer is not None and type(transfer).action is not Transfer.action
         if transfer is not None:
             transfer.check_degree(1 if self.model_class.takes_prior else 0)
             self.target = self._target_task(transfer)
@@ -111,7 +114,8 @@ class FittedRMaxAgent:
         """Make model and planner, without any instances."""
         max_value = float(self.settings.max_value)
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.settings.gamma)
-        self.model = self.model_class(self.mdp, self.model_settings, self.transfer)
+        of_model = None if self.transfer is None or self.transfer.use == "actions" else self.transfer
+        self.model = self.model_class(self.mdp, self.model_settings, of_model)
         self.planner = Planner(
             self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=self.settings.planning_tolerance
         )
@@ -136,7 +140,14 @@ class FittedRMaxAgent:
 
     # ------------------------------------------------------------------ acting
 
-    def act(self, state: np.ndarray, explore: bool = True, episode: int = 0, memory: EpisodeMemory | None = None) -> int:
+    def act(
+        self,
+        state: np.ndarray,
+        explore: bool = True,
+        episode: int = 0,
+        memory: EpisodeMemory | None = None,
+        environment: int = 0,
+    ) -> int:
         """
         Choose an action.
 
@@ -147,10 +158,28 @@ class FittedRMaxAgent:
         :param episode: in learning, a number that tells the episodes of all environments apart
         :param memory: in evaluation, what is stored of the episode so far; where it is caught in a loop, other actions
             are tried
+        :param environment: in learning, the number of the environment, for a transfer method that decides actions
         :return: the action, from 0 on
+        :raises ValueError: if a transfer method decides on something that is no action
         """
         with self._lock:
-            return self._explore(state, episode) if explore else self._exploit(state, memory)
+            if not explore:
+                return self._exploit(state, memory)
+            decided = self._decided_by_transfer(state, environment) if self._transfer_decides else None
+            return self._explore(state, episode) if decided is None else decided
+
+    def _decided_by_transfer(self, state: np.ndarray, environment: int) -> int | None:
+        """The action that the transfer method decides on; None if it leaves it to the agent."""
+        assert self.transfer is not None
+        self.transfer.environment = environment
+        action = self.transfer.action(state)
+        is_number = isinstance(action, int | np.integer) and not isinstance(action, bool)
+        if action is None or (is_number and 0 <= action < self.task.n_actions):
+            return None if action is None else int(action)
+        raise ValueError(
+            f"{type(self.transfer).__name__}.action must return None or a whole number from 0 to {self.task.n_actions - 1}, "
+            f"got {action!r}"
+        )
 
     def _explore(self, state: np.ndarray, episode: int) -> int:
         if self.corrections.n_states[0] == len(self.corrections.key):
@@ -221,32 +250,44 @@ class FittedRMaxAgent:
 
     # ---------------------------------------------------------------- learning
 
-    def update(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+    def update(
+        self,
+        state: np.ndarray,
+        action: int,
+        reward: float,
+        next_state: np.ndarray,
+        terminated: bool,
+        environment: int = 0,
+    ) -> None:
         """
         Learn from one transition, and plan.
 
         :param state: unit coordinates; ``next_state``: the same
         :param action: from 0 on
         :param terminated: whether ``next_state`` is a terminal state; a time limit is none
+        :param environment: see :meth:`act`
         """
         with self._lock:
             self._widen(reward)
             self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
             if self.transfer is not None:
+                self.transfer.environment = environment
                 self.transfer.observe(state, action, reward, next_state, terminated)
             self._plan(self.max_backups, NOWHERE if terminated else next_state)
 
-    def end_episode(self, truncated: bool) -> None:
+    def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """
         Plan on while no action is due.
 
         :param truncated: whether the episode ended by its time limit
+        :param environment: see :meth:`act`
         """
         with self._lock:
             if truncated:
                 self.n_truncated += 1
                 self._outdated.append(self.model.lower_threshold(self._lowered_threshold()))
             if self.transfer is not None:
+                self.transfer.environment = environment
                 self.transfer.end_episode(truncated)
                 self._outdated.append(self.model.outdated())
             self._outdated.append(self.model.end_episode())
@@ -318,6 +359,8 @@ class FittedRMaxAgent:
 
     def _changed_by(self, transfer: Transfer) -> np.ndarray:
         """The pairs, not known, for which the transfer method may have other instances than when it was last asked."""
+        if transfer.use == "actions":
+            return NO_PAIRS
         changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
         if isinstance(changed, bool | np.bool_):
             return np.flatnonzero(~self.model.known) if changed else NO_PAIRS

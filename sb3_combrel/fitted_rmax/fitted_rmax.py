@@ -320,7 +320,8 @@ class FittedRMax(PersistentAlgorithm):
         assert self.env is not None and isinstance(self._last_obs, np.ndarray)
         states = self._last_states
         choices = [
-            self.agent.act(state, episode=number) for state, number in zip(states, self._episode_numbers.tolist(), strict=True)
+            self.agent.act(state, episode=number, environment=e)
+            for e, (state, number) in enumerate(zip(states, self._episode_numbers.tolist(), strict=True))
         ]
         actions = np.array(choices) + self.policy._first_action
         new_obs, rewards, dones, infos = self.env.step(actions)
@@ -331,7 +332,7 @@ class FittedRMax(PersistentAlgorithm):
         next_obs, terminated = true_outcomes(new_obs, dones, infos, ended)
         next_states = self.policy.to_unit(next_obs)
         for e, choice in enumerate(choices):
-            self.agent.update(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]))
+            self.agent.update(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]), e)
             self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
         self._last_states = self.policy.to_unit(np.asarray(new_obs)) if ended else next_states
@@ -364,7 +365,7 @@ class FittedRMax(PersistentAlgorithm):
     def _end_episode(self, env_index: int, terminated: bool) -> None:
         self._episode_num += 1
         self._episode_numbers[env_index] += self.n_envs
-        self.agent.end_episode(not terminated)
+        self.agent.end_episode(not terminated, env_index)
         rewards = self._episode_rewards[env_index]
         self._episode_rewards[env_index] = []
         if not self._warned_of_max_value and (terminated or min(rewards) >= 0.0):

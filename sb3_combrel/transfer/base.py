@@ -73,8 +73,13 @@ class Transfer(ABC):
     rng: np.random.Generator
 
     #: How the model uses the source: "instances": as instances that join the target's own where these do not suffice; "prior":
-    #: as the mean that they are fitted to, see :meth:`prior`.
+    #: as the mean that they are fitted to, see :meth:`prior`; "actions": not at all, the method decides actions only, see
+    #: :meth:`action`.
     use: str = "instances"
+
+    #: Number of the environment, of several that are learned from at once, of the next call of :meth:`action`,
+    #: :meth:`observe` or :meth:`end_episode`.
+    environment: int = 0
 
     #: Arguments of the constructor under the names that they had before: a file may still have them.
     renamed_arguments: ClassVar[dict[str, str]] = {}
@@ -112,6 +117,18 @@ class Transfer(ABC):
         """
         assert self.task is not None
         return self.transferred(self.task.sample_states[points], actions, own_weight)
+
+    def action(self, state: np.ndarray) -> int | None:
+        """
+        Decide an action for the agent while it learns, or leave it to the agent.
+
+        Called once for each step of learning, never for predictions, and only of a method that overrides it. The transition
+        that follows is learned from and observed as any other.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :return: the action, from 0 on; None leaves it to the agent, and is what is returned by default
+        """
+        return None
 
     @abstractmethod
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:

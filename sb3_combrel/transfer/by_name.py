@@ -43,7 +43,8 @@ def _method(name: str) -> Any:
         return getattr(importlib.import_module(module_name or "sb3_combrel"), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(
-            f"transfer names {name!r}, which does not exist; known are sb3_combrel.COMBREL and sb3_combrel.TIMBREL"
+            f"transfer names {name!r}, which does not exist; known are sb3_combrel.COMBREL, sb3_combrel.TIMBREL, "
+            "sb3_combrel.MASTER and sb3_combrel.MappingExperts"
         ) from error
 
 

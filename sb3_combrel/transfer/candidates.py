@@ -97,17 +97,10 @@ class Candidates:
     """
 
     def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask, whole: bool = False):
-        if isinstance(mappings, FactoredMapping):
-            raise ValueError(f'factored mappings need use="prior", got mappings={mappings!r}')
         self.task = task
         self.whole = whole
         self.sources = load_sources(source)
-        self.sets = [
-            resolve(mappings, **_sizes(one, task)).with_names(
-                one.state_names, task.state_names, one.action_names, task.action_names
-            )
-            for one in self.sources
-        ]
+        self.sets = resolved_sets(self.sources, mappings, task)
         self.instances = stacked_instances(self.sources)
         self.table = stacked_table(self.sets)
         self.origins: list[Origin] = []
@@ -211,6 +204,22 @@ def load_sources(source: SourceLike) -> list[SourceInstances]:
     if isinstance(source, Sequence) and len(source) > 0:
         return [instances for one in source for instances in load_sources(one)]
     raise ValueError(f"source must be SourceInstances, a path to them, or a list of these, got {source!r}")
+
+
+def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:
+    """
+    Return the set of mappings that a user means for each source, with names.
+
+    :raises ValueError: if ``mappings`` is factored, or does not fit the tasks
+    """
+    if isinstance(mappings, FactoredMapping):
+        raise ValueError(f'factored mappings need use="prior", got mappings={mappings!r}')
+    return [
+        resolve(mappings, **_sizes(one, task)).with_names(
+            one.state_names, task.state_names, one.action_names, task.action_names
+        )
+        for one in sources
+    ]
 
 
 def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:

@@ -10,7 +10,9 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.copy_predictions import CopyTable, UsePredictions, Uses, join_many_plain, predict_pairs_plain
 from sb3_combrel.transfer.copy_sums import CopyScratch, CopySums, follow_plain, measure_plain
@@ -177,6 +179,20 @@ class Copies:
             side = 1.0 - states[:, v] if self.table.sign[copy, v] < 0.0 else states[:, v]
             at[:, k] += self.table.share[copy, k] * side
         return at
+
+    def mapping(self, copy: int, task: TargetTask, action: tuple[int, ...]) -> InterTaskMapping:
+        """
+        Return a copy as an inter-task mapping, with names.
+
+        :param copy: its number
+        :param task: the target task
+        :param action: source action of each target action
+        """
+        source = self.sources[self.source[copy]]
+        state = tuple(None if k < 0 else k for k in self.state[copy].tolist())
+        sign = tuple(int(s) for s in np.where(self.sign[copy] < 0, -1, 1))
+        mapping = InterTaskMapping(state, action, sign)
+        return mapping.with_names(source.state_names, task.state_names, source.action_names, task.action_names)
 
     def _typical_effects(self) -> np.ndarray:
         """How much each source moves what a copy makes of it.

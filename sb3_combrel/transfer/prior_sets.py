@@ -73,7 +73,7 @@ def make_prior(
         copies, choose = _given(mappings, *parts)
     else:
         candidates = Candidates(source, mappings, task)
-        copies = _copies_of(candidates, task, breadth)
+        copies = copies_of(candidates, task, breadth)
         allowed = _allowed(candidates, copies)
         choose = draw_mapping(copies, allowed, drawn) if drawn else partial(choose_mapping, copies, allowed=allowed)
     return SourcePrior(
@@ -150,8 +150,12 @@ def _of_mappings(
     return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
 
 
-def _copies_of(candidates: Candidates, task: TargetTask, breadth: float) -> Copies:
-    """All state mappings of a set, for each source."""
+def copies_of(candidates: Candidates, task: TargetTask, breadth: float) -> Copies:
+    """
+    Return all state mappings of a set, for each source, in the order of the candidates' mapping table.
+
+    :param breadth: kernel breadth of the source's model, in unit coordinates of the source
+    """
     number = np.repeat(np.arange(len(candidates.sets)), [each.n_state_mappings for each in candidates.sets])
     table = candidates.table
     return Copies(candidates.sources, number, table.variable, table.sign, breadth, task.exploration_threshold)

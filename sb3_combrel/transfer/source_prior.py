@@ -54,6 +54,8 @@ class SourcePrior:
     :param whole: see :meth:`Copies.measure`
     :param max_transitions: target transitions by which is chosen, at most; what is chosen then is checked on
     :param transfer_terminals: whether the source's ends are used at all
+    :param first_renewal: target transitions after which is chosen first; all of them are compared with what all copies
+        predict. Equal to ``max_transitions``, it is chosen once
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class SourcePrior:
         whole: bool,
         max_transitions: int,
         transfer_terminals: bool = True,
+        first_renewal: int = FIRST_RENEWAL,
     ):
         self.copies = copies
         self.task = task
@@ -85,7 +88,8 @@ class SourcePrior:
         self._transitions = RecordedTransitions(task.n_variables)
         # How each recorded transition's episode went on: 0 it did, 1 it terminated, 2 it reached its time limit.
         self._ended = np.zeros(64, dtype=np.int64)
-        self._renewal_due = float(FIRST_RENEWAL)
+        self._renewal_due = float(first_renewal)
+        self._all_measured = max(ALL_MEASURED, first_renewal)
         self._warned = False
         self._uses: Counter[tuple[int, ...]] = Counter()
         self._candidates: list[tuple[int, ...]] = []
@@ -147,7 +151,7 @@ class SourcePrior:
         recorded = self.n_observed <= self.max_transitions
         if recorded:
             self._record(state, action, reward, effect, terminated)
-            if self.n_observed <= ALL_MEASURED or self.n_observed % MEASURED_LATER == 0:
+            if self.n_observed <= self._all_measured or self.n_observed % MEASURED_LATER == 0:
                 self.copies.measure(state, action, effect, self.sums, self.whole)
         if self.choice is not None:
             self._check(state, action, reward, effect, terminated, recorded)
@@ -326,11 +330,7 @@ class SourcePrior:
 
         :param action: source action of each target action; None: 0 throughout
         """
-        source = self.copies.sources[self.copies.source[copy]]
-        state = tuple(None if k < 0 else k for k in self.copies.state[copy].tolist())
-        sign = tuple(int(s) for s in np.where(self.copies.sign[copy] < 0, -1, 1))
-        mapping = InterTaskMapping(state, action or (0,) * self.task.n_actions, sign)
-        return mapping.with_names(source.state_names, self.task.state_names, source.action_names, self.task.action_names)
+        return self.copies.mapping(copy, self.task, action or (0,) * self.task.n_actions)
 
     def describe(self) -> str:
         """Say what each target action is made of: "East: Right on (x, vx), Neutral on (y, vy); West: ..."."""

@@ -1,0 +1,318 @@
+"""Mappings as experts: a bandit over the source's policy, seen through mappings, and the agent (Talvitie & Singh 2007)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.checks import check_count, check_finite, check_positive
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources, resolved_sets
+from sb3_combrel.transfer.prior_sets import is_factored
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
+from sb3_combrel.transfer.source_policy import SourcePolicy
+
+DEFAULT_MAX_EXPERTS = 10
+# Numbers of mappings are saved as float64.
+MAX_MAPPINGS = 2**53
+#: The number of the learning agent among those who may act; the experts come after it.
+AGENT = 0
+
+
+class Expert(NamedTuple):
+    """
+    A mapping that gives a policy for the target.
+
+    :param source: number of the source task
+    :param mapping: from the target to it
+    """
+
+    source: int
+    mapping: InterTaskMapping
+
+
+@dataclass
+class Playing:
+    """
+    An episode that is going on.
+
+    :param arm: who acts: the agent, or an expert
+    :param total: rewards so far
+    :param steps: steps so far
+    :param acted: how many of them an expert decided
+    :param state: the state that was reached, unit coordinates; None before the first step
+    """
+
+    arm: int
+    total: float = 0.0
+    steps: int = 0
+    acted: int = 0
+    state: np.ndarray | None = None
+
+
+class MappingExperts(Transfer):
+    """
+    Every mapping gives a policy, and what acts in an episode, one of these or the agent, is chosen by the returns so far.
+
+    Paper: Talvitie & Singh, "An experts algorithm for transfer learning" (IJCAI 2007). An expert is a mapping: a state of the
+    target is seen as one of the source, the action that is greedy there by the source's value function is found, and one of
+    the target actions that map to it is taken, at random if there are several. If none maps to it, the best source action to
+    which one does; where the source has no data, the agent decides. The value function is planned from the source's instances
+    (:class:`~sb3_combrel.transfer.source_policy.SourcePolicy`). Whatever acts, the agent learns from every transition, and
+    nothing else is transferred: the model is that of no transfer.
+
+    Who acts is chosen by UCB1 (Auer, Cesa-Bianchi & Fischer 2002) at the start of each episode. First the agent, then each
+    expert in turn, acts in one episode; then whoever has the highest
+
+        mean return + (largest - least return so far) * ``exploration`` * sqrt(2 ln(episodes) / own episodes).
+
+    What differs from the paper:
+
+    - The paper's algorithm, ATEASE, is for tasks without episodes: it follows each expert for a number of steps that grows, a
+      guess of the experts' mixing time, then the best as long as it keeps its promise. Here there are episodes, and UCB1. What
+      is kept of the distrust is ``patience``: an expert that takes longer than the agent does hands over to it.
+    - The learning agent is among those who may act. As it gets better, its mean is that of the later half of its episodes.
+    - The paper's algorithm is given its experts; here at most ``max_experts`` are drawn from a set of mappings.
+
+    Cost: an episode of the target for each expert before anything is repeated, of which the expert takes no more than
+    ``patience`` times as many steps as the agent in its own last one; the agent may then go on. If no expert is any good these
+    steps are lost, but for what the agent learns from them: on MountainCar4D, where no expert that was drawn got to the
+    goal in time, 12 episodes with 10 experts took 5,800 steps, with 5 experts 4,000, without transfer 2,700 (two seeds). The
+    value function takes 0.1 seconds for a source of two variables and 1000 instances, once; an expert's action 0.05
+    milliseconds.
+
+    :param source: source instances, a path to them, or a list of several
+    :param mappings: the set that the experts are drawn from: "injective", "surjective", "all", "balanced", one of the paper's
+        sets, a list of mappings or a ``MappingSet``
+    :param max_experts: experts at most; of a larger set so many are drawn without replacement, when learning begins, all
+        mappings being equally likely
+    :param exploration: factor on the bonus for what has been tried seldom. 1 is UCB1's, whose bonus outweighs all differences
+        of returns for hundreds of episodes; 0: always the best so far
+    :param patience: an expert acts in an episode for at most this many times the steps of the agent's last own episode, then
+        the agent takes over until its end. The return of all of it counts for the expert. None: no limit
+    :param gamma: discount factor of the source's value function, below 1
+    :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
+    :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
+    """
+
+    use = "actions"
+
+    def __init__(
+        self,
+        source: SourceLike,
+        mappings: MappingsLike = "injective",
+        *,
+        max_experts: int = DEFAULT_MAX_EXPERTS,
+        exploration: float = 0.2,
+        patience: float | None = 1.0,
+        gamma: float = 0.99,
+        source_breadth: float = DEFAULT_SOURCE_BREADTH,
+    ):
+        check_count("max_experts", max_experts)
+        check_finite("exploration", exploration)
+        if exploration < 0.0:
+            raise ValueError(f"exploration must be at least 0, got {exploration!r}")
+        if patience is not None:
+            check_positive("patience", patience)
+        check_positive("gamma", gamma, max=1.0)
+        if gamma == 1.0:
+            raise ValueError(f"gamma must be below 1, got {gamma!r}")
+        check_positive("source_breadth", source_breadth)
+        if is_factored(mappings):
+            raise ValueError(f"mappings must be a set of mappings, one an expert, no factored ones, got {mappings!r}")
+        self.source: SourceLike = source
+        self.mappings = mappings
+        self.max_experts = max_experts
+        self.exploration = exploration
+        self.patience = patience
+        self.gamma = gamma
+        self.source_breadth = source_breadth
+        self._policies: list[SourcePolicy] = []
+
+    def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        super().bind(task, rng)
+        self.sources = load_sources(self.source)
+        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        self.source = self.sources if len(self.sources) > 1 else self.sources[0]
+        self._sets = resolved_sets(self.sources, self.mappings, task)
+        self.n_mappings = sum(mappings.n_mappings for mappings in self._sets)
+        if self.n_mappings > MAX_MAPPINGS:
+            raise ValueError(f"mappings must hold at most {MAX_MAPPINGS:,} mappings to draw from; list those of interest")
+        if not self._policies:
+            # They depend on the source alone, and are planned once.
+            breadth = float(self.source_breadth)
+            self._policies = [SourcePolicy(source, float(self.gamma), breadth) for source in self.sources]
+        # Source coordinates that a mapping does not determine are typical ones.
+        self._typical = [np.median(source.scaling.to_unit(source.states), axis=0) for source in self.sources]
+        self._numbers = np.empty(0, dtype=np.int64)
+        self.experts: list[Expert] = []
+        # Of each episode that has ended: who acted, its return, its steps, how many of them an expert decided.
+        self._episodes: list[tuple[int, float, int, int]] = []
+        self._playing: dict[int, Playing] = {}
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        return TransferredInstances.empty(len(actions), states.shape[1])
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        return False
+
+    # ------------------------------------------------------------------ acting
+
+    def action(self, state: np.ndarray) -> int | None:
+        playing = self._playing.get(self.environment)
+        if playing is not None and playing.state is not None and not np.array_equal(playing.state, state):
+            # An episode that was broken off, by a reset at the start of ``learn``, counts for nothing.
+            del self._playing[self.environment]
+            playing = None
+        if playing is None:
+            playing = self._playing[self.environment] = Playing(self._choose())
+        if playing.arm == AGENT or playing.acted >= self._most_steps():
+            return None
+        action = self.expert_action(playing.arm, state)
+        playing.acted += action is not None
+        return action
+
+    def expert_action(self, number: int, state: np.ndarray) -> int | None:
+        """
+        Return what an expert does at a state; None where its source has no data.
+
+        :param number: of the expert, from 1 on
+        :param state: unit coordinates of the target, shape (n_variables,)
+        """
+        source, mapping = self.experts[number - 1]
+        seen = mapping.target_to_source(state, self.sources[source].n_variables)
+        q = self._policies[source].q_values(np.where(np.isnan(seen), self._typical[source], seen))
+        available = np.zeros(len(q), dtype=np.bool_)
+        available[list(mapping.action)] = True
+        q = np.where(available, q, -np.inf)
+        best = int(q.argmax())
+        if q[best] == -np.inf:
+            return None
+        actions = mapping.target_actions(best)
+        return int(actions[0] if len(actions) == 1 else self.rng.choice(actions))
+
+    def _most_steps(self) -> float:
+        """Steps for which an expert may act in an episode."""
+        if self.patience is None:
+            return np.inf
+        return self.patience * next((steps for arm, _, steps, _ in reversed(self._episodes) if arm == AGENT), np.inf)
+
+    def _choose(self) -> int:
+        """Choose who acts in an episode."""
+        if len(self._numbers) == 0:
+            every = self.n_mappings <= self.max_experts
+            drawn = np.arange(self.n_mappings) if every else self.rng.choice(self.n_mappings, self.max_experts, replace=False)
+            self._set_experts(drawn)
+        acting = {playing.arm for playing in self._playing.values()}
+        returns = [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
+        if not returns[AGENT]:
+            # Several environments: nobody else acts before it is known how long the agent takes.
+            return AGENT
+        untried = [k for k, of_arm in enumerate(returns) if not of_arm and k not in acting]
+        return untried[0] if untried else best_by_ucb1(returns, float(self.exploration))
+
+    def _set_experts(self, numbers: np.ndarray) -> None:
+        self._numbers = numbers
+        last = np.cumsum([mappings.n_mappings for mappings in self._sets])
+        self.experts = []
+        for number in numbers.tolist():
+            source = int(np.searchsorted(last, number, side="right"))
+            self.experts.append(Expert(source, self._sets[source][number - int(last[source])]))
+
+    # --------------------------------------------------------------- observing
+
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        playing = self._playing.get(self.environment)
+        if playing is not None:
+            playing.total += reward
+            playing.steps += 1
+            playing.state = next_state.copy()
+
+    def end_episode(self, truncated: bool) -> None:
+        playing = self._playing.pop(self.environment, None)
+        if playing is not None:
+            self._episodes.append((playing.arm, playing.total, playing.steps, playing.acted))
+
+    # --------------------------------------------------------------- describing
+
+    def mean_returns(self) -> np.ndarray:
+        """Return the mean return of the agent, of the later half of its episodes, and of each expert; NaN before the first."""
+        returns = [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
+        return np.array([mean_return(k, of_arm) if of_arm else np.nan for k, of_arm in enumerate(returns)])
+
+    def describe(self) -> list[tuple[str, float, int]]:
+        """Return the name, the mean return and the number of episodes of all who may act, the agent first."""
+        names = ["agent", *(repr(mapping) for _, mapping in self.experts)]
+        arms, means = [arm for arm, *_ in self._episodes], self.mean_returns().tolist()
+        return [(name, mean, arms.count(k)) for k, (name, mean) in enumerate(zip(names, means, strict=True))]
+
+    def statistics(self) -> dict[str, float]:
+        means = self.mean_returns()
+        best = AGENT if np.isnan(means).all() else int(np.nanargmax(means))
+        acted = [(arm, acted) for arm, *_, acted in self._episodes]
+        acted += [(playing.arm, playing.acted) for playing in self._playing.values()]
+        episodes_of_experts = sum(arm != AGENT for arm, *_ in self._episodes)
+        return {
+            "transfer/experts": len(self.experts),
+            "transfer/best_expert": best,
+            "transfer/expert_steps": sum(steps for _, steps in acted),
+            "transfer/steps_to_find_mapping": sum(steps for arm, steps in acted if arm != best),
+            "transfer/expert_episodes": episodes_of_experts,
+            "transfer/agent_return": float(means[AGENT]),
+            "transfer/best_return": float(means[best]),
+        }
+
+    # -------------------------------------------------------------------- saving
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        assert self.task is not None
+        playing = [
+            (environment, one.arm, one.total, one.steps, one.acted, *one.state)
+            for environment, one in self._playing.items()
+            if one.state is not None
+        ]
+        return {
+            "experts": self._numbers[:, None].astype(np.float64),
+            "episodes": np.array(self._episodes, dtype=np.float64).reshape(-1, 4),
+            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self.task.n_variables),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        # Whatever a file says: numbers that exist.
+        self._set_experts(np.clip(state["experts"][:, 0], 0, self.n_mappings - 1).astype(np.int64))
+        for arm, total, steps, acted in state["episodes"].tolist():
+            self._episodes.append((self._arm(arm), total, int(steps), int(acted)))
+        for environment, arm, total, steps, acted, *reached in state["playing"].tolist():
+            self._playing[int(environment)] = Playing(self._arm(arm), total, int(steps), int(acted), np.array(reached))
+
+    def _arm(self, number: float) -> int:
+        return int(np.clip(number, AGENT, len(self.experts)))
+
+
+def mean_return(arm: int, returns: list[float]) -> float:
+    """The mean of all returns of an expert, of the later half of those of the agent, which gets better."""
+    return float(np.mean(returns[len(returns) // 2 :] if arm == AGENT else returns))
+
+
+def best_by_ucb1(returns: list[list[float]], exploration: float) -> int:
+    """
+    Choose by UCB1, on returns in parts of the range that they have had; the first of equal ones.
+
+    :param returns: of the agent and of each expert; those that have none are not chosen
+    :param exploration: factor on the bonus
+    """
+    everything = [total for of_arm in returns for total in of_arm]
+    spread = max(everything) - min(everything)
+    scores = [
+        (
+            mean_return(k, of_arm) + spread * exploration * np.sqrt(2.0 * np.log(len(everything)) / len(of_arm))
+            if of_arm
+            else -np.inf
+        )
+        for k, of_arm in enumerate(returns)
+    ]
+    return int(np.argmax(scores))

@@ -1,0 +1,93 @@
+"""The greedy policy of a source task, planned from its instances."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.planning.corrections import CorrectionArrays
+from sb3_combrel.planning.grid import StateGrid, fitting_grid
+from sb3_combrel.planning.mdp import FiniteMDP
+from sb3_combrel.planning.q_values import Prediction, QValues
+from sb3_combrel.planning.sweeping import Planner
+from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.candidates import stacked_instances
+from sb3_combrel.transfer.source_model import SourceModel
+
+# Weight of instances from which on a prediction counts, as by default in Fitted R-Max.
+MIN_WEIGHT = 1.0
+# The finite MDP leads from a grid point until its cell is left, but for no more than so many steps: values that are
+# interpolated at every step would spread over the grid.
+MAX_STEPS = 50
+# What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
+LEAST_WEIGHT_ON_GRID = 0.05
+# Changes of value up to this part of the range of a step's rewards end the planning.
+TOLERANCE = 0.001
+
+
+class SourcePolicy:
+    """
+    What is best in a source task, as far as its instances tell.
+
+    The source's local linear model predicts every action at the states of a grid, and value iteration on these predictions
+    gives the value function: Fitted R-Max's planning, but without optimism. An action with too few instances near a state
+    cannot be taken there, and a grid point without any such action counts as the worst of its neighbours.
+
+    :param source: instances of the source task
+    :param gamma: discount factor, below 1, as the least and the largest value are computed with it
+    :param breadth: kernel breadth of the source's model, in unit coordinates of the source
+    """
+
+    def __init__(self, source: SourceInstances, gamma: float, breadth: float):
+        self.model = SourceModel(stacked_instances([source]), breadth)
+        n, d = source.n_actions, source.n_variables
+        grid = fitting_grid(d, n, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
+        mdp = FiniteMDP(grid, n, gamma)
+        self._write_rows(mdp)
+        lowest, highest = float(source.rewards.min()), float(source.rewards.max())
+        bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
+        tolerance = TOLERANCE * max(highest - lowest, abs(highest), 1e-6)
+        planner = Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=tolerance)
+        # From below: values then come from ways that exist, however few sweeps there are.
+        planner.values[:] = bounds[0]
+        #: Value of each grid point.
+        self.values = planner.exploitation_values()
+        self.grid: StateGrid = grid
+        self._function = self.values, tuple(CorrectionArrays.empty(d)), grid.plain, float(gamma), bounds
+        self._q = QValues(n, d)
+        self._actions = np.arange(n)
+        self._length = np.ones(n, dtype=np.int64)
+
+    def _write_rows(self, mdp: FiniteMDP) -> None:
+        """Write what each action, held until the cell is left, does at each grid point."""
+        n_points, cells = mdp.grid.n_points, mdp.grid.arrays.cells
+        states = np.tile(mdp.grid.points(), (mdp.n_actions, 1))
+        actions = np.repeat(np.arange(mdp.n_actions), n_points)
+        at, reward, weight = states.copy(), np.zeros(len(states)), np.zeros(len(states))
+        # The probability that the episode goes on, discounted for all steps but one, which the MDP discounts itself.
+        goes_on = np.ones(len(states))
+        going = np.arange(len(states))
+        for step in range(MAX_STEPS):
+            goes_on[going] *= 1.0 if step == 0 else mdp.gamma
+            found = self.model.predict(at[going], actions[going])
+            reward[going] += goes_on[going] * found.reward
+            goes_on[going] *= 1.0 - found.end
+            at[going] += found.effect
+            if step == 0:
+                weight[:] = found.weight
+            left = (np.abs(at[going] - states[going]) * cells).max(axis=1) >= 1.0
+            going = going[~left & (goes_on[going] > 0.0)]
+        pairs = np.arange(len(states))
+        mdp.write_rows(pairs, weight >= MIN_WEIGHT, goes_on[:, None], (at - states)[:, None], reward)
+
+    def q_values(self, state: np.ndarray) -> np.ndarray:
+        """
+        Compute the action values at a state of the source.
+
+        :param state: unit coordinates of the source, shape (n_variables,)
+        :return: shape (n_actions,); -inf for actions with too few instances near the state
+        """
+        found = self.model.predict(np.repeat(state[None], len(self._actions), axis=0), self._actions)
+        modelled = found.weight >= MIN_WEIGHT
+        successors = (1.0 - found.end)[:, None], found.effect[:, None]
+        self._q.compute(Prediction(modelled, found.weight, found.reward, self._length, *successors), state, self._function)
+        return np.where(modelled, self._q.q, -np.inf)

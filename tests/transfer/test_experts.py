@@ -1,0 +1,446 @@
+"""Mappings as experts: what each does, who acts in which episode, and that the agent learns from all of it."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers import naive_transfer as naive
+from helpers.asking import bound
+from helpers.walk import GOAL, STRIDE, Walk, same_parameters, small, walk_source
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import sb3_combrel
+from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, MappingSet, SourceInstances
+from sb3_combrel.tensorboard.callback import DashboardCallback
+from sb3_combrel.transfer.experts import best_by_ucb1
+from sb3_combrel.transfer.source_policy import SourcePolicy
+from sb3_combrel.zoo.algorithm import ZooFittedRMax
+
+SAME = InterTaskMapping([0, 1], [0, 1])
+OPPOSITE = InterTaskMapping([0, 1], [1, 0])
+TASK = naive.target_task(np.random.default_rng(0).random((4, 2)), 2)
+
+
+def play(method, total, steps=1, environment=0, truncated=False):
+    """An episode of so many steps that returns ``total``; how many of them an expert decided, and who acted."""
+    method.environment = environment
+    state, decided = np.full(2, 0.5 + 0.001 * len(method._episodes)), 0
+    for step in range(steps):
+        decided += method.action(state) is not None
+        after = state + 1e-6
+        method.observe(state, 0, total / steps, after, step == steps - 1 and not truncated)
+        state = after
+    method.end_episode(truncated)
+    return decided, method._episodes[-1][0]
+
+
+# ------------------------------------------------------------- the source's policy
+
+
+def test_values_of_the_walk_are_those_of_walking_to_the_goal():
+    """The walk's length from each place is known: V = -(1 - gamma^n) / (1 - gamma)."""
+    gamma = 0.95
+    policy = SourcePolicy(walk_source(400), gamma, 0.2)
+
+    def value(place):
+        return -(1.0 - gamma ** (math.floor((GOAL - place) / STRIDE) + 1)) / (1.0 - gamma)
+
+    for n in range(1, 13):
+        # Half a stride from where one step more is needed: rewards and ends are averages over a neighbourhood.
+        place = GOAL - STRIDE * (n - 0.5)
+        q = policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))
+        assert q[1] == pytest.approx(value(place), abs=0.2)
+        assert q[0] == pytest.approx(-1.0 + gamma * value(max(place - STRIDE, -1.0)), abs=0.2)
+
+
+def line_source(stride, reward_at_goal, n=400):
+    """As the walk, with another stride; each step costs 1, or only the goal gives a reward."""
+    at, action = np.linspace(-1.0, 0.89, n), np.arange(n) % 2
+    after = np.clip(at + stride * (2 * action - 1), -1.0, 1.0)
+    ends = after > GOAL
+    return SourceInstances(
+        np.column_stack([at, np.ones(n)]),
+        action,
+        np.where(ends, reward_at_goal, 0.0) if reward_at_goal else np.full(n, -1.0),
+        np.column_stack([after, np.ones(n)]),
+        ends,
+        [-1.0, 0.0],
+        [1.0, 2.0],
+        2,
+    )
+
+
+def test_values_where_a_step_is_shorter_than_a_cell_of_the_grid():
+    """The finite MDP leads several steps ahead, each of them discounted."""
+    gamma, stride = 0.98, 0.012
+    policy = SourcePolicy(line_source(stride, 0.0), gamma, 0.2)
+    for n in (20, 40, 80):
+        place = GOAL - stride * (n - 0.5)
+        expected = -(1.0 - gamma**n) / (1.0 - gamma)
+        # The end is averaged over a neighbourhood of several steps.
+        assert policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))[1] == pytest.approx(expected, rel=0.1)
+
+
+def test_values_are_of_ways_that_exist_even_if_rewards_are_bounded_by_much_more():
+    """Going to and fro for ever loses little: from above, the values would still be several times too high."""
+    gamma = 0.995
+    policy = SourcePolicy(line_source(STRIDE, 10.0), gamma, 0.2)
+    for n in range(1, 12):
+        place = GOAL - STRIDE * (n - 0.5)
+        q = policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))
+        assert q[1] == pytest.approx(10.0 * gamma ** (n - 1), rel=0.05)
+        assert q[0] < q[1]
+
+
+def test_without_data_an_action_has_no_value():
+    policy = SourcePolicy(walk_source(), 0.9, 0.05)
+    assert (policy.q_values(np.array([0.5, 0.0])) == -np.inf).all()
+    assert np.isfinite(policy.q_values(np.array([0.5, 0.5]))).all()
+
+
+# ------------------------------------------------------------------- an expert
+
+
+def experts_of(mappings, source=None, **arguments):
+    method = bound(MappingExperts(walk_source() if source is None else source, mappings, **arguments), TASK)
+    method.action(np.full(2, 0.5))
+    return method
+
+
+def test_an_expert_does_what_is_best_in_the_source_seen_through_its_mapping():
+    exchanged_and_mirrored = InterTaskMapping([1, 0], [1, 0], [1, -1])
+    method = experts_of([SAME, OPPOSITE, exchanged_and_mirrored])
+    assert [expert.mapping for expert in method.experts] == [SAME, OPPOSITE, exchanged_and_mirrored]
+    for at in (0.2, 0.5, 0.8):
+        # The walk's goal is on the right: its action 1.
+        assert method.expert_action(1, np.array([at, 0.5])) == 1
+        assert method.expert_action(2, np.array([at, 0.5])) == 0
+        assert method.expert_action(3, np.array([0.5, at])) == 0
+    # Far from all data of the source.
+    assert method.expert_action(1, np.array([0.5, 0.0])) is None
+
+
+def test_of_several_target_actions_one_is_drawn_and_of_none_the_next_best_source_action_is_taken():
+    rng = np.random.default_rng(1)
+    source, task = naive.random_source(rng, 300, 2, 3), naive.target_task(rng.random((4, 3)), 4)
+    mappings = [InterTaskMapping([0, None, 1], [2, 0, 2, 0]), InterTaskMapping([None, 1, 0], [1, 1, 2, 1])]
+    method = bound(MappingExperts(source, mappings), task)
+    method.action(np.full(3, 0.5))
+    policy, seen = SourcePolicy(source, 0.99, 0.2), set()
+    for state in rng.random((60, 3)):
+        for number, mapping in enumerate(mappings, start=1):
+            q = policy.q_values(mapping.target_to_source(state, 2))
+            best = max(set(mapping.action), key=lambda u: q[u])
+            possible = [a for a in range(4) if mapping.action[a] == best]
+            taken = {method.expert_action(number, state) for _ in range(25)}
+            assert taken == (set(possible) if np.isfinite(q[best]) else {None})
+            seen.add((best == int(q.argmax()), len(possible)))
+    assert {(True, 2), (False, 2), (True, 1)} <= seen
+
+
+def test_source_variables_that_no_target_variable_maps_to_are_typical():
+    method = experts_of(InterTaskMapping([0, None], [0, 1]))
+    assert method.expert_action(1, np.array([0.4, 0.0])) == 1
+
+
+def test_each_expert_uses_its_own_source():
+    away = walk_source()
+    # The same walk with its actions exchanged.
+    other = type(away)(
+        states=away.states,
+        actions=1 - away.actions,
+        rewards=away.rewards,
+        next_states=away.next_states,
+        terminated=away.terminated,
+        low=away.low,
+        high=away.high,
+        n_actions=2,
+    )
+    method = experts_of([SAME], source=[away, other])
+    assert [expert.source for expert in method.experts] == [0, 1]
+    assert [method.expert_action(k, np.array([0.4, 0.5])) for k in (1, 2)] == [1, 0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_a_larger_set_so_many_different_ones_are_drawn(seed):
+    sources = [naive.random_source(np.random.default_rng(k), 50, 2, 3) for k in (0, 1)]
+    task = naive.target_task(np.zeros((1, 3)), 4)
+    method = bound(MappingExperts(sources, "injective", max_experts=7), task, seed)
+    assert method.n_mappings == 2 * 6 * 81
+    method.action(np.zeros(3))
+    numbers = np.random.default_rng(seed).choice(2 * 6 * 81, 7, replace=False).tolist()
+    all_of_them = list(MappingSet.injective(2, 3, 3, 4))
+    assert [tuple(expert) for expert in method.experts] == [(n // 486, all_of_them[n % 486]) for n in numbers]
+    assert len({(source, mapping.state, mapping.action) for source, mapping in method.experts}) == 7
+
+
+# --------------------------------------------------------------------- who acts
+
+
+def naive_ucb1(returns, exploration):
+    """Scores written out; the agent's mean is that of the later half of its episodes, rounded up."""
+    n_all, least, largest = 0, math.inf, -math.inf
+    for of_one in returns:
+        for value in of_one:
+            n_all, least, largest = n_all + 1, min(least, value), max(largest, value)
+    best, chosen = -math.inf, None
+    for k, of_one in enumerate(returns):
+        if of_one:
+            counted = of_one[-math.ceil(len(of_one) / 2) :] if k == 0 else of_one
+            mean = sum(counted) / len(counted)
+            score = mean + (largest - least) * exploration * math.sqrt(2.0 * math.log(n_all) / len(of_one))
+            if score > best + 1e-12:
+                best, chosen = score, k
+    return chosen
+
+
+def test_the_bandit_is_ucb1():
+    rng = np.random.default_rng(0)
+    chosen = set()
+    for _ in range(300):
+        returns = [rng.normal(size=rng.integers(0, 6)).tolist() for _ in range(4)]
+        returns[int(rng.integers(4))].append(0.0)
+        exploration = float(rng.choice([0.0, 0.2, 1.0]))
+        assert best_by_ucb1(returns, exploration) == naive_ucb1(returns, exploration)
+        chosen.add(naive_ucb1(returns, exploration))
+    assert chosen == {0, 1, 2, 3}
+
+
+def test_first_the_agent_then_each_expert_then_the_best():
+    method, rng = bound(MappingExperts(walk_source(), [SAME, OPPOSITE], exploration=0.5), TASK), np.random.default_rng(0)
+    returns, mean = [[], [], []], [-9.0, -5.0, -7.0]
+    for episode in range(60):
+        expected = episode if episode < 3 else naive_ucb1(returns, 0.5)
+        total = mean[expected] + rng.normal()
+        _, arm = play(method, total)
+        assert arm == expected
+        returns[arm].append(sum([total]))
+    assert len(returns[1]) > 30 and all(len(of_one) >= 2 for of_one in returns)
+    names = [name for name, *_ in method.describe()]
+    assert names[0] == "agent" and names[1].startswith("InterTaskMapping(s0<-s0, s1<-s1; a0<-a0")
+    assert [n for *_, n in method.describe()] == list(map(len, returns))
+    later = returns[0][len(returns[0]) // 2 :]
+    np.testing.assert_allclose(method.mean_returns(), [np.mean(later), *map(np.mean, returns[1:])])
+    assert method.statistics()["transfer/best_expert"] == 1
+
+
+def test_an_expert_hands_over_when_it_has_taken_as_long_as_the_agent():
+    method = bound(MappingExperts(walk_source(), [SAME, OPPOSITE], patience=1.5), TASK)
+    assert play(method, -1.0, steps=6) == (0, 0)
+    assert play(method, -1.0, steps=20) == (9, 1)
+    assert play(method, -1.0, steps=4) == (4, 2)
+    assert method.statistics()["transfer/expert_steps"] == 13
+    endless = bound(MappingExperts(walk_source(), [SAME], patience=None), TASK)
+    assert play(endless, -1.0, steps=6) == (0, 0)
+    assert play(endless, -1.0, steps=50) == (50, 1)
+
+
+def test_steps_spent_on_finding_the_best_are_those_of_all_other_experts():
+    method = bound(MappingExperts(walk_source(), [SAME, OPPOSITE], patience=None), TASK)
+    for total, steps in ((-30.0, 30), (-10.0, 10), (-50.0, 50)):
+        play(method, total, steps)
+    figures = method.statistics()
+    assert (figures["transfer/best_expert"], figures["transfer/expert_steps"]) == (1, 60)
+    assert (figures["transfer/steps_to_find_mapping"], figures["transfer/expert_episodes"]) == (50, 2)
+    assert (figures["transfer/agent_return"], figures["transfer/best_return"]) == pytest.approx((-30.0, -10.0))
+
+
+def test_an_episode_that_was_broken_off_counts_for_nothing():
+    method = bound(MappingExperts(walk_source(), [SAME]), TASK)
+    play(method, -3.0, steps=3)
+    state = np.full(2, 0.5)
+    assert method.action(state) is not None
+    method.observe(state, 0, -1.0, np.array([0.6, 0.5]), False)
+    # Somewhere else: the environment has been reset.
+    assert method.action(np.array([0.2, 0.5])) is not None
+    method.observe(np.array([0.2, 0.5]), 0, -5.0, np.array([0.3, 0.5]), True)
+    method.end_episode(False)
+    assert method._episodes[1:] == [(1, -5.0, 1, 1)]
+
+
+def test_episodes_of_several_environments_are_told_apart():
+    method, states = bound(MappingExperts(walk_source(), [SAME, OPPOSITE], patience=None), TASK), np.full((2, 2), 0.5)
+
+    def step(rewards, after):
+        decided = []
+        for e in (0, 1):
+            method.environment = e
+            decided.append(method.action(states[e]))
+        for e in (0, 1):
+            method.environment = e
+            reached = np.array([after, 0.5])
+            method.observe(states[e], 0, rewards[e], reached, False)
+            states[e] = reached
+        return decided
+
+    def end(e):
+        method.environment = e
+        method.end_episode(True)
+        states[e] = 0.5
+
+    # Before the agent has ended an episode nobody else acts.
+    assert step([-1.0, -2.0], 0.51) == [None, None]
+    end(1)
+    # Now the first expert acts in the second environment, to the right, while the agent goes on in the first.
+    assert step([-1.0, -4.0], 0.52) == [None, 1]
+    end(0)
+    assert step([-8.0, -4.0], 0.53) == [0, 1]
+    end(1)
+    end(0)
+    assert [(arm, total) for arm, total, *_ in method._episodes] == [(0, -2.0), (0, -2.0), (1, -8.0), (2, -8.0)]
+
+
+# ------------------------------------------------------------------- in learning
+
+
+def returns_of(model):
+    return [info["r"] for info in model.ep_info_buffer]
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_the_returns_are_those_of_the_episodes_and_the_agent_learns_from_every_step(n_envs):
+    model = small(make_vec_env(Walk, n_envs=n_envs, seed=0), transfer=MappingExperts(walk_source())).learn(300)
+    method = model.policy.transfer
+    # In the buffer the last digits are rounded.
+    np.testing.assert_allclose([total for _, total, *_ in method._episodes], returns_of(model), atol=1e-5)
+    assert sum(steps for *_, steps, _ in method._episodes) == sum(info["l"] for info in model.ep_info_buffer)
+    assert model.agent.model.n_instances == 300
+    assert len(method.experts) == 8 and {arm for arm, *_ in method._episodes} == set(range(9))
+    assert model.agent.model.transfer is None
+
+
+def test_with_the_right_mapping_the_first_episode_of_the_expert_is_as_short_as_can_be():
+    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), SAME, patience=None))
+    model.learn(10_000, StopTrainingOnMaxEpisodes(2))
+    first, second = returns_of(model)
+    assert second == -math.ceil((GOAL + 0.5) / STRIDE)
+    assert first < second
+    model.learn(10_000, StopTrainingOnMaxEpisodes(12))
+    assert model.policy.transfer.describe()[1][1] == second
+
+
+def test_wrong_mappings_are_given_up():
+    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), OPPOSITE, exploration=0.1))
+    model.learn(10_000, StopTrainingOnMaxEpisodes(30))
+    arms = [arm for arm, *_ in model.policy.transfer._episodes]
+    assert arms[:2] == [0, 1] and arms.count(1) <= 5
+    assert model.policy.transfer.statistics()["transfer/best_expert"] == 0
+
+
+def test_experts_do_not_act_in_evaluation():
+    """The deterministic action is that of a model that was given the same transitions, and has no experts."""
+    model = small(transfer=MappingExperts(walk_source())).learn(150)
+    decided = model.policy.transfer._episodes, model.policy.transfer._playing.keys()
+    before = (list(decided[0]), list(decided[1]))
+    states = np.column_stack([np.linspace(-1.0, 1.0, 21), np.ones(21)]).astype(np.float32)
+    generator = model.policy.transfer.rng.bit_generator.state
+    for deterministic in (True, False):
+        model.predict(states, deterministic=deterministic)
+    assert (list(decided[0]), list(decided[1])) == before
+    assert model.policy.transfer.rng.bit_generator.state == generator
+
+
+def test_the_same_seed_gives_the_same_run():
+    one, same, other = (
+        small(transfer=MappingExperts(walk_source(), max_experts=3), seed=seed).learn(150) for seed in (1, 1, 2)
+    )
+    assert same_parameters(one, same)
+    assert one.policy.transfer.experts == same.policy.transfer.experts != other.policy.transfer.experts
+
+
+@pytest.mark.parametrize("n_episodes", [1, 3, 9])
+def test_saved_and_loaded_it_goes_on_as_it_would(n_episodes, tmp_path):
+    arguments = dict(max_experts=4, exploration=0.3, patience=None, gamma=0.9, source_breadth=0.3)
+    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), "all", **arguments))
+    model.learn(10_000, StopTrainingOnMaxEpisodes(n_episodes))
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk(start=-0.5))
+    method, again = model.policy.transfer, loaded.policy.transfer
+    assert same_parameters(model, loaded)
+    assert {name: again.arguments()[name] for name in arguments} == arguments
+    assert again.experts == method.experts and len(method.experts) == 4
+    assert again._episodes == method._episodes and len(method._episodes) == n_episodes
+    np.testing.assert_equal(again.statistics(), method.statistics())
+    for each in (model, loaded):
+        each.learn(each.num_timesteps + 100, reset_num_timesteps=False)
+    assert again._episodes == method._episodes and len(method._episodes) > n_episodes
+    assert same_parameters(model, loaded)
+
+
+def test_parameters_taken_back_in_the_middle_of_an_episode():
+    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), SAME, patience=None))
+    model.learn(10_000, StopTrainingOnMaxEpisodes(1))
+    model.learn(model.num_timesteps + 4, reset_num_timesteps=False)
+    method, saved = model.policy.transfer, model.get_parameters()
+    before = vars(method._playing[0]).copy()
+    assert (before["arm"], before["steps"], before["acted"]) == (1, 4, 4)
+    model.set_parameters(saved)
+    np.testing.assert_equal(vars(method._playing[0]), before)
+
+
+def test_its_figures_are_logged(tmp_path):
+    model = small(transfer=MappingExperts(walk_source()), tensorboard_log=str(tmp_path))
+    model.learn(300, DashboardCallback(scalar_share=1.0), tb_log_name="run")
+    events = EventAccumulator(str(next(tmp_path.glob("run_*"))))
+    events.Reload()
+    [*_, last] = events.Scalars("transfer/expert_steps")
+    assert last.value > 0.0
+    assert {"transfer/steps_to_find_mapping", "transfer/best_expert"} <= set(events.Tags()["scalars"])
+
+
+def test_by_its_name_as_in_a_yaml_file(tmp_path):
+    path = str(walk_source().save(tmp_path / "source.npz"))
+    for name in ("MappingExperts", "sb3_combrel.MappingExperts", "sb3_combrel.transfer.experts.MappingExperts"):
+        model = small(transfer={name: {"source": path, "mappings": "surjective", "max_experts": 3}})
+        assert type(model.policy.transfer) is MappingExperts is sb3_combrel.MappingExperts
+        assert model.policy.transfer.max_experts == 3
+    of_zoo = ZooFittedRMax(
+        "FittedRMaxPolicy", Walk(), {"max_experts": 4}, transfer={"sb3_combrel.MappingExperts": {"source": path}}
+    )
+    assert of_zoo.policy.transfer.max_experts == 4
+
+
+# --------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ({"max_experts": 0}, "max_experts must be a whole number of at least 1, got 0"),
+        ({"max_experts": 2.0}, "max_experts must be a whole number of at least 1, got 2.0"),
+        ({"exploration": -0.1}, "exploration must be at least 0, got -0.1"),
+        ({"exploration": np.nan}, "exploration must be a finite number, got nan"),
+        ({"patience": 0.0}, "patience must be a number above 0, got 0.0"),
+        ({"patience": "long"}, "patience must be a number above 0, got 'long'"),
+        ({"gamma": 1.0}, "gamma must be below 1, got 1.0"),
+        ({"gamma": 0.0}, "gamma must be a number above 0 and at most 1, got 0.0"),
+        ({"source_breadth": None}, "source_breadth must be a number above 0, got None"),
+        ({"mappings": "factored"}, "mappings must be a set of mappings, one an expert, no factored ones, got 'factored'"),
+        ({"mappings": FactoredMapping((SAME,))}, "mappings must be a set of mappings, one an expert, no factored ones"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(argument, message):
+    with pytest.raises(ValueError, match=message):
+        MappingExperts(walk_source(), **argument)
+
+
+@pytest.mark.parametrize(
+    ("source", "mappings", "message"),
+    [
+        (None, "injective", "source must be SourceInstances, a path to them, or a list of these, got None"),
+        (walk_source(), "bijective", "mappings must be one of injective"),
+        (walk_source(), InterTaskMapping([0, None, 1], [0, 1]), "state must have 2 entries"),
+        (walk_source(), InterTaskMapping([0, 1], [0, 2]), "action must hold indices from 0 to 1"),
+    ],
+)
+def test_what_does_not_fit_the_target_is_refused(source, mappings, message):
+    with pytest.raises(ValueError, match=message):
+        small(transfer=MappingExperts(source, mappings))
+
+
+def test_a_set_that_is_too_large_to_draw_from_is_refused():
+    source = naive.random_source(np.random.default_rng(0), 50, 2, 3)
+    with pytest.raises(ValueError, match=r"mappings must hold at most 9,007,199,254,740,992 mappings to draw from"):
+        bound(MappingExperts(source), naive.target_task(np.zeros((1, 3)), 40))
