@@ -9,6 +9,9 @@ from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.transfer.combrel import COMBREL
+from sb3_combrel.transfer.soft_homomorphism import SoftHomomorphism
+from sb3_combrel.transfer.sparse_coding import SparseCodingMapping
+from sb3_combrel.transfer.three_way_rbm import ThreeWayRBM
 from sb3_combrel.transfer.timbrel import TIMBREL
 
 FittedRMax.default_callbacks.append(with_dashboard)
@@ -16,4 +19,15 @@ keep_old_names()
 register_fitted_rmax(FittedRMax)
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["COMBREL", "TIMBREL", "FactoredMapping", "FittedRMax", "InterTaskMapping", "MappingSet", "SourceInstances"]
+__all__ = [
+    "COMBREL",
+    "TIMBREL",
+    "FactoredMapping",
+    "FittedRMax",
+    "InterTaskMapping",
+    "MappingSet",
+    "SoftHomomorphism",
+    "SourceInstances",
+    "SparseCodingMapping",
+    "ThreeWayRBM",
+]
