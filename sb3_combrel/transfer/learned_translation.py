@@ -90,7 +90,7 @@ class LearnedTranslation(Transfer):
         self,
         source: SourceLike,
         *,
-        n_random_steps: int = 500,
+        n_random_steps: int = 200,
         n_source_samples: int = 300,
         breadth: float = DEFAULT_BREADTH,
         breadth_decay: float = DEFAULT_BREADTH_DECAY,

@@ -59,10 +59,11 @@ class SoftHomomorphism(Transfer):
     ends or rewards are confirmed or come to be doubted, the prior changes.
 
     What was changed. The paper maps to a finite set of source states, or by features made by hand; a distribution over ways to
-    read variables needs neither. It transfers the source's value function; here the mixture's model is the prior, and the agent
-    plans. Actions are mapped as well, by parameters of their own. A target with twice the variables of the source is taken for
-    two copies of it, which are mapped each in its own way, with source actions of their own; their predictions are added. Scale
-    and offset are not parameters: in unit coordinates, ranges correspond.
+    read variables needs neither. It transfers the source's value function; here the mixture's model is the prior, and the
+    agent plans. Actions are mapped as well, by parameters of their own. A target with twice the variables of the source is
+    taken for two copies of it, which are mapped each in its own way, with source actions of their own; their predictions are
+    added. Scale and offset are not parameters: in unit coordinates, ranges correspond. As only the mean is fitted, a source
+    action can also come out as the mean of others that it equals, such as no push as half a push to either side.
 
     What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`:
     the weight of the source's data times the part of the target's effects that the mixture explains, of the variable of which
@@ -70,7 +71,7 @@ class SoftHomomorphism(Transfer):
     has been confirmed. Effects on variables of which it explains less than half under an action are predicted as 0.
 
     Cost: no steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. MountainCar2D to 4D
-    (48 mappings, two copies): 1 to 3 s for each of about ten fits in a run of 12 episodes. It needs ``FittedRMax(degree=1)``.
+    (48 mappings, two copies): about 1 s for each of the 16 fits in a run of 12 episodes. It needs ``FittedRMax(degree=1)``.
 
     :param source: source instances, or a path to them
     :param n_copies: copies of the source that the target is made of; None: as many as it has variables for, at least one

@@ -132,7 +132,7 @@ class SparseCodingMapping(LearnedTranslation):
         self,
         source: SourceLike,
         *,
-        n_random_steps: int = 500,
+        n_random_steps: int = 200,
         n_source_samples: int = 300,
         n_atoms: int | None = None,
         sparsity: float = 0.1,

@@ -48,7 +48,7 @@ class ThreeWayRBM(LearnedTranslation):
         self,
         source: SourceLike,
         *,
-        n_random_steps: int = 500,
+        n_random_steps: int = 200,
         n_source_samples: int = 1000,
         n_hidden: int = 30,
         n_factors: int = 30,
