@@ -186,10 +186,9 @@ class SoftHomomorphism(Transfer):
             self._transitions.add(state, action, reward, effect)
             self._ended.append(int(terminated))
         if self._logits is not None:
-            predicted = self._mixture.predict(np.asarray(state, dtype=np.float64)[None], np.array([action]))
-            self._squares += ((predicted[0][0] - effect) ** 2).sum(), effect @ effect
-            _, expected, end, weight = (float(array[0]) if array.ndim == 1 else 0.0 for array in predicted)
-            self._outcomes.note(weight, end, expected, reward, terminated)
+            [expected], [mean_reward], [end], [weight] = self._mixture.predict(state[None], np.array([action]))
+            self._squares += ((expected - effect) ** 2).sum(), effect @ effect
+            self._outcomes.note(float(weight), float(end), float(mean_reward), reward, terminated)
         if self._fit_due <= self._n_observed <= self.max_transitions:
             self._fit_due = RENEWAL_GROWTH * self._n_observed
             self._fit()
@@ -312,13 +311,21 @@ class SoftHomomorphism(Transfer):
         return found, of_action
 
     def describe(self) -> str:
-        """Say what each target action is taken for most probably: "East: Right on (x, vx), Neutral on (y, vy); West: ..."."""
+        """
+        Say what each target action is taken for most probably: "East: Right on (x, vx) 0.97, Neutral on (y, vy) 0.41; ...".
+
+        Probabilities are those of mapping and source action together; low ones, where the mean of several is what fits.
+        """
         assert self.task is not None
+        if self._logits is None:
+            return "; ".join(f"{name}: nothing" for name in self.task.action_names)
         words: dict[str, list[str]] = {name: [] for name in self.task.action_names}
-        for a, _, m, b in self._best():
+        of_mapping, of_action = probabilities(self._logits, self._readings)
+        for a, c, m, b in self._best():
             read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
             names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self.task.state_names[v] for v, s in read]
-            words[self.task.action_names[a]].append(f"{self._source.action_names[b]} on ({', '.join(names)})")
+            share = of_mapping[c, m] * of_action[c, a, b]
+            words[self.task.action_names[a]].append(f"{self._source.action_names[b]} on ({', '.join(names)}) {share:.2f}")
         return "; ".join(f"{name}: {', '.join(each)}" for name, each in words.items())
 
     def statistics(self) -> dict[str, float]:

@@ -115,7 +115,7 @@ class SparseCodingMapping(LearnedTranslation):
     the target's triplets one by one: nothing in the method makes pairs correspond, and the regression fits whatever pairs it
     is given. ``transfer/prediction_error`` says how well the instances that were used then predicted the target.
 
-    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 5 s).
+    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
 
     :param source: source instances, or a path to them
     :param n_random_steps: steps of the target that its sample takes

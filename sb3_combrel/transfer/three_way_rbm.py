@@ -30,7 +30,7 @@ class ThreeWayRBM(LearnedTranslation):
     mean of the target's sample, whatever the source triplet (``transfer/translated_spread`` tells how near). Given pairs that
     belong together it does learn what relates them, but no task gives such pairs.
 
-    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 5 s).
+    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
 
     :param source: source instances, or a path to them
     :param n_random_steps: steps of the target that its sample takes

@@ -10,7 +10,9 @@ from helpers.naive_transfer import random_source, target_task
 from helpers.ring import Ring
 from helpers.walk import Walk, same_parameters, small, walk_source
 
-from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping, SourceInstances, SparseCodingMapping, ThreeWayRBM
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+
+from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping, SoftHomomorphism, SourceInstances, SparseCodingMapping, ThreeWayRBM
 from sb3_combrel.transfer.learned_translation import LearnedTranslation, Standard, Triplets
 from sb3_combrel.transfer.sparse_coding import Regression, nearest_pairs, sparse_codes
 
@@ -200,6 +202,28 @@ def test_a_model_is_saved_and_loaded_with_it(method, steps, tmp_path):
     assert same_parameters(model, loaded)
     loaded.learn(40, reset_num_timesteps=False)
     assert loaded.policy.transfer.statistics()["transfer/mapping_found"] == 1.0
+
+
+RESUMED = {
+    "SparseCodingMapping": lambda: quick(SparseCodingMapping, walk_source()),
+    "ThreeWayRBM": lambda: quick(ThreeWayRBM, walk_source()),
+    "SoftHomomorphism": lambda: SoftHomomorphism(walk_source(), n_starts=2),
+}
+
+
+@pytest.mark.parametrize("name", RESUMED)
+def test_learning_goes_on_to_the_last_bit(name, tmp_path):
+    """Saved at an episode's end, a loaded model learns what the model itself learns when it learns on."""
+    model = small(transfer=RESUMED[name]()).learn(10**6, callback=StopTrainingOnMaxEpisodes(3))
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    model.set_env(Walk())
+    # Loading has seeded the environment again.
+    model.get_env().seed(model.seed)
+    for goes_on in (model, loaded):
+        goes_on.learn(80, reset_num_timesteps=False)
+    assert same_parameters(model, loaded)
+    assert model.agent.model.n_instances > 100
 
 
 def test_it_learns_with_instances_translated_by_the_right_mapping():
