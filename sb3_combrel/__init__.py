@@ -11,6 +11,9 @@ from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.transfer.combrel import COMBREL
 from sb3_combrel.transfer.experts import MappingExperts
 from sb3_combrel.transfer.master import MASTER
+from sb3_combrel.transfer.soft_homomorphism import SoftHomomorphism
+from sb3_combrel.transfer.sparse_coding import SparseCodingMapping
+from sb3_combrel.transfer.three_way_rbm import ThreeWayRBM
 from sb3_combrel.transfer.timbrel import TIMBREL
 
 FittedRMax.default_callbacks.append(with_dashboard)
@@ -27,5 +30,8 @@ __all__ = [
     "InterTaskMapping",
     "MappingExperts",
     "MappingSet",
+    "SoftHomomorphism",
     "SourceInstances",
+    "SparseCodingMapping",
+    "ThreeWayRBM",
 ]

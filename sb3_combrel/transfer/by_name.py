@@ -42,10 +42,14 @@ def _method(name: str) -> Any:
     try:
         return getattr(importlib.import_module(module_name or "sb3_combrel"), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"transfer names {name!r}, which does not exist; known are sb3_combrel.COMBREL, sb3_combrel.TIMBREL, "
-            "sb3_combrel.MASTER and sb3_combrel.MappingExperts"
-        ) from error
+        raise ValueError(f"transfer names {name!r}, which does not exist; known are {', '.join(_known_names())}") from error
+
+
+def _known_names() -> list[str]:
+    """The names of the package's own transfer methods."""
+    package = importlib.import_module("sb3_combrel")
+    methods = ((name, getattr(package, name)) for name in package.__all__)
+    return [f"{package.__name__}.{name}" for name, each in methods if isinstance(each, type) and issubclass(each, Transfer)]
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:

@@ -222,6 +222,20 @@ def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, ta
     ]
 
 
+def load_one_source(source: SourceLike, method: str) -> SourceInstances:
+    """
+    Return the source instances of a method that takes those of one task.
+
+    :param method: its name, for the message
+    :raises FileNotFoundError: if there is no file at a path
+    :raises ValueError: if it is not instances, a path, or a list of one of these
+    """
+    found = load_sources(source)
+    if len(found) > 1:
+        raise ValueError(f"source must be one source with {method}, got {len(found)}")
+    return found[0]
+
+
 def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
     """
     Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.

@@ -1,0 +1,280 @@
+"""What methods share that learn a mapping from random samples of both tasks, and transfer all source data through it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.transfer.candidates import SourceLike, load_one_source
+from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, check_boolean
+from sb3_combrel.transfer.timbrel import TIMBREL
+
+# With fewer samples there is nothing to learn a mapping from.
+MIN_SAMPLES = 10
+
+
+class Triplets(NamedTuple):
+    """
+    Transitions of one task without rewards, in its unit coordinates.
+
+    :param state: float64, shape (n, n_variables)
+    :param action: int64, shape (n,)
+    :param effect: next state minus state, float64, shape (n, n_variables)
+    """
+
+    state: np.ndarray
+    action: np.ndarray
+    effect: np.ndarray
+
+    def columns(self, n_actions: int) -> np.ndarray:
+        """Return them as numbers, state, action (one column each) and effect: shape (n, 2 * n_variables + n_actions)."""
+        return np.hstack([self.state, np.eye(n_actions)[self.action], self.effect])
+
+    @classmethod
+    def of_columns(cls, columns: np.ndarray, n_actions: int) -> Triplets:
+        """Undo :meth:`columns`; of the columns of actions the largest decides."""
+        d = (columns.shape[1] - n_actions) // 2
+        actions = columns[:, d : d + n_actions].argmax(axis=1).astype(np.int64)
+        return cls(columns[:, :d].copy(), actions, columns[:, d + n_actions :].copy())
+
+
+class Standard(NamedTuple):
+    """Columns with mean 0 and standard deviation 1: ``mean`` and ``deviation`` of each, shape (n_columns,)."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+
+    @classmethod
+    def of(cls, rows: np.ndarray) -> Standard:
+        """Take them from rows; columns that do not vary are only shifted."""
+        deviation = rows.std(axis=0)
+        return cls(rows.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
+
+    def to(self, rows: np.ndarray) -> np.ndarray:
+        """Standardise rows."""
+        return (rows - self.mean) / self.deviation
+
+    def back(self, rows: np.ndarray) -> np.ndarray:
+        """Undo :meth:`to`."""
+        return self.mean + rows * self.deviation
+
+
+class LearnedTranslation(Transfer):
+    """
+    Learns a mapping from random samples of both tasks, once; then all source data are instances in target coordinates.
+
+    The first ``n_random_steps`` transitions of the target are its sample: :meth:`action` asks for random actions until then,
+    and nothing is transferred. The sample of the source is drawn from its instances. Then a subclass translates all source
+    instances, with their rewards and ends, and nothing is learned any more. Where the target's own instances do not suffice,
+    the nearest translated ones come first, as in :class:`~sb3_combrel.transfer.timbrel.TIMBREL`, which is given them with the
+    identity as its mapping.
+
+    :param source: source instances, or a path to them
+    :param n_random_steps: size of the target's sample, in steps of the target
+    :param n_source_samples: size of the source's sample, at most
+    :param breadth: kernel breadth of transferred instances, unit coordinates of the target
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param transfer_terminals: whether a source instance that ended its episode ends the target's
+    :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
+    """
+
+    def __init__(
+        self,
+        source: SourceLike,
+        *,
+        n_random_steps: int = 200,
+        n_source_samples: int = 300,
+        breadth: float = DEFAULT_BREADTH,
+        breadth_decay: float = DEFAULT_BREADTH_DECAY,
+        transfer_terminals: bool = True,
+    ):
+        check_count("n_random_steps", n_random_steps, min=MIN_SAMPLES)
+        check_count("n_source_samples", n_source_samples, min=MIN_SAMPLES)
+        check_positive("breadth", breadth)
+        check_positive("breadth_decay", breadth_decay, max=1.0)
+        check_boolean("transfer_terminals", transfer_terminals)
+        self.source = source
+        self.n_random_steps = n_random_steps
+        self.n_source_samples = n_source_samples
+        self.breadth = breadth
+        self.breadth_decay = breadth_decay
+        self.transfer_terminals = bool(transfer_terminals)
+
+    @abstractmethod
+    def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
+        """
+        Learn a mapping, and translate with it.
+
+        :param source: the source's sample; ``target``: the target's
+        :param instances: all of the source
+        :return: ``instances``, in their order, in target coordinates; they are brought into the target's box afterwards
+        """
+
+    # ------------------------------------------------------------------ binding
+
+    def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        super().bind(task, rng)
+        name = type(self).__name__
+        self._source = load_one_source(self.source, name)
+        for of, periodic in (("source", self._source.periodic), ("target", tuple(task.periodic or ()))):
+            if any(periodic):
+                raise ValueError(
+                    f"{name} does not support periodic state variables, got periodic={periodic} of the {of}; give both tasks "
+                    "sine and cosine of the angle as variables, or take another transfer method"
+                )
+        self._samples = np.empty((0, 2 * task.n_variables + 1))
+        # State, action and next state of each source instance in unit coordinates of the target, once there is a mapping.
+        self._rows = self._samples
+        self._translated: SourceInstances | None = None
+        self._timbrel: TIMBREL | None = None
+        self._seconds = 0.0
+
+    @property
+    def n_samples(self) -> int:
+        """Transitions of the target that have been sampled for the mapping."""
+        return len(self._samples)
+
+    @property
+    def translated(self) -> SourceInstances | None:
+        """All source instances in target coordinates, raw units of the target; None until the mapping has been learned."""
+        return self._translated
+
+    # ------------------------------------------------------------------ learning
+
+    def action(self, state: np.ndarray) -> int | None:
+        """
+        Choose the agent's action while it learns: a random one until the target's sample is complete.
+
+        :param state: unit coordinates, shape (n_variables,)
+        :return: the action, from 0 on; None to leave it to the agent
+        """
+        assert self.task is not None
+        return int(self.rng.integers(self.task.n_actions)) if self.n_samples < self.n_random_steps else None
+
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        if self._timbrel is not None:
+            self._timbrel.observe(state, action, reward, next_state, terminated)
+            return
+        self._samples = np.vstack([self._samples, [*state, action, *(next_state - state)]])
+        if self.n_samples == self.n_random_steps:
+            self._learn()
+
+    def _learn(self) -> None:
+        """Learn the mapping, and translate all source instances."""
+        assert self.task is not None
+        began = perf_counter()
+        source, d = self._source, self.task.n_variables
+        states = source.scaling.to_unit(source.states)
+        instances = Triplets(states, source.actions, source.scaling.to_unit(source.next_states) - states)
+        rows = np.sort(self.rng.permutation(len(source))[: self.n_source_samples])
+        target = Triplets(self._samples[:, :d], self._samples[:, d].astype(np.int64), self._samples[:, d + 1 :])
+        found = self.learn_translation(Triplets(*(column[rows] for column in instances)), target, instances)
+        # Nothing is known of states outside the box, nor of effects beyond those seen.
+        states = np.clip(found.state, 0.0, 1.0)
+        after = np.clip(states + np.clip(found.effect, target.effect.min(axis=0), target.effect.max(axis=0)), 0.0, 1.0)
+        self._transfer_rows(np.column_stack([states, found.action, after]))
+        self._seconds = perf_counter() - began
+
+    def _transfer_rows(self, rows: np.ndarray) -> None:
+        """Transfer the source's instances from now on, with these states, actions and next states in unit coordinates."""
+        assert self.task is not None
+        task, source, d = self.task, self._source, self.task.n_variables
+        self._rows = rows
+        self._translated = SourceInstances(
+            states=task.scaling.to_raw(rows[:, :d]),
+            actions=np.clip(rows[:, d], 0, task.n_actions - 1).astype(np.int64),
+            rewards=source.rewards,
+            next_states=task.scaling.to_raw(rows[:, d + 1 :]),
+            terminated=source.terminated,
+            low=task.scaling.low,
+            high=task.scaling.high,
+            n_actions=task.n_actions,
+            state_names=task.state_names,
+            action_names=task.action_names,
+            origin={"env": f"{source.origin.get('env', 'an unnamed task')} by {type(self).__name__}"},
+        )
+        self._timbrel = TIMBREL(
+            self._translated,
+            InterTaskMapping(tuple(range(task.n_variables)), tuple(range(task.n_actions))),
+            breadth=self.breadth,
+            breadth_decay=self.breadth_decay,
+            transfer_terminals=self.transfer_terminals,
+        )
+        self._timbrel.bind(task, self.rng)
+
+    # -------------------------------------------------------------------- asking
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        if self._timbrel is None:
+            return TransferredInstances.empty(len(actions), states.shape[1])
+        return self._timbrel.transferred(states, actions, own_weight)
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        return False if self._timbrel is None else self._timbrel.changed(known)
+
+    def end_episode(self, truncated: bool) -> None:
+        if self._timbrel is not None:
+            self._timbrel.end_episode(truncated)
+
+    def note_use(self, transferred: TransferredInstances) -> None:
+        if self._timbrel is not None:
+            self._timbrel.note_use(transferred)
+
+    def lowest_reward(self) -> float:
+        return float(self._source.rewards.min())
+
+    def statistics(self) -> dict[str, float]:
+        figures = {
+            "transfer/steps_to_find_mapping": self.n_samples,
+            "transfer/mapping_found": float(self._timbrel is not None),
+            "transfer/mapping_seconds": self._seconds,
+            "transfer/translated_spread": self._spread(),
+        }
+        return figures if self._timbrel is None else {**figures, **self._timbrel.statistics()}
+
+    def _spread(self) -> float:
+        """Standard deviation of the translated instances' states over that of the sample's, mean over variables; or NaN.
+
+        Near 0 where the mapping takes all source states for the same target state, because it has found no relation.
+        """
+        if self._translated is None or self.task is None:
+            return np.nan
+        sampled = self._samples[:, : self.task.n_variables].std(axis=0)
+        spread = self.task.scaling.to_unit(self._translated.states).std(axis=0)
+        return float((spread / np.maximum(sampled, 1e-12))[sampled > 1e-12].mean()) if (sampled > 1e-12).any() else np.nan
+
+    # -------------------------------------------------------------------- saving
+
+    def arguments(self) -> dict[str, Any]:
+        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        return super().arguments() if self.task is None else {**super().arguments(), "source": self._source}
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        return {"samples": self._samples.copy(), "translated": self._rows.copy(), **self._state_of_timbrel()}
+
+    def _state_of_timbrel(self) -> dict[str, np.ndarray]:
+        """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
+        assert self.task is not None
+        if self._timbrel is None:
+            like = TIMBREL(self._source, InterTaskMapping((0,) * self.task.n_variables, (0,) * self.task.n_actions))
+            like.bind(self.task, np.random.default_rng(0))
+            return {f"timbrel_{name}": array for name, array in like.get_state().items()}
+        return {f"timbrel_{name}": array for name, array in self._timbrel.get_state().items()}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        self._samples = state["samples"].copy()
+        if len(state["translated"]) != len(self._source):
+            return
+        self._transfer_rows(state["translated"].copy())
+        assert self._timbrel is not None
+        prefix = "timbrel_"
+        given = {name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)}
+        self._timbrel.set_state(given)

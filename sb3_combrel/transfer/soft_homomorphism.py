@@ -1,0 +1,380 @@
+"""Soft homomorphisms: a stochastic mapping of target to source states, fitted online (Sorg & Singh 2009)."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.common.periodic import differences
+from sb3_combrel.common.prior import PriorPredictions
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.transfer.base import TargetTask, Transfer
+from sb3_combrel.transfer.borne_out import GOES_ON, Outcomes
+from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
+from sb3_combrel.transfer.copy_sums import LARGEST_MISS
+from sb3_combrel.transfer.mapping_transfer import check_boolean
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.soft_mapping import (
+    FitData,
+    Logits,
+    all_readings,
+    as_source,
+    brought_back,
+    count_mappings,
+    fit,
+    most_probable,
+    n_readings,
+    probabilities,
+)
+from sb3_combrel.transfer.soft_predictions import MixturePredictions, Predicted
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
+from sb3_combrel.transfer.source_prior import FIRST_RENEWAL, MIN_EXPLAINED, MIN_TRANSITIONS, RENEWAL_GROWTH, TRUST_STEP
+
+# Each mapping predicts every transition that is fitted to with each source action.
+MAX_MAPPINGS = 2000
+MAX_FITTED = 500
+# The prediction of a copy is the mean over its most probable mappings and source actions: as many as have this probability
+# together, at most so many.
+MASS, MAX_TERMS = 0.98, 12
+# Errors are compared with effects of at least this fraction of the mean size of a variable's effects.
+LEAST_EFFECT = 0.25
+
+
+class SoftHomomorphism(Transfer):
+    """
+    The source's model, seen through a stochastic mapping of states that is fitted to the target, is the prior of its model.
+
+    Paper: Sorg & Singh, "Transfer via soft homomorphisms" (AAMAS 2009). A soft homomorphism maps a target state to a
+    distribution over source states, such that the expected model of the source is that of the target; it is found online by
+    fitting its parameters to the target's transitions.
+
+    Here the mapping is a mixture of deterministic ones: every source variable reads one target variable, as it is or mirrored,
+    no two the same; the parameters are logits of what each variable reads, and of the source action for each target
+    action. Given a target state and action, the prediction is the mean over the mixture of what the source's local linear
+    model predicts, each brought back to target coordinates by the mapping that it was made through. Parameters are fitted by
+    gradient descent after 10 transitions, and again whenever there are 1.4 times as many; only then, and when the source's
+    ends or rewards are confirmed or come to be doubted, the prior changes.
+
+    What was changed. The paper maps to a finite set of source states, or by features made by hand; a distribution over ways to
+    read variables needs neither. It transfers the source's value function; here the mixture's model is the prior, and the
+    agent plans. Actions are mapped as well, by parameters of their own. A target with twice the variables of the source is
+    taken for two copies of it, which are mapped each in its own way, with source actions of their own; their predictions are
+    added. Scale and offset are not parameters: in unit coordinates, ranges correspond. As only the mean is fitted, a source
+    action can also come out as the mean of others that it equals, such as no push as half a push to either side.
+
+    What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`:
+    the weight of the source's data times the part of the target's effects that the mixture explains, of the variable of which
+    it explains least, from 10 transitions of an action on; nothing of what it explains less than half, and no end before one
+    has been confirmed. Effects on variables of which it explains less than half under an action are predicted as 0.
+
+    Cost: no steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. MountainCar2D to 4D
+    (48 mappings, two copies): about 1 s for each of the 16 fits in a run of 12 episodes. It needs ``FittedRMax(degree=1)``.
+
+    :param source: source instances, or a path to them
+    :param n_copies: copies of the source that the target is made of; None: as many as it has variables for, at least one
+    :param mirrored: whether target variables may be read mirrored as well
+    :param n_starts: random starts of each fit, besides the parameters of the last one
+    :param max_transitions: target transitions that are recorded, at most; of these, 500 drawn at random are fitted to
+    :param transfer_terminals: whether the source's ends are used
+    :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
+    :raises ValueError: if an argument is out of range; when learning starts, if there are more than 2,000 mappings
+    """
+
+    use = "prior"
+
+    def __init__(
+        self,
+        source: SourceLike,
+        *,
+        n_copies: int | None = None,
+        mirrored: bool = True,
+        n_starts: int = 4,
+        max_transitions: int = 3000,
+        transfer_terminals: bool = True,
+        source_breadth: float = DEFAULT_SOURCE_BREADTH,
+    ):
+        check_count("n_copies", n_copies, none_allowed=True)
+        check_count("n_starts", n_starts)
+        check_count("max_transitions", max_transitions, min=FIRST_RENEWAL)
+        check_boolean("mirrored", mirrored)
+        check_boolean("transfer_terminals", transfer_terminals)
+        check_positive("source_breadth", source_breadth)
+        self.source = source
+        self.n_copies = n_copies
+        self.mirrored = bool(mirrored)
+        self.n_starts = n_starts
+        self.max_transitions = max_transitions
+        self.transfer_terminals = bool(transfer_terminals)
+        self.source_breadth = source_breadth
+
+    def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        super().bind(task, rng)
+        self._source = load_one_source(self.source, type(self).__name__)
+        source, d = self._source, task.n_variables
+        n_mappings = count_mappings(source.n_variables, d, self.mirrored)
+        if n_mappings > MAX_MAPPINGS:
+            advice = "mirrored=False would do, or " if self.mirrored else ""
+            raise ValueError(
+                f"SoftHomomorphism needs at most {MAX_MAPPINGS:,} mappings of states, got {n_mappings:,} of {d} target to "
+                f"{source.n_variables} source variables; {advice}a source with fewer variables"
+            )
+        instances = stacked_instances([source])
+        self._model = SourceModel(instances, float(self.source_breadth))
+        self._mean = source.scaling.to_unit(source.states).mean(axis=0)
+        self._readings = all_readings(source.n_variables, d, self.mirrored)
+        copies = max(1, d // source.n_variables) if self.n_copies is None else self.n_copies
+        columns = n_readings(source.n_variables, d, self.mirrored)
+        self._shape = Logits(
+            np.zeros((copies, source.n_variables, columns)), np.zeros((copies, task.n_actions, source.n_actions))
+        )
+        self._logits: Logits | None = None
+        self._mixture = MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
+        self._periodic = np.array(task.periodic)
+        self._transitions = RecordedTransitions(d)
+        # How each recorded transition's episode went on: 0 it did, 1 it terminated, 2 it reached its time limit.
+        self._ended: list[int] = []
+        self._outcomes = Outcomes(source.rewards, float(task.exploration_threshold))
+        self._trust = np.zeros(task.n_actions)
+        self._explains = np.ones((task.n_actions, d), dtype=np.bool_)
+        self._claims = False, False
+        # Squared errors of predictions, and squared effects, of transitions as they came.
+        self._squares = np.zeros(2)
+        self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
+        self._fit_due = float(FIRST_RENEWAL)
+        self._seconds = 0.0
+
+    # -------------------------------------------------------------------- asking
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        return TransferredInstances.empty(len(actions), states.shape[1])
+
+    def changed(self, known: np.ndarray) -> bool:
+        return False
+
+    def prior_version(self) -> int:
+        return self._version
+
+    def lowest_reward(self) -> float:
+        return float(self._source.rewards.min())
+
+    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
+        assert self.task is not None
+        if self._logits is None:
+            return PriorPredictions.nothing(len(actions), self.task.n_variables)
+        effect, reward, end, weight = self._mixture.predict(states, actions)
+        effect = np.where(self._explains[actions], effect, 0.0)
+        if self._outcomes.doubted:
+            return PriorPredictions(effect, reward, end, np.zeros(len(actions)))
+        weight = weight * self._trust[actions]
+        if not self._ends_believed:
+            weight[end >= GOES_ON] = 0.0
+        return PriorPredictions(effect, reward, end, weight)
+
+    @property
+    def _ends_believed(self) -> bool:
+        return self.transfer_terminals and self._outcomes.confirmed > 0
+
+    # ----------------------------------------------------------------- observing
+
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        effect = differences(next_state, state, self._periodic)
+        self._n_observed += 1
+        if self._n_observed <= self.max_transitions:
+            self._transitions.add(state, action, reward, effect)
+            self._ended.append(int(terminated))
+        if self._logits is not None:
+            [expected], [mean_reward], [end], [weight] = self._mixture.predict(state[None], np.array([action]))
+            self._squares += ((expected - effect) ** 2).sum(), effect @ effect
+            self._outcomes.note(float(weight), float(end), float(mean_reward), reward, terminated)
+        if self._fit_due <= self._n_observed <= self.max_transitions:
+            self._fit_due = RENEWAL_GROWTH * self._n_observed
+            self._fit()
+        self._note_claims()
+
+    def end_episode(self, truncated: bool) -> None:
+        if truncated and self._ended and self._n_observed <= self.max_transitions:
+            self._ended[-1] = 2
+        if self._logits is not None:
+            self._outcomes.end_episode(truncated)
+            self._note_claims()
+
+    def _note_claims(self) -> None:
+        """Let the version grow if ends and rewards are doubted, or believed, that were not before."""
+        claims = self._outcomes.doubted, self._ends_believed
+        self._version += claims != self._claims
+        self._claims = claims
+
+    # ------------------------------------------------------------------- fitting
+
+    def _fit(self) -> None:
+        """Fit the mixture to the recorded transitions; what it claims to know is decided anew."""
+        began = perf_counter()
+        n, seen = self._transitions.n, self._transitions
+        rows = np.arange(n) if n <= MAX_FITTED else np.sort(self.rng.choice(n, MAX_FITTED, replace=False))
+        size = np.abs(seen.effects[:n]).mean(axis=0)
+        scale = np.maximum(size, max(1e-2 * float(size.max()), 1e-6))
+        data = FitData(self._all_predictions(seen.states[rows]), seen.actions[rows], seen.effects[rows], scale)
+        found = self._state_mappings()
+        seed = int(self.rng.integers(2**63))
+        self._use(fit(self._logits, self._shape, self._readings, data, self.n_starts, seed))
+        if self._state_mappings() != found:
+            self._steps_to_find = self._n_observed
+        predicted = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
+        self._judge(predicted, size)
+        self._replay(predicted)
+        self._n_fits += 1
+        self._version += 1
+        self._seconds += perf_counter() - began
+
+    def _use(self, logits: Logits) -> None:
+        """Predict with these parameters from now on."""
+        self._logits = logits
+        self._mixture.set_terms(most_probable(*probabilities(logits, self._readings), MAX_TERMS, MASS))
+
+    def _all_predictions(self, states: np.ndarray) -> np.ndarray:
+        """What each mapping with each source action predicts, shape (n, n_mappings, n_source_actions, n_target_variables)."""
+        readings, n_actions = self._readings, self._source.n_actions
+        n, m, d = len(states), len(readings.variable), states.shape[1]
+        at = as_source(
+            np.repeat(states, m, axis=0), np.tile(readings.variable, (n, 1)), np.tile(readings.sign, (n, 1)), self._mean
+        )
+        found = np.empty((n, m, n_actions, d))
+        for b in range(n_actions):
+            effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect.reshape(n, m, -1)
+            found[:, :, b] = brought_back(effects, readings.variable, readings.sign, d)
+        return found
+
+    def _judge(self, predicted: Predicted, size: np.ndarray) -> None:
+        """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
+        assert self.task is not None
+        effects, actions = self._transitions.effects[: self._transitions.n], self._transitions.actions[: self._transitions.n]
+        effect, _, _, weight = predicted
+        founded = np.minimum(1.0, weight / self.task.exploration_threshold)
+        compared = np.maximum(effects**2, np.maximum((LEAST_EFFECT * size) ** 2, 1e-300))
+        missed = founded[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared)
+        for a in range(self.task.n_actions):
+            rows = actions == a
+            total = founded[rows].sum()
+            enough = total >= MIN_TRANSITIONS
+            explained = 1.0 - missed[rows].sum(axis=0) / total if enough else np.ones(len(size))
+            self._explains[a] = explained >= MIN_EXPLAINED
+            least = explained.min() if enough else 0.0
+            self._trust[a] = np.floor(least / TRUST_STEP + 1e-9) * TRUST_STEP if least >= MIN_EXPLAINED else 0.0
+
+    def _replay(self, predicted: Predicted) -> None:
+        """Count anew what confirms and contradicts the ends and rewards that are predicted."""
+        self._outcomes.forget()
+        _, reward, end, weight = predicted
+        for i, ended in enumerate(self._ended):
+            got = float(self._transitions.rewards[i])
+            self._outcomes.note(float(weight[i]), float(end[i]), float(reward[i]), got, ended == 1)
+            if ended:
+                self._outcomes.end_episode(ended == 2)
+
+    # --------------------------------------------------------------- describing
+
+    def _best(self) -> list[tuple[int, ...]]:
+        """The most probable mapping and source action of each target action and copy; none before the first fit."""
+        if self._logits is None:
+            return []
+        terms = self._mixture.terms
+        action = np.repeat(np.arange(len(terms.first) - 1), np.diff(terms.first))
+        best: dict[tuple[int, int], tuple[int, ...]] = {}
+        for row in zip(action.tolist(), *(column.tolist() for column in terms[1:4]), strict=True):
+            best.setdefault(row[:2], row)
+        return list(best.values())
+
+    def _state_mappings(self) -> list[int]:
+        """The most probable mapping of states of each copy, in any order of the copies; none before the first fit."""
+        return [] if self._logits is None else sorted(probabilities(self._logits, self._readings)[0].argmax(axis=1).tolist())
+
+    def mixture(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the stochastic mapping.
+
+        :return: probability that each source variable of each copy reads each target variable, as it is, shape (n_copies, 2,
+            n_source_variables, n_target_variables), [:, 0], or mirrored, [:, 1]; and of each source action for each target
+            action, shape (n_copies, n_target_actions, n_source_actions)
+        :raises ValueError: before the first fit, after 10 transitions
+        """
+        if self._logits is None:
+            raise ValueError(f"there is no mapping before the target has been seen for {FIRST_RENEWAL} transitions")
+        assert self.task is not None
+        of_mapping, of_action = probabilities(self._logits, self._readings)
+        found = np.zeros((len(of_mapping), 2, self._source.n_variables, self.task.n_variables))
+        for (m, k), v in np.ndenumerate(self._readings.variable):
+            if v >= 0:
+                found[:, int(self._readings.sign[m, k] < 0.0), k, v] += of_mapping[:, m]
+        return found, of_action
+
+    def describe(self) -> str:
+        """
+        Say what each target action is taken for most probably: "East: Right on (x, vx) 0.97, Neutral on (y, vy) 0.41; ...".
+
+        Probabilities are those of mapping and source action together; low ones, where the mean of several is what fits.
+        """
+        assert self.task is not None
+        if self._logits is None:
+            return "; ".join(f"{name}: nothing" for name in self.task.action_names)
+        words: dict[str, list[str]] = {name: [] for name in self.task.action_names}
+        of_mapping, of_action = probabilities(self._logits, self._readings)
+        for a, c, m, b in self._best():
+            read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
+            names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self.task.state_names[v] for v, s in read]
+            share = of_mapping[c, m] * of_action[c, a, b]
+            words[self.task.action_names[a]].append(f"{self._source.action_names[b]} on ({', '.join(names)}) {share:.2f}")
+        return "; ".join(f"{name}: {', '.join(each)}" for name, each in words.items())
+
+    def statistics(self) -> dict[str, float]:
+        wrong, baseline = self._squares.tolist()
+        certainty = float(probabilities(self._logits, self._readings)[0].max(axis=1).mean()) if self._logits else np.nan
+        return {
+            "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
+            "transfer/prior_trust": float(self._trust.mean()),
+            "transfer/prior_doubted": float(self._outcomes.doubted),
+            "transfer/mapping_probability": certainty,
+            "transfer/steps_to_find_mapping": self._steps_to_find,
+            "transfer/fits": self._n_fits,
+            "transfer/fit_seconds": self._seconds,
+            "transfer/target_transitions": self._n_observed,
+        }
+
+    # -------------------------------------------------------------------- saving
+
+    def arguments(self) -> dict[str, Any]:
+        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        return super().arguments() if self.task is None else {**super().arguments(), "source": self._source}
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        logits = self._shape if self._logits is None else self._logits
+        figures = self._n_observed, self._n_fits, self._version, self._steps_to_find, self._fit_due, *self._squares
+        return {
+            "transitions": np.column_stack([self._transitions.rows(), np.array(self._ended, dtype=np.float64)]),
+            "soft_state_logits": logits.state.ravel().copy(),
+            "soft_action_logits": logits.action.ravel().copy(),
+            "soft_trust": self._trust.copy(),
+            "soft_explains": self._explains.ravel().astype(np.float64),
+            "soft_outcomes": self._outcomes.get_state(),
+            "soft_figures": np.array(figures, dtype=np.float64),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        assert self.task is not None
+        d, n_actions = self.task.n_variables, self.task.n_actions
+        for *row, ended in state["transitions"].tolist():
+            action = int(np.clip(row[-1], 0, n_actions - 1))
+            self._transitions.add(np.array(row[:d]), action, row[-2], np.array(row[d : 2 * d]))
+            self._ended.append(int(ended))
+        *counts, self._fit_due, wrong, baseline = state["soft_figures"].tolist()
+        self._n_observed, self._n_fits, self._version, self._steps_to_find = (int(count) for count in counts)
+        self._squares = np.array([wrong, baseline])
+        if self._n_fits:
+            given = state["soft_state_logits"], state["soft_action_logits"]
+            self._use(Logits(*(array.reshape(like.shape).copy() for array, like in zip(given, self._shape, strict=True))))
+        self._trust = state["soft_trust"].copy()
+        self._explains = state["soft_explains"].reshape(n_actions, d) > 0.5
+        self._outcomes.set_state(state["soft_outcomes"])
+        self._claims = self._outcomes.doubted, self._ends_believed

@@ -1,0 +1,225 @@
+"""Stochastic mappings of target states to source states, with continuous parameters that are fitted by gradient descent."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from math import perm
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+# Logits have a normal prior of this standard deviation: a few transitions do not make anything certain.
+LOGIT_DEVIATION = 3.0
+N_STEPS, STEP_SIZE = 200, 0.1
+NOTHING = -1
+
+
+class Readings(NamedTuple):
+    """
+    The deterministic mappings of target to source states that a stochastic mapping is a mixture of.
+
+    In each, every source variable reads a target variable of its own, as it is or mirrored, in unit coordinates. Where the
+    source has more variables than the target, the others read nothing, and stand at their mean in the source's instances.
+
+    :param variable: int64, shape (n_mappings, n_source_variables): target variable that is read, -1 for none
+    :param sign: float64, same shape: -1 where it is mirrored
+    :param number: int64, same shape: column of the logits; of a mirrored variable, n_target_variables further on
+    """
+
+    variable: np.ndarray
+    sign: np.ndarray
+    number: np.ndarray
+
+
+def count_mappings(n_source: int, n_target: int, mirrored: bool) -> int:
+    """Return how many mappings :func:`all_readings` lists."""
+    n_read = min(n_source, n_target)
+    return perm(max(n_source, n_target), n_read) * (2**n_read if mirrored else 1)
+
+
+def n_readings(n_source: int, n_target: int, mirrored: bool) -> int:
+    """Return how many things a source variable may read: the number of columns of its logits."""
+    return n_target * (2 if mirrored else 1) + (n_source > n_target)
+
+
+def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
+    """
+    List the deterministic mappings of states.
+
+    :param n_source: number of source variables; ``n_target``: of target variables
+    :param mirrored: whether target variables may be read mirrored
+    """
+    nothing = [NOTHING] * max(0, n_source - n_target)
+    orders = sorted(set(permutations([*range(n_target), *nothing], n_source)))
+    rows = []
+    for order in orders:
+        signs = product(*((1.0, -1.0) if mirrored and v != NOTHING else (1.0,) for v in order))
+        rows += [(order, sign) for sign in signs]
+    variable = np.array([order for order, _ in rows], dtype=np.int64)
+    sign = np.array([signs for _, signs in rows], dtype=np.float64)
+    number = np.where(sign < 0.0, variable + n_target, variable)
+    number[variable == NOTHING] = n_readings(n_source, n_target, mirrored) - 1
+    return Readings(variable, sign, number)
+
+
+def as_source(states: np.ndarray, variable: np.ndarray, sign: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """
+    Return target states as mappings have them in the source, unit coordinates.
+
+    :param states: of the target, shape (n, n_target_variables)
+    :param variable: shape (n, n_source_variables) or (n_source_variables,), as in :class:`Readings`; ``sign``: the same
+    :param mean: of the source's instances, shape (n_source_variables,), for variables that read nothing
+    :return: shape (n, n_source_variables)
+    """
+    variable, sign = (np.broadcast_to(array, (len(states), len(mean))) for array in (variable, sign))
+    read = np.take_along_axis(states, np.maximum(variable, 0), axis=1)
+    return np.where(variable == NOTHING, mean, np.where(sign < 0.0, 1.0 - read, read))
+
+
+def brought_back(effects: np.ndarray, variable: np.ndarray, sign: np.ndarray, n_target: int) -> np.ndarray:
+    """
+    Return effects of the source in target coordinates: each target variable moves as the source variable that reads it.
+
+    :param effects: unit coordinates of the source, shape (..., n_source_variables)
+    :param variable: same shape, or one that is broadcast to it; ``sign``: the same
+    :return: shape (..., n_target): 0 for variables that are not read
+    """
+    variable, sign = (np.broadcast_to(array, effects.shape) for array in (variable, sign))
+    found = np.zeros((*effects.shape[:-1], n_target))
+    for v in range(n_target):
+        found[..., v] = np.where(variable == v, sign * effects, 0.0).sum(axis=-1)
+    return found
+
+
+class Logits(NamedTuple):
+    """
+    Parameters of several stochastic mappings that together make up a target task, one for each copy of the source.
+
+    :param state: float64, shape (n_copies, n_source_variables, n_readings): softmax over what each source variable reads
+    :param action: float64, shape (n_copies, n_target_actions, n_source_actions): softmax over source actions
+    """
+
+    state: np.ndarray
+    action: np.ndarray
+
+
+def probabilities(logits: Logits, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the mixture that the parameters stand for.
+
+    A mapping's probability is the product of those of its source variables' readings, normalised over the mappings listed: a
+    target variable is read once.
+
+    :return: of each deterministic mapping, shape (n_copies, n_mappings); of each source action, as ``logits.action``
+    """
+    state, action = _log_probabilities(th.from_numpy(logits.state), th.from_numpy(logits.action), readings.number)
+    return state.exp().numpy(), action.exp().numpy()
+
+
+def _log_probabilities(state: th.Tensor, action: th.Tensor, number: np.ndarray) -> tuple[th.Tensor, th.Tensor]:
+    """Log-probabilities of mappings, shape (..., n_mappings), and of source actions; see :func:`probabilities`."""
+    each = [state[..., k, :][..., th.from_numpy(column)] for k, column in enumerate(number.T)]
+    return th.log_softmax(th.stack(each).sum(dim=0), dim=-1), th.log_softmax(action, dim=-1)
+
+
+class FitData(NamedTuple):
+    """
+    Target transitions, and what every deterministic mapping predicts of them.
+
+    :param predicted: float64, shape (n, n_mappings, n_source_actions, n_target_variables): effects, target coordinates
+    :param action: int64, shape (n,)
+    :param effect: float64, shape (n, n_target_variables)
+    :param scale: float64, shape (n_target_variables,), above 0: errors are measured in it
+    """
+
+    predicted: np.ndarray
+    action: np.ndarray
+    effect: np.ndarray
+    scale: np.ndarray
+
+
+def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData) -> th.Tensor:
+    """
+    Compute the error of mixtures, to be minimised; differentiable.
+
+    Of a transition, the sum over variables of sqrt(1 + (error / scale)^2) - 1: like a squared error where errors are small, so
+    that the mean is fitted, but a few large effects, such as those of a car that hits the wall, do not decide alone. Added is
+    the negative logarithm of the logits' normal prior.
+
+    :param state: logits of ``n_starts`` sets of parameters, shape (n_starts, *logits.state.shape); ``action``: the same
+    :return: shape (n_starts,)
+    """
+    of_mapping, of_action = (each.exp() for each in _log_probabilities(state, action, readings.number))
+    n, m, b, d = data.predicted.shape
+    by_mapping = th.from_numpy(np.ascontiguousarray(data.predicted.transpose(0, 2, 3, 1)).reshape(n * b * d, m))
+    s, c = of_mapping.shape[:2]
+    mixed = (by_mapping @ of_mapping.reshape(s * c, m).T).reshape(n, b, d, s, c)
+    chosen = of_action[:, :, th.from_numpy(data.action)]
+    mean = th.einsum("nbdsc,scnb->snd", mixed, chosen)
+    error = (mean - th.from_numpy(data.effect)) / th.from_numpy(data.scale)
+    squares = (state**2).sum(dim=(1, 2, 3)) + (action**2).sum(dim=(1, 2, 3))
+    return (th.sqrt(1.0 + error**2) - 1.0).sum(dim=(1, 2)) + squares / (2.0 * LOGIT_DEVIATION**2)
+
+
+def fit(before: Logits | None, shape: Logits, readings: Readings, data: FitData, n_starts: int, seed: int) -> Logits:
+    """
+    Fit the parameters by gradient descent (Adam) from several starts; the best are returned.
+
+    :param before: parameters to start from as well, those of the last fit
+    :param shape: any parameters of the shapes wanted
+    :param n_starts: random starts
+    :param seed: of the random starts, the only random numbers here
+    """
+    generator = th.Generator().manual_seed(seed)
+    starts = []
+    for k, like in enumerate(shape):
+        drawn = th.randn((n_starts, *like.shape), generator=generator, dtype=th.float64)
+        kept = [] if before is None else [th.from_numpy(before[k].copy())[None]]
+        starts.append(th.cat([*kept, drawn]).requires_grad_())
+    optimizer = th.optim.Adam(starts, lr=STEP_SIZE)
+    for _ in range(N_STEPS):
+        optimizer.zero_grad()
+        loss(starts[0], starts[1], readings, data).sum().backward()
+        optimizer.step()
+    with th.no_grad():
+        best = int(loss(starts[0], starts[1], readings, data).argmin())
+    return Logits(*(found[best].detach().numpy().copy() for found in starts))
+
+
+class Terms(NamedTuple):
+    """
+    The most probable parts of the mixture, listed by target action and copy.
+
+    :param first: int64, shape (n_target_actions + 1,): those of action a are ``first[a]`` to ``first[a + 1]``
+    :param copy: int64, shape (n_terms,)
+    :param mapping: int64, same shape: row of :class:`Readings`; ``action``: the same, source action
+    :param share: float64, same shape: probability; those of a copy under an action add up to 1
+    """
+
+    first: np.ndarray
+    copy: np.ndarray
+    mapping: np.ndarray
+    action: np.ndarray
+    share: np.ndarray
+
+
+def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int, mass: float) -> Terms:
+    """
+    List the parts of the mixture by falling probability, until they have ``mass`` together or are ``max_terms``.
+
+    :param of_mapping: shape (n_copies, n_mappings); ``of_action``: shape (n_copies, n_target_actions, n_source_actions)
+    :param max_terms: of one copy under one action
+    """
+    first, rows = [0], []
+    for a in range(of_action.shape[1]):
+        for c, (mappings, actions) in enumerate(zip(of_mapping, of_action[:, a], strict=True)):
+            joint = np.outer(mappings, actions)
+            order = np.argsort(-joint, axis=None, kind="stable")[:max_terms]
+            share = joint.ravel()[order]
+            n = 1 + int(np.searchsorted(np.cumsum(share), mass))
+            share = share[:n] / share[:n].sum()
+            rows += [(c, *np.unravel_index(i, joint.shape), p) for i, p in zip(order[:n], share, strict=True)]
+        first.append(len(rows))
+    copy, mapping, action = (np.array([row[k] for row in rows], dtype=np.int64) for k in range(3))
+    return Terms(np.array(first, dtype=np.int64), copy, mapping, action, np.array([row[3] for row in rows]))

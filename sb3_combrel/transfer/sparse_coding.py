@@ -1,0 +1,181 @@
+"""A mapping between tasks by sparse coding of random samples, and Gaussian process regression (Ammar et al. 2012)."""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.transfer.candidates import SourceLike
+from sb3_combrel.transfer.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
+
+N_ITERATIONS = 30
+# Noise of the standardised target triplets, as a variance, that the regression starts from.
+FIRST_NOISE = 0.1
+
+
+class Codes(NamedTuple):
+    """
+    Both samples as sparse codes over one dictionary.
+
+    :param source: float64, shape (n_source_samples, n_atoms); ``target``: the same for the target's
+    :param dictionary: shape (n_atoms, n_target_columns)
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+    dictionary: np.ndarray
+
+
+def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity: float, seed: int) -> Codes:
+    """
+    Code the triplets of both tasks over one dictionary.
+
+    The source's are coded first over as many atoms as the target's triplets have columns, so that both have the same number
+    of columns; a larger dictionary is then learned for these codes, over which the target's triplets are coded as well.
+
+    :param source: standardised triplets, one a row; ``target``: the same
+    :param n_atoms: of the larger dictionary
+    :param sparsity: weight of the codes' absolute values beside half the squared error
+    :param seed: of the dictionaries' first atoms
+    """
+    from sklearn.decomposition import DictionaryLearning, sparse_encode
+    from sklearn.exceptions import ConvergenceWarning
+
+    def learn(rows: np.ndarray, n: int) -> np.ndarray:
+        learner = DictionaryLearning(n, alpha=sparsity, max_iter=N_ITERATIONS, fit_algorithm="cd", random_state=seed)
+        return np.asarray(learner.fit(rows).components_)
+
+    def encode(rows: np.ndarray, dictionary: np.ndarray) -> np.ndarray:
+        return np.asarray(sparse_encode(rows, dictionary, algorithm="lasso_cd", alpha=sparsity, max_iter=10_000))
+
+    with warnings.catch_warnings():
+        # The dictionaries need not be the best there are.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        first = encode(source, learn(source, target.shape[1]))
+        first = Standard.of(first).to(first)
+        dictionary = learn(first, n_atoms)
+        return Codes(encode(first, dictionary), encode(target, dictionary), dictionary)
+
+
+def nearest_pairs(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the row of ``target`` that is nearest to each row of ``source``, int64, shape (n_source_rows,)."""
+    return np.asarray(cKDTree(target).query(source)[1], dtype=np.int64)
+
+
+class Regression:
+    """
+    Gaussian process regression from standardised source triplets to target triplets, all columns with one kernel.
+
+    :param source: shape (n, n_source_columns); ``target``: shape (n, n_target_columns)
+    :param seed: of the regression's optimiser
+    """
+
+    def __init__(self, source: np.ndarray, target: np.ndarray, seed: int):
+        from sklearn.exceptions import ConvergenceWarning
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+        noise = WhiteKernel(FIRST_NOISE, (1e-6, 1e1))
+        kernel = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.sqrt(source.shape[1]), (1e-1, 1e3)) + noise
+        self._regressor = GaussianProcessRegressor(kernel, random_state=seed)
+        with warnings.catch_warnings():
+            # A noise or a length at its bound is what it is.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            self._regressor.fit(source, target)
+        #: Mean squared error on the pairs that it was fitted to; 1 is that of the mean of standardised columns.
+        self.error = float(((self.predict(source) - target) ** 2).mean())
+
+    def predict(self, source: np.ndarray) -> np.ndarray:
+        """Return the mean for source triplets, shape (n, n_target_columns)."""
+        return np.asarray(self._regressor.predict(source)).reshape(len(source), -1)
+
+
+class SparseCodingMapping(LearnedTranslation):
+    """
+    Pairs random transitions of both tasks by their sparse codes, and transfers all source data by regression on the pairs.
+
+    Paper: Ammar, Tuyls, Taylor, Driessens & Weiss, "Reinforcement learning transfer via sparse coding" (AAMAS 2012). Source
+    triplets (state, action, next state) are coded over a dictionary with as many atoms as a target triplet has columns. A
+    second, larger dictionary is learned for these codes; the target's triplets are coded over it too. Each source triplet is
+    paired with the target triplet whose code is nearest; a Gaussian process learns the mapping from these pairs, and carries
+    all source data over to the target. Nothing is learned about the mapping afterwards.
+
+    What was changed. Triplets are of unit coordinates, with the effect in place of the next state, which beside its state
+    says little, and with one column for each action in place of its number; all columns are standardised, the first codes too.
+    The regression is an exact Gaussian process, on at most ``n_source_samples`` pairs, not a sparse one. Translated data are
+    instances that join the target's own, nearest first, instead of what fitted Q-iteration or LSPI starts from. Rewards and
+    ends are the source's.
+
+    What to expect. The atoms of the first dictionary come in any order and with any sign, and are compared with the columns of
+    the target's triplets one by one: nothing in the method makes pairs correspond, and the regression fits whatever pairs it
+    is given. ``transfer/prediction_error`` says how well the instances that were used then predicted the target.
+
+    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
+
+    :param source: source instances, or a path to them
+    :param n_random_steps: steps of the target that its sample takes
+    :param n_source_samples: source instances that pairs are made of, at most
+    :param n_atoms: atoms of the second dictionary; None: twice the columns of a target triplet
+    :param sparsity: weight of the codes' absolute values beside half the squared error
+    :param breadth: kernel breadth of transferred instances, unit coordinates of the target
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param transfer_terminals: whether a source instance that ended its episode ends the target's
+    :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
+    """
+
+    def __init__(
+        self,
+        source: SourceLike,
+        *,
+        n_random_steps: int = 200,
+        n_source_samples: int = 300,
+        n_atoms: int | None = None,
+        sparsity: float = 0.1,
+        breadth: float = DEFAULT_BREADTH,
+        breadth_decay: float = DEFAULT_BREADTH_DECAY,
+        transfer_terminals: bool = True,
+    ):
+        super().__init__(
+            source,
+            n_random_steps=n_random_steps,
+            n_source_samples=n_source_samples,
+            breadth=breadth,
+            breadth_decay=breadth_decay,
+            transfer_terminals=transfer_terminals,
+        )
+        check_count("n_atoms", n_atoms, none_allowed=True)
+        check_positive("sparsity", sparsity)
+        self.n_atoms = n_atoms
+        self.sparsity = sparsity
+        self.regression_error = np.nan
+
+    def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
+        assert self.task is not None
+        n_target, n_source = self.task.n_actions, self._source.n_actions
+        seed = int(self.rng.integers(2**31))
+        source_columns, target_columns = source.columns(n_source), target.columns(n_target)
+        of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
+        from_rows, to_rows = of_source.to(source_columns), of_target.to(target_columns)
+        n_atoms = 2 * to_rows.shape[1] if self.n_atoms is None else self.n_atoms
+        codes = sparse_codes(from_rows, to_rows, n_atoms, self.sparsity, seed)
+        regression = Regression(from_rows, to_rows[nearest_pairs(codes.source, codes.target)], seed)
+        self.regression_error = regression.error
+        found = regression.predict(of_source.to(instances.columns(n_source)))
+        return Triplets.of_columns(of_target.back(found), n_target)
+
+    def statistics(self) -> dict[str, float]:
+        return {**super().statistics(), "transfer/regression_error": self.regression_error}
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        error = np.nan_to_num(self.regression_error, nan=-1.0)
+        return {**super().get_state(), "regression_error": np.array([error])}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        super().set_state(state)
+        error = float(state["regression_error"][0])
+        self.regression_error = error if error >= 0.0 else np.nan
