@@ -8,6 +8,7 @@ from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
 from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
+from sb3_combrel.tensorboard.explain import explain
 from sb3_combrel.transfer.combrel import COMBREL
 from sb3_combrel.transfer.timbrel import TIMBREL
 
@@ -16,4 +17,13 @@ keep_old_names()
 register_fitted_rmax(FittedRMax)
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["COMBREL", "TIMBREL", "FactoredMapping", "FittedRMax", "InterTaskMapping", "MappingSet", "SourceInstances"]
+__all__ = [
+    "COMBREL",
+    "TIMBREL",
+    "FactoredMapping",
+    "FittedRMax",
+    "InterTaskMapping",
+    "MappingSet",
+    "SourceInstances",
+    "explain",
+]

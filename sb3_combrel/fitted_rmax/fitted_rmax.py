@@ -85,7 +85,7 @@ class FittedRMax(PersistentAlgorithm):
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", which means the same); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
     :param transfer: a transfer method, such as ``COMBREL(source)``; or a dict, as in RL-Zoo's YAML files, from the
-        method's name to its arguments. A copy of it is used.
+        method's name to its arguments. A copy of it is used, which is ``model.transfer`` from then on, with its results
     :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: with ``degree=1`` 0.15 for one
         or two state variables, 0.25 for three, 0.4 for four or five, 0.5 for more; with ``degree=0`` 0.09, 0.15 and 0.2. With
         a smaller one the model is more exact and more is explored.
@@ -202,6 +202,7 @@ class FittedRMax(PersistentAlgorithm):
         self.max_model_steps = max_model_steps
         self.periodic = periodic
         self._warned_of_max_value = False
+        self._names: dict[str, Any] = {}
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
             self._setup_model()
@@ -211,6 +212,8 @@ class FittedRMax(PersistentAlgorithm):
         self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             refuse_normalized_observations(self.env)
+            # Saved with the model, for one that is loaded without an environment.
+            self._names = names_of(self.env)
         if self.periodic is None:
             self.periodic = periodic_of(self.env)
         if self.seed is None:
@@ -227,9 +230,11 @@ class FittedRMax(PersistentAlgorithm):
             transfer=make_transfer(self.transfer),
             rng=self._rng,
             **{name: getattr(self, name) for name in FittedRMaxSettings.names()},
-            **{**names_of(self.env), **self.policy_kwargs},
+            **{**self._names, **self.policy_kwargs},
         )
         self.policy = self.policy.to(self.device)
+        # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
+        self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
         self._progress = ProgressWatch(self.max_value, self.gamma, self.planning_tolerance)
         if self.verbose >= 1:

@@ -222,9 +222,7 @@ class MappingSet:
         constructors = {"injective": cls.injective, "surjective": cls.surjective, "all": cls.all, "balanced": cls.balanced}
         unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
         if unsigned not in constructors:
-            names = [*constructors, *(f"signed_{each}" for each in constructors), "paper_mountain_car", "paper_icub"]
-            factored = 'with use="prior" also factored, signed_factored'
-            raise ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
+            raise _unknown_set(name)
         numbers = (n_source_variables, n_target_variables, n_source_actions, n_target_actions)
         return constructors[unsigned](*numbers, signs=signs or unsigned != name)
 
@@ -369,6 +367,25 @@ class MappingSet:
     def _check_action(self, action: int) -> None:
         if not 0 <= action < self.n_target_actions:
             raise ValueError(f"action must be a target action from 0 to {self.n_target_actions - 1}, got {action}")
+
+
+_SETS = ("injective", "surjective", "all", "balanced")
+_OTHER_SETS = ("paper_mountain_car", "paper_icub")
+_FACTORED_SETS = ("factored", "signed_factored")
+
+
+def check_set_name(name: str) -> None:
+    """
+    :raises ValueError: if there is no set of that name
+    """
+    if name.removeprefix("signed_") not in _SETS and name not in (*_OTHER_SETS, *_FACTORED_SETS):
+        raise _unknown_set(name)
+
+
+def _unknown_set(name: object) -> ValueError:
+    names = [*_SETS, *(f"signed_{each}" for each in _SETS), *_OTHER_SETS]
+    factored = f'with use="prior" also {", ".join(_FACTORED_SETS)}'
+    return ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
 
 
 def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:

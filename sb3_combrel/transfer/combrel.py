@@ -61,7 +61,10 @@ class COMBREL(MappingTransfer):
     target's own instances is said in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs
     ``FittedRMax(degree=1)``.
 
-    :param source: source instances, a path to them, or a list of several, among which is selected as well
+    :param source: source instances, a path to them, or a list of several, among which is selected as well; or the id of an
+        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first needed
+        and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
+        :func:`~sb3_combrel.sources.recipes.find_source`
     :param mappings: None: "factored" with ``use="prior"``, "injective" with "instances"; or a set. "injective" (each source
         variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
         "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
