@@ -1,6 +1,7 @@
 """Fitted R-Max for Stable-Baselines3, with transfer between tasks that have other states and other actions."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sb3_combrel._moved import keep_old_names
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
@@ -11,6 +12,9 @@ from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.tensorboard.explain import explain
 from sb3_combrel.transfer.combrel import COMBREL
 from sb3_combrel.transfer.timbrel import TIMBREL
+
+if TYPE_CHECKING:
+    from sb3_combrel.experiments.compare import compare
 
 FittedRMax.default_callbacks.append(with_dashboard)
 keep_old_names()
@@ -25,5 +29,15 @@ __all__ = [
     "InterTaskMapping",
     "MappingSet",
     "SourceInstances",
+    "compare",
     "explain",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # Statistics take a moment to import, and only who compares needs them.
+    if name == "compare":
+        from sb3_combrel.experiments.compare import compare
+
+        return compare
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -78,6 +78,12 @@ class FittedRMax(PersistentAlgorithm):
     model from transferred instances; ``deterministic=False`` takes the optimistic ones first, as in learning. Pass the state
     that it returns to the next call, as ``evaluate_policy`` does: the policy then notices when it is caught in a loop.
 
+    ::
+
+        model = FittedRMax("MountainCar-v0", seed=0).learn(total_timesteps=5_000)
+        model.save("car")
+        action, state = model.predict(np.array([-0.5, 0.0]), deterministic=True)
+
     Cost: a step's time is about linear in the number of instances near the state, and linear, with a small factor, in the
     number of all instances (one box is compared for every 8 of them). Memory is about 400 bytes for an instance, and about
     800 bytes for a known state-action pair of the grid. Both are bounded, by ``max_instances`` and by the grid.

@@ -25,6 +25,13 @@ class FactoredMapping:
     A copy may leave out source variables. The source is then seen through the others alone: it is fitted to them, over all
     that its instances have in those that are left out.
 
+    ::
+
+        # Target states are (x, y, vx, vy), source states (x, v); source actions are Neutral, Left, Right.
+        along_x = InterTaskMapping(state=(0, None, 1, None), action=(0, 1, 2, 0, 0))
+        along_y = InterTaskMapping(state=(None, 0, None, 1), action=(0, 0, 0, 1, 2))
+        transfer = TIMBREL(source, FactoredMapping([along_x, along_y]), use="prior")
+
     :param copies: inter-task mappings, or dicts of their arguments as in a YAML file
     :raises ValueError: if there is no copy, if copies differ in their numbers of target variables or actions, or if two have
         a target variable in common

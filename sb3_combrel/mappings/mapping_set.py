@@ -31,6 +31,11 @@ class MappingSet:
     Only the two factors are stored. Without ``pairs``, mapping number i is the pair of state mapping
     ``i // n_action_mappings`` and action mapping ``i % n_action_mappings``; it is built when it is asked for.
 
+    ::
+
+        mappings = MappingSet.injective(n_source_variables=2, n_target_variables=4, n_source_actions=3, n_target_actions=5)
+        print(len(mappings), mappings[0])  # 2916 InterTaskMapping(...)
+
     :param state_mappings: one state mapping a row, shape (n_state_mappings, n_target_variables); the source variable of
         each target variable, -1 for None
     :param actions: action mappings: one a row, shape (n_action_mappings, n_target_actions), or an ``ActionMappings``

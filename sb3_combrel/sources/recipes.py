@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_combrel.sources.source_instances import SourceInstances
 
@@ -32,7 +33,7 @@ def check_source(source: Any) -> None:
     if isinstance(source, SourceInstances):
         return
     if isinstance(source, str | os.PathLike):
-        if not _file_of(source) and not _is_task(str(source)):
+        if not _file_of(source) and task_spec(str(source)) is None:
             raise _nothing_there(source)
     elif isinstance(source, Mapping) and source:
         _check_recipe(source)
@@ -68,7 +69,7 @@ def find_source(source: Any) -> SourceInstances:
     file = _file_of(source)
     if file is not None:
         return SourceInstances.load(file)
-    if _is_task(str(source)):
+    if task_spec(str(source)) is not None:
         return learn_or_read({**DEFAULT_RECIPE, "env": str(source)})
     raise _nothing_there(source)
 
@@ -133,13 +134,17 @@ def _nothing_there(source: object) -> FileNotFoundError:
     )
 
 
-def _is_task(name: str) -> bool:
-    """Whether there is an environment of this id; a module before a colon is imported first, as by ``gymnasium.make``."""
+def task_spec(name: str) -> EnvSpec | None:
+    """
+    Find the environment of an id; a module before a colon is imported first, as by ``gymnasium.make``.
+
+    :param name: the id; those of this project need no import of ``combrel_envs``
+    :return: None if there is none
+    """
     module, _, env_id = f"combrel_envs:{name}".rpartition(":") if name.startswith("combrel/") else name.rpartition(":")
     try:
         if module:
             importlib.import_module(module)
-        gym.spec(env_id)
+        return gym.spec(env_id)
     except (gym.error.Error, ImportError, ValueError):
-        return False
-    return True
+        return None

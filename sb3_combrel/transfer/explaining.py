@@ -200,12 +200,13 @@ def _alternatives(prior: SourcePrior, choice: Choice) -> list[Choice]:
     if not prior.chooses:
         return []
     # What is in use cannot be chosen again.
-    compliance = prior.sums.compliance.copy()
+    measured = prior.measured_sums()
+    compliance = measured.compliance.copy()
     for a in range(len(choice.copies)):
         for copy, used in zip(choice.copies[a].tolist(), choice.actions[a].tolist(), strict=True):
             if copy >= 0 and used >= 0:
-                compliance[copy, a, used] = -prior.sums.n[a]
-    sums = prior.sums._replace(compliance=compliance)
+                compliance[copy, a, used] = -1.0 - measured.n[a]
+    sums = measured._replace(compliance=compliance)
     if prior.whole:
         return [prior.choose(sums)]
     other_actions, _ = best_actions(prior.copies, sums)
@@ -224,13 +225,13 @@ def _next_division(prior: SourcePrior) -> tuple[str, float]:
     assert prior.choice is not None
     if prior.whole or not prior.chooses or not prior.transitions.n:
         return "", np.nan
-    sample = _sample(prior)
+    sample, measured = _sample(prior), prior.measured_sums()
     everything = np.ones(len(sample.actions), dtype=np.bool_)
     best, name, error = -1.0, "", np.nan
     for copy in np.unique(prior.choice.copies[prior.choice.copies >= 0]).tolist():
-        compliance = prior.sums.compliance.copy()
+        compliance = measured.compliance.copy()
         compliance[copy] = 0.0
-        other = prior.choose(prior.sums._replace(compliance=compliance))
+        other = prior.choose(measured._replace(compliance=compliance))
         its_compliance, its_error = _fit(prior, other, sample).of(everything)
         if its_compliance > best:
             copies = dict.fromkeys(other.copies[other.copies >= 0].tolist())

@@ -147,7 +147,9 @@ class TransferReport:
             figures = tuple(_text(value) for value in (*compliances, each.error, each.next_best_error, each.trust))
             rows.append((each.target_action, each.mapping, *shares, *figures))
         kept = [column for column in zip(*rows, strict=True) if any(cell != "-" for cell in column[1:])]
-        lines = [_EXPLANATION, *_aligned(list(zip(*kept, strict=True)))]
+        shown = [column[0] for column in kept]
+        lines = [text for name, text in _EXPLANATIONS.items() if name in shown]
+        lines += _aligned(list(zip(*kept, strict=True)))
         lines += [f"Next best for {each.target_action}: {each.next_best}." for each in self.mappings if each.next_best]
         if np.isfinite(self.error):
             lines.append(f"Prediction error over all actions: {_text(self.error)} (no change: 1).")
@@ -183,10 +185,12 @@ class TransferReport:
 
 
 _FIGURES = ("compliance", "next best", "no change", "error", "next best's", "trust")
-_EXPLANATION = (
-    'Compliance: how well the mapping predicts the target\'s own transitions, 1 is exact; of the next best, and of "no change".\n'
-    'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.'
-)
+_EXPLANATIONS = {
+    "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and of "
+    '"no change".',
+    "error": 'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.',
+    "trust": "Trust: which part of the source's data counts as known.",
+}
 
 
 def _text(value: float) -> str:

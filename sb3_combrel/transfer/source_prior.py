@@ -334,13 +334,20 @@ class SourcePrior:
 
     # --------------------------------------------------------------- describing
 
+    def measured_sums(self) -> CopySums:
+        """The sums, with numbers of transitions of those that compliances have been added up of: later ones have none."""
+        number = np.arange(1, self.transitions.n + 1)
+        measured = (number <= ALL_MEASURED) | (number % MEASURED_LATER == 0)
+        actions = self.transitions.actions[: self.transitions.n][measured]
+        return self.sums._replace(n=np.bincount(actions, minlength=self.task.n_actions).astype(np.float64))
+
     def mean_compliance(self) -> np.ndarray:
         """Mean compliance of what each target action is made of, shape (n_target_actions,); NaN where nothing is chosen."""
-        found = np.full(self.task.n_actions, np.nan)
+        found, sums = np.full(self.task.n_actions, np.nan), self.measured_sums()
         for a in range(self.task.n_actions):
-            if self._choose is None or self.sums.n[a] == 0.0:
+            if self._choose is None or sums.n[a] == 0.0:
                 continue
-            means = [self.sums.compliance[copy, a, used] / self.sums.n[a] for copy, used in self._moved(a)]
+            means = [sums.compliance[copy, a, used] / sums.n[a] for copy, used in self._moved(a)]
             found[a] = np.prod(means) if means else np.nan
         return found
 
@@ -358,8 +365,8 @@ class SourcePrior:
 
     def describe(self) -> str:
         """Say what each target action is made of: "East: Right on (x, vx), Neutral on (y, vy); West: ..."."""
-        names = enumerate(self.task.action_names)
-        return "; ".join(f"{name}: {'nothing' if self.choice is None else self.describe_action(self.choice, a)}" for a, name in names)
+        choice, names = self.choice, enumerate(self.task.action_names)
+        return "; ".join(f"{name}: {'nothing' if choice is None else self.describe_action(choice, a)}" for a, name in names)
 
     def describe_action(self, choice: Choice, action: int) -> str:
         """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""

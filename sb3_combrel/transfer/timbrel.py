@@ -37,6 +37,12 @@ class TIMBREL(MappingTransfer):
     target's own instances are fitted to what it leaves over. What it claims to know without them is said in
     :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs ``FittedRMax(degree=1)``.
 
+    ::
+
+        right = {"Neutral": "Neutral", "West": "Left", "East": "Right", "South": "Neutral", "North": "Neutral"}
+        along_x = InterTaskMapping(state={"x": "x", "vx": "v"}, action=right)
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=TIMBREL(source, along_x), seed=0).learn(total_timesteps=5_000)
+
     :param source: source instances, a path to them, or a list of several; or the id of an
         environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first needed
         and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
