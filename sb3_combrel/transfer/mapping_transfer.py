@@ -312,8 +312,9 @@ class MappingTransfer(Transfer):
         :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
         """
         if self.use == "prior":
+            of_actions = self._prior.choices()
             assert self.task is not None
-            return np.repeat(self._prior.choices(), len(self.task.sample_states))
+            return np.repeat(of_actions, len(self.task.sample_states))
         return self._selector.choices()
 
     def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:

@@ -31,7 +31,8 @@ class MappingReport:
     :param share: fraction of this action's transfers that used this mapping
     :param n_mappings: number of mappings that were used for this action
     :param compliance: of this mapping; with ``use="instances"`` of what was chosen, averaged over states
-    :param next_best: the mapping of the highest compliance among the others, by name; "" for none
+    :param next_best: the mapping of the highest compliance among the others, by name; "" for none, and with
+        ``use="instances"``, where it may be another in each state
     :param next_best_compliance: its compliance
     :param no_change_compliance: compliance of the prediction that no variable changes
     :param error: prediction error of what was transferred
