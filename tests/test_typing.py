@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
-MORE = '''
+MORE = """
 from sb3_combrel import compare, explain
 
 found = explain(model, "explained")
@@ -18,7 +18,7 @@ by_name = InterTaskMapping(state={"x": "x"}, action={"East": "Right"}, sign={"x"
 result = compare("combrel/MountainCar4D-v0", {"none": None, "COMBREL": COMBREL("source.npz")}, seeds=[1, 2], steps=100)
 print(result.sentence, result.table)
 result.figure().savefig("curves.png")
-'''
+"""
 
 
 @pytest.mark.integration

@@ -234,8 +234,8 @@ def compare(
         Results do not depend on it.
     :param progress_bar: show how many runs are complete
     :return: learning curves, measures, p-values, table, figure and sentence
-    :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; after the runs if one was too
-        short for a single episode
+    :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short for
+        a single episode
     :raises FileNotFoundError: if a source does not exist
     :raises ~sb3_combrel.experiments.engine_jobs.JobError: if a run in another process failed
     """
@@ -253,9 +253,7 @@ def compare(
     for run in runs[:: len(numbers)]:
         _try_out(run)
     results = _carry_out(runs, n_jobs, progress_bar)
-    by_method = {
-        method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(methods)
-    }
+    by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(methods)}
     return _evaluate(by_method, baseline, threshold)
 
 
@@ -268,7 +266,9 @@ def carry_out(run: ComparedRun) -> RunResult:
         model.learn(run.steps, recorder, log_interval=None)
     episodes = recorder.episodes
     if len(episodes.steps) == 0:
-        raise ValueError(f"steps={run.steps} is too few: no episode ended in the run of {run.name}; take more, or a time limit")
+        raise ValueError(
+            f"steps={run.steps} is too few: no episode ended in the run of {run.name}; take more, or a time limit"
+        )
     report = None if model.transfer is None else model.transfer.report()
     return RunResult(tuple(map(float, episodes.returns)), tuple(map(float, episodes.steps)), report)
 
@@ -310,7 +310,9 @@ def _check_methods(methods: Any, baseline: Any) -> str:
     if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
         raise ValueError(f"methods must be a dict from names to transfer methods, got {methods!r}")
     if len(methods) < 2:
-        raise ValueError(f'methods must have at least two, such as {{"none": None, "COMBREL": COMBREL(source)}}, got {methods!r}')
+        raise ValueError(
+            f'methods must have at least two, such as {{"none": None, "COMBREL": COMBREL(source)}}, got {methods!r}'
+        )
     for name, transfer in methods.items():
         if not (transfer is None or isinstance(transfer, Transfer | dict | str)):
             raise ValueError(f"methods must be transfer methods or None for no transfer, got {transfer!r} for {name!r}")

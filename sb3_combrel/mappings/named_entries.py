@@ -71,7 +71,11 @@ def _number(argument: str, entry: Any, names: Sequence[str], task: str) -> Any:
     if list(names).count(entry) != 1:
         raise ValueError(
             f"{argument} must hold names of the {task}'s {_kind(argument)}, {', '.join(names)}, got {entry!r}"
-            + (", which is the name of several" if entry in names else "; a task that names none has s0, s1, ... and a0, a1, ...")
+            + (
+                ", which is the name of several"
+                if entry in names
+                else "; a task that names none has s0, s1, ... and a0, a1, ..."
+            )
         )
     return list(names).index(entry)
 

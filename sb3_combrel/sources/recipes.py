@@ -127,7 +127,7 @@ def _file_of(source: str | os.PathLike[str]) -> Path | None:
 
 
 def _nothing_there(source: object) -> FileNotFoundError:
-    file = Path(str(source)).with_suffix(".npz")
+    file = Path(str(source) or "source").with_suffix(".npz")
     return FileNotFoundError(
         f"there is no source file {source}, looked for in {Path.cwd()}, and no environment of that name; write one with "
         f"SourceInstances.record(...).save({str(file)!r}), or: sb3-combrel record combrel/MountainCar2D-v0 --output {file}"

@@ -48,7 +48,8 @@ def explain(
         model = _load(Path(model))
     if model.agent.transfer is None:
         raise ValueError(
-            "the model has no transfer method, so there is nothing to explain; one with: FittedRMax(env, transfer=COMBREL(source))"
+            "the model has no transfer method, so there is nothing to explain; "
+            "one that has: FittedRMax(env, transfer=COMBREL(source))"
         )
     if model.agent.model.n_instances == 0:
         raise ValueError("the model has not learned anything yet: call model.learn(total_timesteps) first")

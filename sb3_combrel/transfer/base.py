@@ -243,9 +243,10 @@ class Transfer(ABC):
         :raises NotBoundError: if results are asked for under ``name``, and the object is a description only
         """
         if self.task is None and not name.startswith("__"):
+            what = "" if name.startswith("_") else f" ({name})"
             raise NotBoundError(
-                f"{type(self).__name__} has no results{'' if name.startswith('_') else f' ({name})'}: an algorithm uses a copy of "
-                "this object; after model = FittedRMax(env, transfer=...).learn(), results are on that copy, model.transfer"
+                f"{type(self).__name__} has no results{what}: an algorithm uses a copy of this object; "
+                "after model = FittedRMax(env, transfer=...).learn(), results are on that copy, model.transfer"
             )
 
     def __repr__(self) -> str:

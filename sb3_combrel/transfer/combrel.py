@@ -68,8 +68,8 @@ class COMBREL(MappingTransfer):
         print(model.transfer.report())
 
     :param source: source instances, a path to them, or a list of several, among which is selected as well; or the id of an
-        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first needed
-        and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
+        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first
+        needed, and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
         :func:`~sb3_combrel.sources.recipes.find_source`
     :param mappings: None: "factored" with ``use="prior"``, "injective" with "instances"; or a set. "injective" (each source
         variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",

@@ -29,7 +29,7 @@ from sb3_combrel.transfer.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
-from sb3_combrel.transfer.report import NotBoundError, TransferReport
+from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.selectors import Ranges, Selector
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior

@@ -162,7 +162,7 @@ class TransferReport:
         if not self.n_compared:
             return "No prediction of the source has been compared with what happened." if self.mappings else ""
         lines = [
-            f"Compared on {self.n_compared:,} steps, the source was worse than \"no change\" on {self.n_worse:,} "
+            f'Compared on {self.n_compared:,} steps, the source was worse than "no change" on {self.n_worse:,} '
             f"({100 * self.n_worse / self.n_compared:.0f} %)."
         ]
         if self.contradictions:
@@ -187,8 +187,8 @@ class TransferReport:
 
 _FIGURES = ("compliance", "next best", "no change", "error", "next best's", "trust")
 _EXPLANATIONS = {
-    "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and of "
-    '"no change".',
+    "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and "
+    'of "no change".',
     "error": 'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.',
     "trust": "Trust: which part of the source's data counts as known.",
 }

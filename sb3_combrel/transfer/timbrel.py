@@ -44,8 +44,8 @@ class TIMBREL(MappingTransfer):
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=TIMBREL(source, along_x), seed=0).learn(total_timesteps=5_000)
 
     :param source: source instances, a path to them, or a list of several; or the id of an
-        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first needed
-        and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
+        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first
+        needed, and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
         :func:`~sb3_combrel.sources.recipes.find_source`
     :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of
         ``mappings`` drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever

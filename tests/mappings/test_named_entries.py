@@ -64,7 +64,10 @@ def test_a_mirrored_variable_is_named():
     ("change", "message"),
     [
         ({"state": ("z", None, "v", None)}, "state must hold names of the source's variables, x, v, got 'z'"),
-        ({"state": {"z": "x"}}, "state must hold names of the target's variables, x, y, vx, vy, got 'z'; a task that names none"),
+        (
+            {"state": {"z": "x"}},
+            "state must hold names of the target's variables, x, y, vx, vy, got 'z'; a task that names none",
+        ),
         ({"state": {"x": "x", 0: "v"}}, "state must have each of the target's variables once, got"),
         ({"state": {7: "x"}}, "state must have keys from 0 to 3 or names, got 7"),
         ({"state": {"x": None}}, "state must map at least one target variable"),

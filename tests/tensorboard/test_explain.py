@@ -6,8 +6,8 @@ import io
 import numpy as np
 import pytest
 from helpers.dashboard import METHODS, NamedWalk, walker
-from matplotlib.image import imread
 from helpers.own_method import Mine
+from matplotlib.image import imread
 
 from sb3_combrel import FittedRMax, cli, explain
 from sb3_combrel.tensorboard import pictures
@@ -87,7 +87,7 @@ def test_what_cannot_be_explained_is_refused(saved, transfers, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no model file .*nowhere.zip, looked for in"):
         explain(tmp_path / "nowhere.zip")
     (tmp_path / "text.zip").write_text("mine")
-    with pytest.raises(ValueError, match="text.zip is damaged"):
+    with pytest.raises(ValueError, match=r"text.zip is damaged"):
         explain(tmp_path / "text.zip")
     with pytest.raises(ValueError, match=r"at must be 2 numbers, one a state variable, got \[1\]"):
         explain(saved[0], tmp_path, at=[1])

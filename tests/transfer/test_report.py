@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers import factored as f
 from helpers.dashboard import NamedWalk
+from helpers.own_method import Mine
 from helpers.walk import METHODS as ON_WALK
 from helpers.walk import Walk, small, walk_source
-from helpers.own_method import Mine
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
 from sb3_combrel.transfer.placed_errors import MIN_TRANSITIONS, N_PARTS, PlacedErrors
@@ -149,7 +149,9 @@ def test_errors_by_place_are_those_of_a_loop():
                     for s, b, e, p in rows
                     if a == b and (s[v] >= part / N_PARTS or part == 0) and (s[v] < (part + 1) / N_PARTS or last)
                 ]
-                missed, moved = (sum((x**2).sum() for x in each) for each in zip(*((e - p, e) for e, p in inside), strict=True))
+                missed, moved = (
+                    sum((x**2).sum() for x in each) for each in zip(*((e - p, e) for e, p in inside), strict=True)
+                )
                 if len(inside) >= MIN_TRANSITIONS and missed > moved:
                     expected.add((f"a{a}", f"s{v}", part / N_PARTS, len(inside), round(missed / moved, 9)))
     found = errors.contradictions()
@@ -252,11 +254,17 @@ def test_results_that_are_not_there_yet_are_refused_with_what_to_do(name):
         unbound.report()
     if name == "a user's own":
         return
-    for result in (unbound.mapping_counts, unbound.choices, unbound.statistics, unbound.describe_prior, lambda: unbound.sources):
+    for result in (
+        unbound.mapping_counts,
+        unbound.choices,
+        unbound.statistics,
+        unbound.describe_prior,
+        lambda: unbound.sources,
+    ):
         with pytest.raises(NotBoundError, match="has no results"):
             result()
     assert not hasattr(unbound, "sources")
-    with pytest.raises(ValueError, match="nothing to report before learning: call model.learn"):
+    with pytest.raises(ValueError, match=r"nothing to report before learning: call model.learn"):
         small(transfer=unbound).transfer.report()
 
 
