@@ -234,8 +234,8 @@ def compare(
         Results do not depend on it.
     :param progress_bar: show how many runs are complete
     :return: learning curves, measures, p-values, table, figure and sentence
-    :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short for
-        a single episode
+    :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short
+        for a single episode
     :raises FileNotFoundError: if a source does not exist
     :raises ~sb3_combrel.experiments.engine_jobs.JobError: if a run in another process failed
     """

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.tensorboard.plane import Plane, VariablePair, numbered, plane_through
 from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.report import TransferReport
@@ -34,8 +35,9 @@ def explain(
         print(report.mappings[0].target_action, report.mappings[0].compliance)
 
     :param model: the model, or the path of its file
-    :param output: a folder for pictures: V and policy over two state variables, and the source action that each target action
-        is mapped to; for a transfer method without mappings the former only. None: no pictures
+    :param output: a folder for the report, ``report.txt``, and the dashboard's pictures as PNG: V and policy over two state
+        variables, and the source action that each target action is mapped to; and its table of the mappings used most,
+        ``mappings.md``. A transfer method without mappings has the report and V only. None: nothing is written
     :param variables: pairs of state variables, by number or name, over which is drawn; None for the first two
     :param at: state (raw units) through which the pictures' plane goes; None for the middle of the state space
     :return: the report; ``print`` it, or read its fields
@@ -53,9 +55,13 @@ def explain(
         )
     if model.agent.model.n_instances == 0:
         raise ValueError("the model has not learned anything yet: call model.learn(total_timesteps) first")
-    report = model.agent.transfer.report()
+    transfer = model.agent.transfer
+    report = transfer.report()
     if output is not None:
         save_pictures(model, output, variables, at)
+        (Path(output) / "report.txt").write_text(f"{report}\n")
+        if isinstance(transfer, MappingTransfer):
+            (Path(output) / "mappings.md").write_text(f"{mapping_table(transfer, model.agent.task.action_names)}\n")
     return report
 
 

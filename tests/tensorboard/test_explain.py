@@ -11,7 +11,10 @@ from matplotlib.image import imread
 
 from sb3_combrel import FittedRMax, cli, explain
 from sb3_combrel.tensorboard import pictures
+from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.tensorboard.plane import plane_through
+
+TEXTS = ("mappings.md", "report.txt")
 
 
 def call(*args):
@@ -40,7 +43,9 @@ def test_every_method_is_explained_with_its_pictures(method, transfers, tmp_path
     assert str(explain(model, tmp_path / "new" / "folder")) == str(model.transfer.report())
     of_choice = ["source_action_place_height.png"] if method in ("TIMBREL", "COMBREL") else []
     written = sorted(path.name for path in (tmp_path / "new" / "folder").iterdir())
-    assert written == sorted([*of_choice, "value_and_policy_place_height.png"])
+    assert written == sorted([*of_choice, *TEXTS, "value_and_policy_place_height.png"])
+    table = (tmp_path / "new" / "folder" / "mappings.md").read_text()
+    assert table == f"{mapping_table(model.transfer, NamedWalk.action_names)}\n"
 
 
 def test_the_files_are_the_dashboards_pictures(saved, tmp_path):
@@ -52,7 +57,7 @@ def test_the_files_are_the_dashboards_pictures(saved, tmp_path):
         "value_and_policy_height_place.png": pictures.value_and_policy(agent, plane),
         "source_action_height_place.png": pictures.source_actions(agent, model.transfer, plane),
     }
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(drawn)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*drawn, *TEXTS])
     for name, pixels in drawn.items():
         np.testing.assert_allclose(imread(tmp_path / name)[..., :3], pixels / 255.0, atol=1 / 255)
 
@@ -75,7 +80,7 @@ def test_names_given_to_the_policy_come_before_those_of_the_environment(transfer
 def test_a_method_of_ones_own_has_a_report_and_a_picture(tmp_path):
     report = explain(walker(transfer=Mine()).learn(60), tmp_path)
     assert str(report).startswith("Mine()")
-    assert [path.name for path in tmp_path.iterdir()] == ["value_and_policy_place_height.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.txt", "value_and_policy_place_height.png"]
 
 
 def test_what_cannot_be_explained_is_refused(saved, transfers, tmp_path):
