@@ -117,8 +117,8 @@ def explain(model: Path, /, output: Path | None = None) -> None:
     Say what transfer did in a model: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
     :param model: file of a model that FittedRMax has saved
-    :param output: folder for the report, a table of mappings, and pictures of value, policy and mappings; by default the report
-        is printed only
+    :param output: folder for the report, a table of mappings, and pictures of value, policy and mappings; by default the
+        report is printed only
     """
     from sb3_combrel.tensorboard.explain import explain as run
 
