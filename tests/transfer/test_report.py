@@ -90,6 +90,7 @@ def test_the_compliance_in_logs_stays_when_no_more_transitions_are_recorded():
     np.testing.assert_array_equal(transfer._prior.mean_compliance(), before)
 
 
+@pytest.mark.filterwarnings("ignore:what was transferred")
 def test_where_the_target_contradicts_a_source_is_said_by_action_variable_and_raw_range():
     def turned(states, actions):
         # In the upper part of the first variable everything goes the other way.
