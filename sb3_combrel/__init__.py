@@ -1,6 +1,7 @@
 """Fitted R-Max for Stable-Baselines3, with transfer between tasks that have other states and other actions."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sb3_combrel._moved import keep_old_names
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
@@ -8,6 +9,7 @@ from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
 from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
+from sb3_combrel.tensorboard.explain import explain
 from sb3_combrel.transfer.combrel import COMBREL
 from sb3_combrel.transfer.experts import MappingExperts
 from sb3_combrel.transfer.master import MASTER
@@ -15,6 +17,9 @@ from sb3_combrel.transfer.soft_homomorphism import SoftHomomorphism
 from sb3_combrel.transfer.sparse_coding import SparseCodingMapping
 from sb3_combrel.transfer.three_way_rbm import ThreeWayRBM
 from sb3_combrel.transfer.timbrel import TIMBREL
+
+if TYPE_CHECKING:
+    from sb3_combrel.experiments.compare import compare
 
 FittedRMax.default_callbacks.append(with_dashboard)
 keep_old_names()
@@ -34,4 +39,15 @@ __all__ = [
     "SourceInstances",
     "SparseCodingMapping",
     "ThreeWayRBM",
+    "compare",
+    "explain",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # Statistics take a moment to import, and only who compares needs them.
+    if name == "compare":
+        from sb3_combrel.experiments.compare import compare
+
+        return compare
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -112,7 +112,24 @@ def reproduce(
     print("Written:", *made, sep="\n  ")
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record, "reproduce": reproduce}
+def explain(model: Path, /, output: Path | None = None) -> None:
+    """
+    Say what transfer did in a model: which mappings, how sure, what the target contradicted, how many steps rested on it.
+
+    :param model: file of a model that FittedRMax has saved
+    :param output: folder for the report, a table of mappings, and pictures of value, policy and mappings; by default the
+        report is printed only
+    """
+    from sb3_combrel.tensorboard.explain import explain as run
+
+    report = run(model, output)
+    print(report)
+    if output is not None:
+        names = ("*.png", "mappings.md", "report.txt")
+        print("\nWritten:", *(file for name in names for file in sorted(output.glob(name))), sep="\n  ")
+
+
+COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record, "reproduce": reproduce, "explain": explain}
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -36,13 +36,13 @@ class StateScaling:
     low: NDArray[np.float64]
     high: NDArray[np.float64]
 
-    def __post_init__(self) -> None:
+    def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
         # Copies that cannot be written to: a scaling is shared by the grid, the instances and the transfer method.
-        low, high = (_as_vector(name, getattr(self, name)) for name in ("low", "high"))
-        if low.shape != high.shape:
-            raise ValueError(f"low and high must have the same length, got {low.size} and {high.size} values")
-        _check_order(low, high, "low, high")
-        for name, vector in (("low", low), ("high", high)):
+        lowest, highest = _as_vector("low", low), _as_vector("high", high)
+        if lowest.shape != highest.shape:
+            raise ValueError(f"low and high must have the same length, got {lowest.size} and {highest.size} values")
+        _check_order(lowest, highest, "low, high")
+        for name, vector in (("low", lowest), ("high", highest)):
             vector.flags.writeable = False
             object.__setattr__(self, name, vector)
 

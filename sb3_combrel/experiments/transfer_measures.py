@@ -290,6 +290,7 @@ def compare_learning(
     n_last: int = 10,
     window: int = 5,
     floor: float | None = None,
+    n_steps: int | None = None,
     n_resamples: int = 2000,
     seed: int = 0,
 ) -> TransferMeasures:
@@ -314,13 +315,14 @@ def compare_learning(
     :param window: see :func:`time_to_threshold`
     :param floor: a return that no counted episode is below; None: the lowest return of any run of both, or 0 if none is
         negative, which is Taylor & Stone's definition
+    :param n_steps: environment steps that areas over steps are measured on; None: as many as the shortest run of both has
     :param n_resamples: draws of the bootstrap
     :param seed: of the bootstrap and of the permutation tests
     :raises ValueError: if a run is shorter than these ask for, or a return is below the floor
     """
     both = (with_transfer, without)
     n_episodes = min(int(curves.n_episodes.min()) for curves in both)
-    n_steps = min(int(curves.n_steps.min()) for curves in both)
+    n_steps = min(int(curves.n_steps.min()) for curves in both) if n_steps is None else n_steps
     floor = _checked_floor(floor, min(float(np.nanmin(curves.returns)) for curves in both))
     of_with, of_without = (
         measure_learning(

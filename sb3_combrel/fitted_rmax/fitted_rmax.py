@@ -78,6 +78,12 @@ class FittedRMax(PersistentAlgorithm):
     model from transferred instances; ``deterministic=False`` takes the optimistic ones first, as in learning. Pass the state
     that it returns to the next call, as ``evaluate_policy`` does: the policy then notices when it is caught in a loop.
 
+    ::
+
+        model = FittedRMax("MountainCar-v0", seed=0).learn(total_timesteps=5_000)
+        model.save("car")
+        action, state = model.predict(np.array([-0.5, 0.0]), deterministic=True)
+
     Cost: a step's time is about linear in the number of instances near the state, and linear, with a small factor, in the
     number of all instances (one box is compared for every 8 of them). Memory is about 400 bytes for an instance, and about
     800 bytes for a known state-action pair of the grid. Both are bounded, by ``max_instances`` and by the grid.
@@ -85,7 +91,7 @@ class FittedRMax(PersistentAlgorithm):
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", which means the same); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
     :param transfer: a transfer method, such as ``COMBREL(source)``; or a dict, as in RL-Zoo's YAML files, from the
-        method's name to its arguments. A copy of it is used.
+        method's name to its arguments. A copy of it is used, which is ``model.transfer`` from then on, with its results
     :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: with ``degree=1`` 0.15 for one
         or two state variables, 0.25 for three, 0.4 for four or five, 0.5 for more; with ``degree=0`` 0.09, 0.15 and 0.2. With
         a smaller one the model is more exact and more is explored.
@@ -202,6 +208,7 @@ class FittedRMax(PersistentAlgorithm):
         self.max_model_steps = max_model_steps
         self.periodic = periodic
         self._warned_of_max_value = False
+        self._names: dict[str, Any] = {}
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
             self._setup_model()
@@ -211,6 +218,8 @@ class FittedRMax(PersistentAlgorithm):
         self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             refuse_normalized_observations(self.env)
+            # Saved with the model, for one that is loaded without an environment.
+            self._names = names_of(self.env)
         if self.periodic is None:
             self.periodic = periodic_of(self.env)
         if self.seed is None:
@@ -227,9 +236,11 @@ class FittedRMax(PersistentAlgorithm):
             transfer=make_transfer(self.transfer),
             rng=self._rng,
             **{name: getattr(self, name) for name in FittedRMaxSettings.names()},
-            **{**names_of(self.env), **self.policy_kwargs},
+            **{**self._names, **self.policy_kwargs},
         )
         self.policy = self.policy.to(self.device)
+        # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
+        self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
         self._progress = ProgressWatch(self.max_value, self.gamma, self.planning_tolerance)
         if self.verbose >= 1:

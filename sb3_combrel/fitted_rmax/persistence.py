@@ -30,6 +30,7 @@ class PersistentAlgorithm(BaseAlgorithm):
     """What :class:`~sb3_combrel.FittedRMax` is, apart from learning: it can be saved, loaded, and given parameters."""
 
     policy: FittedRMaxPolicy  # type: ignore[assignment]
+    #: The transfer method in use, bound to the task; None if there is none.
     transfer: Any
     _rng: np.random.Generator
     _generator_state: dict[str, Any] | None

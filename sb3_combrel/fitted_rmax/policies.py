@@ -98,8 +98,8 @@ class FittedRMaxPolicy(BasePolicy):
         return attrgetter(path)(self.agent)
 
     @property
-    def transfer(self) -> Transfer | None:
-        """The transfer method, bound to the task; None if there is none."""
+    def transfer(self) -> Any:
+        """The transfer method, bound to the task; None if there is none. Which class it is, the user knows, not the type."""
         return self.agent.transfer
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -209,7 +209,7 @@ class FittedRMaxPolicy(BasePolicy):
         expected = self.agent.get_state()
         if self.agent.settings.degree == 0:
             # Version 0.1.0, which had the kernel average only, did not have them.
-            for name in {"visits", "transfer_check"} & expected.keys():
+            for name in {"visits", "transfer_check", "transfer_errors"} & expected.keys():
                 state_dict.setdefault(prefix + name, th.zeros(expected[name].shape, dtype=th.float64))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)

@@ -21,7 +21,7 @@ def names_of(env: VecEnv | None) -> dict[str, Any]:
             continue
         value = env.get_attr(name, 0)[0]
         if isinstance(value, Sequence) and len(value) == n and all(isinstance(each, str) for each in value):
-            found[name] = value
+            found[name] = list(value)
     return found
 
 

@@ -25,6 +25,13 @@ class FactoredMapping:
     A copy may leave out source variables. The source is then seen through the others alone: it is fitted to them, over all
     that its instances have in those that are left out.
 
+    ::
+
+        # Target states are (x, y, vx, vy), source states (x, v); source actions are Neutral, Left, Right.
+        along_x = InterTaskMapping(state=(0, None, 1, None), action=(0, 1, 2, 0, 0))
+        along_y = InterTaskMapping(state=(None, 0, None, 1), action=(0, 0, 0, 1, 2))
+        transfer = TIMBREL(source, FactoredMapping([along_x, along_y]), use="prior")
+
     :param copies: inter-task mappings, or dicts of their arguments as in a YAML file
     :raises ValueError: if there is no copy, if copies differ in their numbers of target variables or actions, or if two have
         a target variable in common
@@ -32,22 +39,20 @@ class FactoredMapping:
 
     copies: tuple[InterTaskMapping, ...]
 
-    def __post_init__(self) -> None:
-        if isinstance(self.copies, str | Mapping | InterTaskMapping) or not isinstance(self.copies, Iterable):
-            raise ValueError(f"copies must be a list of inter-task mappings, one a copy of the source, got {self.copies!r}")
-        copies = tuple(_copy(each) for each in self.copies)
-        if not copies:
+    def __init__(self, copies: Iterable[InterTaskMapping | Mapping[str, Any]]) -> None:
+        if isinstance(copies, str | Mapping | InterTaskMapping) or not isinstance(copies, Iterable):
+            raise ValueError(f"copies must be a list of inter-task mappings, one a copy of the source, got {copies!r}")
+        mappings = tuple(_copy(each) for each in copies)
+        if not mappings:
             raise ValueError("copies must hold at least one inter-task mapping, got none")
-        first = copies[0]
-        for each in copies:
-            if len(each.state) != len(first.state) or len(each.action) != len(first.action):
-                raise ValueError(
-                    f"copies must all have the same numbers of target variables and actions, got {first!r} and {each!r}"
-                )
-        shared = np.flatnonzero(np.sum([each.mapped for each in copies], axis=0) > 1)
-        if len(shared):
-            raise ValueError(f"copies must have no target variable in common, got variable {shared[0]} in two of {copies!r}")
-        object.__setattr__(self, "copies", tuple(sorted(copies, key=lambda each: int(each.mapped.argmax()))))
+        # Those that are given by name cannot be compared before both tasks are known: see ``with_names``.
+        named = any(each.has_names for each in mappings)
+        object.__setattr__(self, "copies", mappings if named else _disjoint(mappings))
+
+    @property
+    def has_names(self) -> bool:
+        """Whether there are names that have not been replaced by numbers yet."""
+        return any(each.has_names for each in self.copies)
 
     @property
     def n_target_variables(self) -> int:
@@ -80,7 +85,7 @@ class FactoredMapping:
         source_actions: Iterable[str],
         target_actions: Iterable[str],
     ) -> FactoredMapping:
-        """The same mapping with names for ``repr``; see :meth:`InterTaskMapping.with_names`."""
+        """The same mapping with names for ``repr``, and numbers for names; see :meth:`InterTaskMapping.with_names`."""
         names = tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions)
         return FactoredMapping(tuple(each.with_names(*names) for each in self.copies))
 
@@ -117,6 +122,20 @@ def describe_actions(target_actions: Sequence[str], moves: Sequence[tuple[str, S
         for a, name in enumerate(target_actions)
     )
     return "; ".join(lines)
+
+
+def _disjoint(copies: tuple[InterTaskMapping, ...]) -> tuple[InterTaskMapping, ...]:
+    """Copies by their first target variable, after a check that they fit together."""
+    first = copies[0]
+    for each in copies:
+        if len(each.state) != len(first.state) or len(each.action) != len(first.action):
+            raise ValueError(
+                f"copies must all have the same numbers of target variables and actions, got {first!r} and {each!r}"
+            )
+    shared = np.flatnonzero(np.sum([each.mapped for each in copies], axis=0) > 1)
+    if len(shared):
+        raise ValueError(f"copies must have no target variable in common, got variable {shared[0]} in two of {copies!r}")
+    return tuple(sorted(copies, key=lambda each: int(each.mapped.argmax())))
 
 
 def _copy(copy: InterTaskMapping | Mapping[str, Any]) -> InterTaskMapping:

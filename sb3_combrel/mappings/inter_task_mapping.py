@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import index as as_index
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.mappings.named_entries import Entries, as_entries, has_names, numbers
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,51 +40,92 @@ class InterTaskMapping:
     tasks may differ. A target variable that is mapped to None keeps the value of the current target state, and a
     translated instance predicts no change for it; distances are taken over the mapped variables only.
 
-    :param state: for each target variable the index of its source variable, or None
-    :param action: for each target action its source action
+    Variables and actions may also be given by name, or as a dict from those of the target to those of the source, without
+    the variables that are not mapped. Names stand for numbers as soon as both tasks are known: a transfer method finds out
+    when it is given to an algorithm, :meth:`with_names` at once::
+
+        along_x = InterTaskMapping(
+            state={"x": "x", "vx": "v"},
+            action={"Neutral": "Neutral", "West": "Left", "East": "Right", "South": "Neutral", "North": "Neutral"},
+        )
+
+    :param state: for each target variable the index or name of its source variable, or None; or a dict
+    :param action: for each target action its source action, by number or name; or a dict
     :param sign: for each target variable +1, or -1 to mirror it in its range (unit coordinate u becomes 1 - u and
-        displacements change sign); None for +1 throughout. The sign of an unmapped variable has no effect and is
-        stored as +1.
+        displacements change sign); None for +1 throughout; or a dict, without those that are +1. The sign of an unmapped
+        variable has no effect and is stored as +1.
     :param names: names for ``repr``; they play no part in comparisons, see :meth:`with_names`
-    :raises ValueError: if an entry is not of the kind above, if no variable is mapped, or if there is no action
+    :raises ValueError: if an entry is not of the kind above, if no variable is mapped, or if there is no action; where names
+        have not been replaced yet, if something is asked that needs their numbers
     """
 
+    # With names that have not been replaced yet these are what the user gave, dicts as pairs.
     state: tuple[int | None, ...]
     action: tuple[int, ...]
-    sign: tuple[int, ...] | None = None
+    sign: tuple[int, ...] | None
     names: MappingNames | None = field(default=None, compare=False, kw_only=True)
 
-    def __post_init__(self) -> None:
-        state = tuple(None if i is None else _index("state", i) for i in _entries("state", self.state))
-        if all(i is None for i in state):
-            raise ValueError(f"state must map at least one target variable to a source variable, got state={self.state!r}")
-        action = tuple(_index("action", a) for a in _entries("action", self.action))
-        if not action:
-            raise ValueError("action must hold one source action for each target action, got action=()")
-        object.__setattr__(self, "state", state)
-        object.__setattr__(self, "action", action)
-        object.__setattr__(self, "sign", _signs(self.sign, state))
-        if self.names is not None:
-            object.__setattr__(self, "names", _checked_names(self.names, state, action))
+    def __init__(
+        self,
+        state: Entries,
+        action: Entries,
+        sign: Sequence[int] | Mapping[Any, int] | None = None,
+        *,
+        names: MappingNames | None = None,
+    ) -> None:
+        given = as_entries("state", state), as_entries("action", action)
+        signs = None if sign is None else as_entries("sign", sign)
+        named = any(has_names(entries) for entries in (*given, signs or ()))
+        if named and names is not None:
+            groups = MappingNames(*(tuple(map(str, group)) for group in names))
+            given = (
+                numbers("state", given[0], groups.target_variables, groups.source_variables),
+                numbers("action", given[1], groups.target_actions, groups.source_actions),
+            )
+            signs = None if signs is None else numbers("sign", signs, groups.target_variables, (), default=1)
+        if not named or names is not None:
+            given, signs = _checked(*given), _signs(signs, _checked(*given)[0])
+            names = None if names is None else _checked_names(names, *given)
+        for name, value in {"state": given[0], "action": given[1], "sign": signs, "names": names}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def has_names(self) -> bool:
+        """Whether there are names that have not been replaced by numbers yet."""
+        return any(has_names(entries) for entries in (self.state, self.action, self.sign or ()))
+
+    def _check_numbers(self) -> None:
+        """
+        :raises ValueError: if there are names that have not been replaced by numbers yet
+        """
+        if self.has_names:
+            raise ValueError(
+                f"{self!r} has names, which stand for numbers only when both tasks are known: give it to a transfer method, "
+                "or call with_names(source_variables, target_variables, source_actions, target_actions) first"
+            )
 
     @property
     def n_target_variables(self) -> int:
         """Number of variables of the target task."""
+        self._check_numbers()
         return len(self.state)
 
     @property
     def n_target_actions(self) -> int:
         """Number of actions of the target task."""
+        self._check_numbers()
         return len(self.action)
 
     @property
     def state_index(self) -> Ints:
         """``state`` as an array for compiled loops, shape (n_target_variables,), -1 for None."""
+        self._check_numbers()
         return np.array([UNMAPPED if i is None else i for i in self.state], dtype=np.int64)
 
     @property
     def state_sign(self) -> Floats:
         """``sign`` as an array for compiled loops, shape (n_target_variables,)."""
+        self._check_numbers()
         return np.array(self.sign, dtype=np.float64)
 
     @property
@@ -146,10 +188,12 @@ class InterTaskMapping:
 
     def source_action(self, target_action: int) -> int:
         """The source action that a target action maps to."""
+        self._check_numbers()
         return self.action[target_action]
 
     def target_actions(self, source_action: int) -> Ints:
         """The target actions that map to a source action, ascending; a source instance is translated to each of them."""
+        self._check_numbers()
         return np.flatnonzero(np.array(self.action) == source_action).astype(np.int64)
 
     def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
@@ -158,6 +202,7 @@ class InterTaskMapping:
 
         :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
         """
+        self._check_numbers()
         _check_length("state", self.state, n_target_variables, "variables")
         _check_length("action", self.action, n_target_actions, "actions")
         _check_range("state", self.state, n_source_variables, "variables")
@@ -171,18 +216,21 @@ class InterTaskMapping:
         target_actions: Iterable[str],
     ) -> InterTaskMapping:
         """
-        The same mapping with names for ``repr``.
+        The same mapping with names for ``repr``; entries that were given by name are replaced by their numbers.
 
         :param source_variables: names of the source task's variables
         :param target_variables: names of the target task's variables
         :param source_actions: names of the source task's actions
         :param target_actions: names of the target task's actions
-        :raises ValueError: if there are fewer names than the mapping uses
+        :raises ValueError: if there are fewer names than the mapping uses, or it has a name that is none of these
         """
         names = MappingNames(tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions))
-        return replace(self, names=names)
+        return InterTaskMapping(self.state, self.action, self.sign, names=names)
 
     def __repr__(self) -> str:
+        if self.has_names:
+            parts = {"state": self.state, "action": self.action, **({} if self.sign is None else {"sign": self.sign})}
+            return f"InterTaskMapping({', '.join(f'{name}={_as_given(entries)!r}' for name, entries in parts.items())})"
         if self.names is None:
             mirrored = f", sign={self.sign}" if -1 in self.state_sign else ""
             return f"InterTaskMapping(state={self.state}, action={self.action}{mirrored})"
@@ -209,10 +257,20 @@ class InterTaskMapping:
         return array[..., np.maximum(self.state_index, 0)]
 
 
-def _entries(name: str, values: Sequence[int | None]) -> Sequence[int | None]:
-    if isinstance(values, str) or not isinstance(values, Sequence | np.ndarray):
-        raise ValueError(f"{name} must be a sequence with one entry for each target variable or action, got {values!r}")
-    return values
+def _checked(state: Sequence[Any], action: Sequence[Any]) -> tuple[tuple[int | None, ...], tuple[int, ...]]:
+    """Entries as integers."""
+    indices = tuple(None if i is None else _index("state", i) for i in state)
+    if all(i is None for i in indices):
+        raise ValueError(f"state must map at least one target variable to a source variable, got state={state!r}")
+    actions = tuple(_index("action", a) for a in action)
+    if not actions:
+        raise ValueError("action must hold one source action for each target action, got action=()")
+    return indices, actions
+
+
+def _as_given(entries: Sequence[Any]) -> Any:
+    """Pairs as a dict again."""
+    return dict(entries) if any(isinstance(each, tuple) for each in entries) else tuple(entries)
 
 
 def _index(name: str, value: object) -> int:
@@ -234,7 +292,7 @@ def _index(name: str, value: object) -> int:
 def _signs(sign: Sequence[int] | None, state: tuple[int | None, ...]) -> tuple[int, ...]:
     if sign is None:
         return (1,) * len(state)
-    entries = tuple(_entries("sign", sign))
+    entries = tuple(sign)
     if len(entries) != len(state):
         raise ValueError(f"sign must have {len(state)} entries, one for each entry of state={state}, got sign={sign!r}")
     if any(entry not in (1, -1) for entry in entries):

@@ -39,7 +39,7 @@ def distinct_parts(mappings: Sequence[InterTaskMapping]) -> DistinctParts:
     for mapping in mappings:
         if not isinstance(mapping, InterTaskMapping):
             raise ValueError(f"mappings must be InterTaskMapping objects, got {mapping!r}")
-        if len(mapping.state) != len(first.state) or len(mapping.action) != len(first.action):
+        if (mapping.n_target_variables, mapping.n_target_actions) != (first.n_target_variables, first.n_target_actions):
             raise ValueError(
                 f"mappings must all have the same numbers of target variables and actions, got {first!r} and {mapping!r}"
             )

@@ -31,6 +31,11 @@ class MappingSet:
     Only the two factors are stored. Without ``pairs``, mapping number i is the pair of state mapping
     ``i // n_action_mappings`` and action mapping ``i % n_action_mappings``; it is built when it is asked for.
 
+    ::
+
+        mappings = MappingSet.injective(n_source_variables=2, n_target_variables=4, n_source_actions=3, n_target_actions=5)
+        print(len(mappings), mappings[0])  # 2916 InterTaskMapping(...)
+
     :param state_mappings: one state mapping a row, shape (n_state_mappings, n_target_variables); the source variable of
         each target variable, -1 for None
     :param actions: action mappings: one a row, shape (n_action_mappings, n_target_actions), or an ``ActionMappings``
@@ -222,9 +227,7 @@ class MappingSet:
         constructors = {"injective": cls.injective, "surjective": cls.surjective, "all": cls.all, "balanced": cls.balanced}
         unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
         if unsigned not in constructors:
-            names = [*constructors, *(f"signed_{each}" for each in constructors), "paper_mountain_car", "paper_icub"]
-            factored = 'with use="prior" also factored, signed_factored'
-            raise ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
+            raise _unknown_set(name)
         numbers = (n_source_variables, n_target_variables, n_source_actions, n_target_actions)
         return constructors[unsigned](*numbers, signs=signs or unsigned != name)
 
@@ -369,6 +372,25 @@ class MappingSet:
     def _check_action(self, action: int) -> None:
         if not 0 <= action < self.n_target_actions:
             raise ValueError(f"action must be a target action from 0 to {self.n_target_actions - 1}, got {action}")
+
+
+_SETS = ("injective", "surjective", "all", "balanced")
+_OTHER_SETS = ("paper_mountain_car", "paper_icub")
+_FACTORED_SETS = ("factored", "signed_factored")
+
+
+def check_set_name(name: str) -> None:
+    """
+    :raises ValueError: if there is no set of that name
+    """
+    if name.removeprefix("signed_") not in _SETS and name not in (*_OTHER_SETS, *_FACTORED_SETS):
+        raise _unknown_set(name)
+
+
+def _unknown_set(name: object) -> ValueError:
+    names = [*_SETS, *(f"signed_{each}" for each in _SETS), *_OTHER_SETS]
+    factored = f'with use="prior" also {", ".join(_FACTORED_SETS)}'
+    return ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
 
 
 def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:

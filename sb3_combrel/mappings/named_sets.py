@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
-from sb3_combrel.mappings.mapping_set import MappingSet
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, MappingNames
+from sb3_combrel.mappings.mapping_set import MappingSet, check_set_name
+
+WHAT_THEY_MUST_BE = "mappings must be a name, an InterTaskMapping, a list of them or a MappingSet"
 
 
 def resolve(
@@ -40,7 +43,7 @@ def resolve(
     elif isinstance(mappings, Iterable):
         resolved = MappingSet.from_list([_mapping(mapping) for mapping in mappings])
     else:
-        raise ValueError(f"mappings must be a name, an InterTaskMapping, a list of them or a MappingSet, got {mappings!r}")
+        raise ValueError(f"{WHAT_THEY_MUST_BE}, got {mappings!r}")
     resolved.check(
         n_source_variables=n_source_variables,
         n_target_variables=n_target_variables,
@@ -58,3 +61,53 @@ def _mapping(mapping: InterTaskMapping | Mapping[str, Any]) -> InterTaskMapping:
     raise ValueError(
         f"each of the mappings must be an InterTaskMapping or a dict of state, action and (optional) sign, got {mapping!r}"
     )
+
+
+def check_mappings(mappings: Any) -> None:
+    """
+    Check as much of what a user gives as can be checked before the tasks are known.
+
+    :param mappings: see :func:`resolve`, or a factored mapping or a dict of its copies
+    :raises ValueError: for a set that does not exist, an empty list, or something else than mappings
+    """
+    if isinstance(mappings, str):
+        check_set_name(mappings)
+    elif isinstance(mappings, Mapping) and "copies" in mappings:
+        _factored(mappings)
+    elif isinstance(mappings, Mapping):
+        _mapping(mappings)
+    elif isinstance(mappings, Sequence):
+        if not mappings:
+            raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
+        for each in mappings:
+            _mapping(each)
+    elif not isinstance(mappings, InterTaskMapping | FactoredMapping | MappingSet | Iterable):
+        raise ValueError(f"{WHAT_THEY_MUST_BE}, got {mappings!r}")
+
+
+def with_numbers(mappings: Any, names: Sequence[MappingNames]) -> Any:
+    """
+    Replace names of variables and actions by their numbers.
+
+    :param mappings: see :func:`check_mappings`
+    :param names: of each source and the target
+    :return: mappings that were given by name, with numbers; anything else as it is
+    :raises ValueError: if a name is not that of one variable or action, or stands for different ones in several sources
+    """
+    if isinstance(mappings, Mapping):
+        made = _factored(mappings) if "copies" in mappings else _mapping(mappings)
+        return with_numbers(made, names) if made.has_names else mappings
+    if isinstance(mappings, list | tuple):
+        return [with_numbers(each, names) for each in mappings]
+    if not (isinstance(mappings, InterTaskMapping | FactoredMapping) and mappings.has_names):
+        return mappings
+    found = [mappings.with_names(*each) for each in names]
+    if any(each != found[0] for each in found):
+        raise ValueError(f"{mappings!r} means different variables or actions in each of the source tasks: give numbers")
+    return found[0]
+
+
+def _factored(mapping: Mapping[str, Any]) -> FactoredMapping:
+    if set(mapping) != {"copies"}:
+        raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
+    return FactoredMapping(**mapping)

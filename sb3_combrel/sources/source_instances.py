@@ -40,6 +40,12 @@ class SourceInstances:
     """
     Instances <s, a, r, s'> of a source task (Section 3), in raw units, and the spaces that they come from.
 
+    ::
+
+        source = SourceInstances.record(None, "MountainCar-v0", n_instances=500, seed=0)  # None: random actions
+        source.save("source.npz")
+        transfer = COMBREL("source.npz")
+
     The arrays cannot be written to: one source may serve several transfer methods.
 
     :param states: where each transition starts, raw units, shape (n_instances, n_variables)

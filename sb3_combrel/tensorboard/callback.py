@@ -17,11 +17,12 @@ from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.tensorboard import readings
+from sb3_combrel.tensorboard.explain import planes_of
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.hyperparameters import METRICS, hyperparameters
 from sb3_combrel.tensorboard.layout import LAYOUT
 from sb3_combrel.tensorboard.mapping_table import mapping_table
-from sb3_combrel.tensorboard.plane import Plane, VariablePair, numbered, plane_through
+from sb3_combrel.tensorboard.plane import Plane, VariablePair
 from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 
 if TYPE_CHECKING:
@@ -117,13 +118,7 @@ class DashboardCallback(BaseCallback):
             )
 
     def _make_planes(self) -> list[Plane]:
-        agent = self.agent
-        if self.at is not None and np.shape(self.at) != (agent.task.scaling.n_variables,):
-            raise ValueError(f"at must be {agent.task.scaling.n_variables} numbers, one a state variable, got {self.at!r}")
-        names = agent.task.state_names
-        return [
-            plane_through(agent.grid, agent.task.scaling, names, pair, self.at) for pair in numbered(self.variables, names)
-        ]
+        return planes_of(self.model, self.variables, self.at)
 
     def _write_settings(self) -> None:
         from torch.utils.tensorboard.summary import hparams

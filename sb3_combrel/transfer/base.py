@@ -12,10 +12,20 @@ import numpy as np
 
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.transfer.report import NotBoundError, TransferReport
 
 if TYPE_CHECKING:
     from sb3_combrel.common.prior import PriorPredictions
     from sb3_combrel.common.transferred import TransferredInstances
+
+
+#: What an algorithm, or this package, calls of a transfer method; ``dir`` leaves it out.
+FOR_THE_ALGORITHM = frozenset(
+    (
+        *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
+        *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "renamed_arguments", "makes_choices"),
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -234,3 +244,44 @@ class Transfer(ABC):
     def statistics(self) -> dict[str, float]:
         """Return figures for the logger, by name."""
         return {}
+
+    def report(self) -> TransferReport:
+        """
+        Say what was transferred, as far as the method knows it; by default its arguments and its figures for the logger.
+
+        :return: a report to print, with all its figures as fields
+        :raises NotBoundError: (a ValueError) if no algorithm uses this object
+        """
+        self._check_bound("report")
+        return TransferReport(method=repr(self), use=self.use, statistics=self.statistics())
+
+    def _check_bound(self, name: str) -> None:
+        """
+        :raises NotBoundError: if results are asked for under ``name``, and the object is a description only
+        """
+        if self.task is None and not name.startswith("__"):
+            what = "" if name.startswith("_") else f" ({name})"
+            raise NotBoundError(
+                f"{type(self).__name__} has no results{what}: an algorithm uses a copy of this object; "
+                "after model = FittedRMax(env, transfer=...).learn(), results are on that copy, model.transfer"
+            )
+
+    def __repr__(self) -> str:
+        """The method with those of its arguments that differ from their defaults."""
+        try:
+            given = self.arguments()
+        except AttributeError:
+            return object.__repr__(self)
+        defaults = {name: each.default for name, each in inspect.signature(type(self)).parameters.items()}
+        shown = [f"{name}={value!r}" for name, value in given.items() if not _equal(value, defaults.get(name))]
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+    def __dir__(self) -> list[str]:
+        """Names for the user: without those that begin with an underscore, and those that only an algorithm calls."""
+        names = {name for name in super().__dir__() if name.startswith("__") or not name.startswith("_")}
+        return sorted(names - FOR_THE_ALGORITHM)
+
+
+def _equal(value: Any, default: Any) -> bool:
+    """Whether an argument, of any type, has its default value."""
+    return value is default or (type(value) is type(default) and bool(np.all(value == default)))

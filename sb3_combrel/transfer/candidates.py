@@ -12,10 +12,12 @@ from sb3_combrel.common.instances import Instances, along_curve
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve
+from sb3_combrel.sources.recipes import check_source, find_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 
-SourceLike = SourceInstances | str | os.PathLike[str] | Sequence[SourceInstances | str | os.PathLike[str]]
+OneSource = SourceInstances | str | os.PathLike[str] | Mapping[str, Any]
+SourceLike = OneSource | Sequence[OneSource]
 MappingsLike = str | InterTaskMapping | FactoredMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
 
@@ -192,18 +194,17 @@ class Candidates:
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
     """
-    Return the source instances that a user means.
+    Return the source instances that a user means; a task is learned, unless that was done before.
 
-    :raises FileNotFoundError: if there is no file at a path
-    :raises ValueError: if it is not instances, a path, or a list of these
+    :param source: what :func:`~sb3_combrel.sources.recipes.find_source` takes, or a list of such
+    :raises FileNotFoundError: if there is neither a file nor a task of that name
+    :raises ValueError: if it is something else, or the task cannot be learned
     """
-    if isinstance(source, SourceInstances):
-        return [source]
-    if isinstance(source, str | os.PathLike):
-        return [SourceInstances.load(source)]
-    if isinstance(source, Sequence) and len(source) > 0:
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        check_source(source)
         return [instances for one in source for instances in load_sources(one)]
-    raise ValueError(f"source must be SourceInstances, a path to them, or a list of these, got {source!r}")
+    check_source(source)
+    return [find_source(source)]
 
 
 def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:

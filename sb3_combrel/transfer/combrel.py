@@ -61,7 +61,16 @@ class COMBREL(MappingTransfer):
     target's own instances is said in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs
     ``FittedRMax(degree=1)``.
 
-    :param source: source instances, a path to them, or a list of several, among which is selected as well
+    ::
+
+        source = SourceInstances.from_q_learning("combrel/MountainCar2D-v0", n_instances=1000, seed=0)
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=COMBREL(source), seed=0).learn(total_timesteps=5_000)
+        print(model.transfer.report())
+
+    :param source: source instances, a path to them, or a list of several, among which is selected as well; or the id of an
+        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first
+        needed, and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
+        :func:`~sb3_combrel.sources.recipes.find_source`
     :param mappings: None: "factored" with ``use="prior"``, "injective" with "instances"; or a set. "injective" (each source
         variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
         "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";

@@ -18,11 +18,13 @@ from sb3_combrel.transfer.compliance import (
 from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-from sb3_combrel.transfer.selectors import Ranges, Selector
+from sb3_combrel.transfer.selectors import Confidence, Ranges, Selector
 
 # Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: every
 # transition changes some choices, and to plan again with each would cost more than all the rest.
 RENEWAL_GROWTH = 1.2
+# The confidence in choices is averaged over so many states of the sample, at most, evenly spread.
+MAX_COMPARED = 500
 NO_DRAWS = np.empty(0)
 
 _transition_compliance, _add_to_sample = EntryPoint(transition_compliance_plain), EntryPoint(add_to_sample)
@@ -256,6 +258,33 @@ class ComplianceSelector(Selector):
         n_counted = counted.sum(axis=1)
         total = np.where(counted, compliance, 0.0).sum(axis=1)
         return np.where(n_counted > 0, total / np.maximum(n_counted, 1), np.nan)
+
+    def confidence(self, action: int) -> Confidence | None:
+        n_points = len(self.task.sample_states)
+        pairs = action * n_points + np.arange(n_points)
+        pairs = pairs[self._choice[pairs] >= 0]
+        if len(pairs) == 0:
+            return None
+        if len(pairs) > MAX_COMPARED:
+            pairs = pairs[(np.arange(MAX_COMPARED) * (len(pairs) / MAX_COMPARED)).astype(np.int64)]
+        self._measure(self._near_of_pair[pairs])
+        n_candidates = int(self.first[action + 1] - self.first[action])
+        compared = np.empty((len(pairs), 3))
+        for row, pair in enumerate(pairs.tolist()):
+            near = self._near_of_pair[pair]
+            near = near[near >= 0]
+            mean = self._cache.compliance[near, :n_candidates].mean(axis=0)
+            chosen = int(self._choice[pair] - self.first[action])
+            others = np.delete(mean, chosen)
+            compared[row] = mean[chosen], others.max(initial=-np.inf), self._no_change(near)
+        chosen_mean, next_best, no_change = compared.mean(axis=0).tolist()
+        return Confidence(chosen_mean, next_best if n_candidates > 1 else np.nan, no_change)
+
+    def _no_change(self, near: np.ndarray) -> float:
+        """Mean compliance of some transitions with the no-change baseline."""
+        seen, bandwidths = self.transitions, self.options.bandwidths
+        each = (no_change_compliance(seen.effects[i], float(seen.rewards[i]), self._rewards, bandwidths) for i in near)
+        return float(np.mean(list(each)))
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {

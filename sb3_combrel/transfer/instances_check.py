@@ -66,26 +66,31 @@ class InstancesCheck:
             del self._pending[next(iter(self._pending))]
         self._pending[state.tobytes()] = TransferredInstances(*(array[:n_actions].copy() for array in given))
 
-    def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
+    def observe(
+        self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool
+    ) -> np.ndarray | None:
         """
         Compare a transition with what was transferred to its state and action, if anything was.
 
         :param state: unit coordinates; ``effect``: next state minus state
         :param reward: raw
+        :return: the effect that was predicted, None if nothing was transferred
         """
         given = self._pending.pop(state.tobytes(), None)
         n = 0 if given is None else int(given.length[action])
         if given is None or n == 0:
             # A visit to where an end was predicted may be over.
             self.outcomes.note(0.0, 0.0, 0.0, reward, terminated)
-            return
+            return None
         weight = given.weight[action, :n] / given.weight[action, :n].sum()
-        error = effect - weight @ given.effect[action, :n]
+        predicted: np.ndarray = weight @ given.effect[action, :n]
+        error = effect - predicted
         self._sums *= 1.0 - 1.0 / WINDOW
         self._sums += error @ error, effect @ effect
         self.n_compared += 1
         end, predicted_reward = float(weight @ given.terminated[action, :n]), float(weight @ given.reward[action, :n])
         self.outcomes.note(self._threshold, end, predicted_reward, reward, terminated)
+        return predicted
 
     def end_episode(self, truncated: bool) -> bool:
         """

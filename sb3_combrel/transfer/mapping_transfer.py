@@ -14,16 +14,22 @@ from sb3_combrel.common.checks import check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.mappings.inter_task_mapping import MappingNames
+from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
+from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike
+from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike, load_sources
 from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.explaining import describe_sources, mappings_of_instances, report_of_prior
 from sb3_combrel.transfer.instances_check import InstancesCheck
+from sb3_combrel.transfer.placed_errors import PlacedErrors
 from sb3_combrel.transfer.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
+from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.selectors import Ranges, Selector
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior
@@ -48,7 +54,7 @@ class MappingTransfer(Transfer):
     """
     Translates source instances through mappings: a selector chooses the mappings, a translator the instances.
 
-    :param source: instances, a path to them, or a list of several
+    :param source: instances, a path to them, the id or recipe of a task to learn them from, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
     :param breadth: kernel breadth of transferred instances, in unit coordinates
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after the target's own transitions
@@ -83,6 +89,8 @@ class MappingTransfer(Transfer):
             raise ValueError(f'factored mappings need use="prior", got use="instances" with {mappings!r}')
         if use == "prior" and relevance:
             raise ValueError('relevance must be False with use="prior": no instances are transferred, got True')
+        check_source(source)
+        check_mappings(mappings)
         check_positive("source_breadth", source_breadth)
         check_positive("breadth", breadth)
         check_positive("breadth_decay", breadth_decay, max=1.0)
@@ -108,6 +116,7 @@ class MappingTransfer(Transfer):
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not there otherwise.
         if name not in _RENAMED_ATTRIBUTES:
+            self._check_bound(name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         warn_of_name(name, _RENAMED_ATTRIBUTES[name])
         return getattr(self, _RENAMED_ATTRIBUTES[name])
@@ -116,6 +125,10 @@ class MappingTransfer(Transfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
+        sources = load_sources(self.source)
+        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        self.source = sources if len(sources) > 1 else sources[0]
+        self._replace_names(sources, task)
         self._periodic = np.array(task.periodic)
         self._wraps = bool(self._periodic.any())
         if self.use == "prior":
@@ -137,9 +150,19 @@ class MappingTransfer(Transfer):
         self._check = InstancesCheck(self.candidates.sources, float(task.exploration_threshold))
         self._uses: Counter[int] = Counter()
         self._instances_used = 0
+        self._n_steps = 0
+        self._errors = PlacedErrors(task)
         self._n_of_relevance = 0
         # What has been returned for any state of the sample may have changed.
         self._all_changed = True
+
+    def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
+        """Replace names of variables and actions in mappings by their numbers, now that both tasks are known."""
+        names = [
+            MappingNames(each.state_names, tuple(task.state_names), each.action_names, tuple(task.action_names))
+            for each in sources
+        ]
+        self.mappings = with_numbers(self.mappings, names)
 
     def _whole_mappings(self) -> bool:
         """Return whether whole mappings are the candidates."""
@@ -207,7 +230,10 @@ class MappingTransfer(Transfer):
         if self.use == "prior":
             self._prior.observe(state, action, reward, effect, terminated)
             return
-        self._check.observe(state, action, reward, effect, terminated)
+        self._n_steps += 1
+        predicted = self._check.observe(state, action, reward, effect, terminated)
+        if predicted is not None:
+            self._errors.note(state, action, effect, predicted)
         selector = self._selector
         selector.before_transition()
         if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
@@ -263,8 +289,9 @@ class MappingTransfer(Transfer):
         """
         Say what the source is taken for: "East: Right on (x, vx), Neutral on (y, vy); West: ..."; with ``use="prior"``.
 
-        :raises ValueError: with ``use="instances"``
+        :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
         """
+        self._check_bound("describe_prior")
         if self.use != "prior":
             raise ValueError(f'use must be "prior" for describe_prior, got {self.use!r}')
         return self._prior.describe()
@@ -285,8 +312,9 @@ class MappingTransfer(Transfer):
         :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
         """
         if self.use == "prior":
+            of_actions = self._prior.choices()
             assert self.task is not None
-            return np.repeat(self._prior.choices(), len(self.task.sample_states))
+            return np.repeat(of_actions, len(self.task.sample_states))
         return self._selector.choices()
 
     def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -326,13 +354,42 @@ class MappingTransfer(Transfer):
             **self._selector.statistics(),
         }
 
-    # --------------------------------------------------------------- saving
+    def report(self) -> TransferReport:
+        """
+        Say what was transferred: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
-    def arguments(self) -> dict[str, Any]:
-        # Once read, the instances themselves: the file of a saved model must not depend on other files.
-        if self.task is None:
-            return super().arguments()
-        return {**super().arguments(), "source": self.sources if len(self.sources) > 1 else self.sources[0]}
+        :return: a report to print, with all its figures as fields
+        :raises NotBoundError: (a ValueError) if no algorithm uses this object
+        :raises ValueError: before the first step of learning
+        """
+        self._check_bound("report")
+        if (self._prior.n_observed if self.use == "prior" else self._n_steps) == 0:
+            raise ValueError("there is nothing to report before learning: call model.learn(total_timesteps) first")
+        return report_of_prior(repr(self), self._prior) if self.use == "prior" else self._report_of_instances()
+
+    def _report_of_instances(self) -> TransferReport:
+        assert self.task is not None
+        n_actions, outcomes, used = self.task.n_actions, self._check.outcomes, self.uses()
+        parts = [self.candidates.parts(candidate) for candidate in used]
+        sure = [self._selector.confidence(action) for action in range(n_actions)]
+        totals = self._errors.of_actions.sum(axis=0)
+        return TransferReport(
+            method=repr(self),
+            use=self.use,
+            sources=describe_sources(self.sources),
+            n_steps=self._n_steps,
+            n_rested=self._check.n_compared,
+            mappings=mappings_of_instances(used, parts, self.task.action_names, sure, self._errors),
+            error=self._errors.error(),
+            n_compared=int(totals[0]),
+            n_worse=int(totals[3]),
+            contradictions=self._errors.contradictions(),
+            ends=(outcomes.confirmed, outcomes.contradicted),
+            rewards=(outcomes.rewards_right, outcomes.rewards_wrong),
+            statistics=self.statistics(),
+        )
+
+    # --------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         if self.use == "prior":
@@ -345,6 +402,7 @@ class MappingTransfer(Transfer):
             "uses": uses,
             "instances_used": np.array([float(self._instances_used)]),
             "check": self._check.get_state(),
+            "errors": np.concatenate([[float(self._n_steps)], self._errors.sums.ravel()]),
             **self._selector.get_state(),
         }
 
@@ -365,6 +423,8 @@ class MappingTransfer(Transfer):
         self._uses = Counter(dict(zip(used.tolist(), state["uses"][used].astype(np.int64).tolist(), strict=True)))
         self._instances_used = int(state["instances_used"][0])
         self._check.set_state(state["check"])
+        self._n_steps = int(state["errors"][0])
+        self._errors.sums.ravel()[:] = state["errors"][1:]
         if self.relevance and self._selector.n_used():
             self._renew_relevance(self._selector.n_used())
 

@@ -37,6 +37,12 @@ class Choice(NamedTuple):
 Chooser = Callable[[CopySums], Choice]
 
 
+def moved(choice: Choice, action: int) -> list[tuple[int, int]]:
+    """Return the copies that a target action moves, and the source actions by which it does."""
+    pairs = zip(choice.copies[action].tolist(), choice.actions[action].tolist(), strict=True)
+    return [(copy, used) for copy, used in pairs if copy >= 0 and used >= 0]
+
+
 def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
     Find the source action of highest mean compliance for each copy and target action, each on its own.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,20 @@ from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 Ranges = tuple[np.ndarray, np.ndarray]
+
+
+class Confidence(NamedTuple):
+    """
+    How sure choices are: mean compliances with the nearest transitions, averaged over states of the sample.
+
+    :param chosen: of the candidates chosen
+    :param next_best: of the best of all others there; NaN if there are none
+    :param no_change: of the no-change baseline
+    """
+
+    chosen: float
+    next_best: float
+    no_change: float
 
 
 class Selector(ABC):
@@ -86,6 +100,15 @@ class Selector(ABC):
         :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
         """
         return np.full(self.task.n_actions * len(self.task.sample_states), -1, dtype=np.int64)
+
+    def confidence(self, action: int) -> Confidence | None:
+        """
+        Compare the choices for a target action with the next best and with the no-change baseline.
+
+        :param action: target action
+        :return: None where nothing is chosen by compliance
+        """
+        return None
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return what is to be saved besides the transitions."""

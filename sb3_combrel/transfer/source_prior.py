@@ -7,14 +7,15 @@ from collections import Counter
 import numpy as np
 
 from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.mappings.factored_mapping import describe_actions, describe_copy
+from sb3_combrel.mappings.factored_mapping import describe_copy
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import GOES_ON, TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
 from sb3_combrel.transfer.candidates import Candidate
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
-from sb3_combrel.transfer.prior_choice import Choice, Chooser
+from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.prior_choice import Choice, Chooser, moved
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 FIRST_RENEWAL = 10
@@ -84,8 +85,12 @@ class SourcePrior:
         self.explains = np.ones((task.n_actions, task.n_variables), dtype=np.bool_)
         rewards = np.concatenate([source.rewards for source in copies.sources])
         self.outcomes = Outcomes(rewards, float(task.exploration_threshold))
+        #: Errors of the mapping in use, where the source has data.
+        self.errors = PlacedErrors(task)
+        #: Transitions whose outcome the source claimed to know.
+        self.n_claimed = 0
         self._claims = False, False
-        self._transitions = RecordedTransitions(task.n_variables)
+        self.transitions = RecordedTransitions(task.n_variables)
         # How each recorded transition's episode went on: 0 it did, 1 it terminated, 2 it reached its time limit.
         self._ended = np.zeros(64, dtype=np.int64)
         self._renewal_due = float(first_renewal)
@@ -97,6 +102,16 @@ class SourcePrior:
         self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
         if isinstance(choose, Choice):
             self._set_choice(choose)
+
+    @property
+    def chooses(self) -> bool:
+        """Whether it is chosen by compliance, and not given or drawn."""
+        return self._choose is not None
+
+    def choose(self, sums: CopySums) -> Choice:
+        """Choose from sums over the target's transitions; only where :attr:`chooses` is true."""
+        assert self._choose is not None
+        return self._choose(sums)
 
     # -------------------------------------------------------------------- asking
 
@@ -112,12 +127,16 @@ class SourcePrior:
         effect, reward, end, coverage = self._raw(np.ascontiguousarray(states, dtype=np.float64), actions)
         if not self.explains.all():
             effect *= self.explains[actions]
+        return PriorPredictions(effect, reward, end, self._claimed(end, coverage, actions))
+
+    def _claimed(self, end: np.ndarray, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The weight that is claimed for predictions: that of the source's data, as far as it is believed."""
         if self.outcomes.doubted:
-            return PriorPredictions(effect, reward, end, np.zeros(len(actions)))
+            return np.zeros(len(actions))
         weight = coverage * self.trust[actions]
         if not self._ends_believed:
             weight[end >= GOES_ON] = 0.0
-        return PriorPredictions(effect, reward, end, weight)
+        return weight
 
     @property
     def _ends_believed(self) -> bool:
@@ -162,7 +181,7 @@ class SourcePrior:
         self._note_claims()
 
     def _record(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
-        i = self._transitions.add(state, action, reward, effect)
+        i = self.transitions.add(state, action, reward, effect)
         if i == len(self._ended):
             self._ended = np.concatenate([self._ended, np.zeros_like(self._ended)])
         self._ended[i] = int(terminated)
@@ -173,18 +192,24 @@ class SourcePrior:
         """Compare a transition with what was predicted of it."""
         actions = np.array([action], dtype=np.int64)
         predicted = self.copies.predict(self._used, self._work_space, np.ascontiguousarray(state)[None], actions)
-        _, r, end, weight = predicted
+        predicted_effect, r, end, weight = predicted
+        self.n_claimed += bool(self._claimed(end, weight, actions)[0] > 0.0)
+        self._compare(state, action, effect, predicted_effect[0], float(weight[0]))
         self.outcomes.note(float(weight[0]), float(end[0]), float(r[0]), reward, terminated)
         self._uses[self._key(action)] += 1
         if not recorded:
             self.copies.follow(self._used, action, effect, predicted, self.sums)
+
+    def _compare(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray, weight: float) -> None:
+        if weight >= self.copies.threshold:
+            self.errors.note(state, action, effect, predicted)
 
     def end_episode(self, truncated: bool) -> None:
         """Take in the end of an episode; ``truncated``: by its time limit."""
         if self.n_observed == 0:
             return
         if truncated and self.n_observed <= self.max_transitions:
-            self._ended[self._transitions.n - 1] = 2
+            self._ended[self.transitions.n - 1] = 2
         if self.choice is not None:
             self.outcomes.end_episode(truncated)
         self._note_claims()
@@ -221,11 +246,13 @@ class SourcePrior:
         self._stored.clear()
 
     def _replay(self) -> None:
-        """Count anew what confirms and contradicts the ends and rewards that are predicted through another mapping."""
+        """Count anew what confirms and contradicts what is predicted through another mapping."""
         self.outcomes.forget()
-        n, seen = self._transitions.n, self._transitions
-        _, reward, end, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
+        self.errors.forget()
+        n, seen = self.transitions.n, self.transitions
+        effect, reward, end, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
         for i, ended in enumerate(self._ended[:n].tolist()):
+            self._compare(seen.states[i], int(seen.actions[i]), seen.effects[i], effect[i], float(weight[i]))
             self.outcomes.note(float(weight[i]), float(end[i]), float(reward[i]), float(seen.rewards[i]), ended == 1)
             if ended:
                 self.outcomes.end_episode(ended == 2)
@@ -271,10 +298,7 @@ class SourcePrior:
 
     def _moved(self, action: int) -> list[tuple[int, int]]:
         """The copies that a target action moves, and the source actions by which it does."""
-        if self.choice is None:
-            return []
-        pairs = zip(self.choice.copies[action].tolist(), self.choice.actions[action].tolist(), strict=True)
-        return [(copy, used) for copy, used in pairs if copy >= 0 and used >= 0]
+        return [] if self.choice is None else moved(self.choice, action)
 
     # ------------------------------------------------------------------- figures
 
@@ -314,13 +338,20 @@ class SourcePrior:
 
     # --------------------------------------------------------------- describing
 
+    def measured_sums(self) -> CopySums:
+        """The sums, with numbers of transitions of those that compliances have been added up of: later ones have none."""
+        number = np.arange(1, self.transitions.n + 1)
+        measured = (number <= ALL_MEASURED) | (number % MEASURED_LATER == 0)
+        actions = self.transitions.actions[: self.transitions.n][measured]
+        return self.sums._replace(n=np.bincount(actions, minlength=self.task.n_actions).astype(np.float64))
+
     def mean_compliance(self) -> np.ndarray:
         """Mean compliance of what each target action is made of, shape (n_target_actions,); NaN where nothing is chosen."""
-        found = np.full(self.task.n_actions, np.nan)
+        found, sums = np.full(self.task.n_actions, np.nan), self.measured_sums()
         for a in range(self.task.n_actions):
-            if self._choose is None or self.sums.n[a] == 0.0:
+            if self._choose is None or sums.n[a] == 0.0:
                 continue
-            means = [self.sums.compliance[copy, a, used] / self.sums.n[a] for copy, used in self._moved(a)]
+            means = [sums.compliance[copy, a, used] / sums.n[a] for copy, used in self._moved(a)]
             found[a] = np.prod(means) if means else np.nan
         return found
 
@@ -334,13 +365,14 @@ class SourcePrior:
 
     def describe(self) -> str:
         """Say what each target action is made of: "East: Right on (x, vx), Neutral on (y, vy); West: ..."."""
-        lines = []
-        for a, name in enumerate(self.task.action_names):
-            moves = [
-                (describe_copy(self.copy_mapping(copy)), [self._action_name(copy, used)]) for copy, used in self._moved(a)
-            ]
-            lines.append(describe_actions([name], moves) if moves else f"{name}: nothing")
-        return "; ".join(lines)
+        choice, names = self.choice, enumerate(self.task.action_names)
+        return "; ".join(f"{name}: {'nothing' if choice is None else self.describe_action(choice, a)}" for a, name in names)
+
+    def describe_action(self, choice: Choice, action: int) -> str:
+        """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
+        moves = moved(choice, action)
+        words = (f"{self._action_name(copy, used)} on {describe_copy(self.copy_mapping(copy))}" for copy, used in moves)
+        return ", ".join(words) if moves else "nothing"
 
     def _action_name(self, copy: int, used: int) -> str:
         return self.copies.sources[self.copies.source[copy]].action_names[used]
@@ -377,7 +409,7 @@ class SourcePrior:
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What was learned, float64 arrays."""
-        n, d = self._transitions.n, self.task.n_variables
+        n, d = self.transitions.n, self.task.n_variables
         chosen = np.full((3, self.task.n_actions, d), -1.0)
         if self.choice is not None:
             chosen[0] = 0.0
@@ -386,12 +418,13 @@ class SourcePrior:
         uses = [[self._uses[key], *key, *[-1] * (2 * d + 1 - len(key))] for key in self._candidates]
         figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, self._n_slots()
         return {
-            "transitions": np.column_stack([self._transitions.rows(), self._ended[:n]]),
+            "transitions": np.column_stack([self.transitions.rows(), self._ended[:n]]),
             "prior_choice": chosen.ravel(),
             "prior_trust": self.trust.copy(),
             "prior_explains": self.explains.ravel().astype(np.float64),
             "prior_outcomes": self.outcomes.get_state(),
             "prior_figures": np.array(figures, dtype=np.float64),
+            "prior_errors": np.concatenate([[float(self.n_claimed)], self.errors.sums.ravel()]),
             "prior_uses": np.array(uses, dtype=np.float64).reshape(-1, 2 * d + 2),
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
@@ -405,7 +438,7 @@ class SourcePrior:
         for *row, ended in state["transitions"]:
             action = int(np.clip(row[-1], 0, n_actions - 1))
             self._record(np.array(row[:d]), action, float(row[-2]), np.array(row[d : 2 * d]), False)
-            self._ended[self._transitions.n - 1] = int(ended)
+            self._ended[self.transitions.n - 1] = int(ended)
         for name, array in self.sums._asdict().items():
             array.ravel()[:] = state[f"prior_sums_{name}"]
         observed, switches, version, due, warned, n_slots = state["prior_figures"].tolist()
@@ -419,6 +452,8 @@ class SourcePrior:
         self.trust = state["prior_trust"].copy()
         self.explains = state["prior_explains"].reshape(n_actions, d) > 0.5
         self.outcomes.set_state(state["prior_outcomes"])
+        self.n_claimed = int(state["prior_errors"][0])
+        self.errors.sums.ravel()[:] = state["prior_errors"][1:]
         self._claims = self.outcomes.doubted, self._ends_believed
         self._candidates, self._uses = [], Counter()
         for n, *key in state["prior_uses"].astype(np.int64).tolist():

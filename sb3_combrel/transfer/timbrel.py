@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
 from sb3_combrel.transfer.mapping_transfer import (
@@ -36,7 +37,16 @@ class TIMBREL(MappingTransfer):
     target's own instances are fitted to what it leaves over. What it claims to know without them is said in
     :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs ``FittedRMax(degree=1)``.
 
-    :param source: source instances, a path to them, or a list of several
+    ::
+
+        right = {"Neutral": "Neutral", "West": "Left", "East": "Right", "South": "Neutral", "North": "Neutral"}
+        along_x = InterTaskMapping(state={"x": "x", "vx": "v"}, action=right)
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=TIMBREL(source, along_x), seed=0).learn(total_timesteps=5_000)
+
+    :param source: source instances, a path to them, or a list of several; or the id of an
+        environment, "MountainCar-v0", which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first
+        needed, and kept in a file; or a recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``, see
+        :func:`~sb3_combrel.sources.recipes.find_source`
     :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of
         ``mappings`` drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever
         it is asked for, elsewhere with each transition; or "pool" for the translations by all of ``mappings`` in one pool
@@ -99,6 +109,16 @@ class TIMBREL(MappingTransfer):
         if use == "prior" and isinstance(mapping, str) and mapping == "pool":
             raise ValueError('mapping must be a mapping or "random" with use="prior", got "pool"')
         self.mapping = mapping
+
+    def arguments(self) -> dict[str, Any]:
+        given = super().arguments()
+        # The set has no meaning for a mapping that is given.
+        return given if isinstance(self.mapping, str) else {name: each for name, each in given.items() if name != "mappings"}
+
+    def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
+        super()._replace_names(sources, task)
+        if not isinstance(self.mapping, str):
+            self.mapping = self.mappings  # type: ignore[assignment]
 
     def _make_selector(self, task: TargetTask) -> Selector:
         parts = self.candidates, task, self._transitions, self.rng

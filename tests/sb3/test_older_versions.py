@@ -20,7 +20,7 @@ DATA = Path(__file__).parents[1] / "data"
 # Of these predictions no trace is left any more, so that the counts are lower.
 COUNTS = ("transfer_uses", "transfer_instances_used")
 # What version 0.1.0 did not have.
-ADDED = ("visits", "transfer_check")
+ADDED = ("visits", "transfer_check", "transfer_errors")
 NEW = {*COUNTS, *ADDED}
 
 

@@ -6,32 +6,13 @@ import numpy as np
 import pytest
 from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import target_task
+from helpers.own_method import Mine
 from helpers.walk import Walk, same_parameters, small, walk_source
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.common.transferred import TransferredInstances, check_transferred
 from sb3_combrel.tensorboard.callback import DashboardCallback
-from sb3_combrel.transfer.base import Transfer
-
-
-class Mine(Transfer):
-    """Predicts what the last transition with the same action did."""
-
-    def __init__(self, reward=-1.0):
-        self.reward = reward
-
-    def observe(self, state, action, reward, next_state, terminated):
-        self.effects = getattr(self, "effects", np.zeros((self.task.n_actions, self.task.n_variables)))
-        self.effects[action] = next_state - state
-
-    def transferred(self, states, actions, own_weight):
-        found = TransferredInstances.empty(len(actions), self.task.n_variables, 1)
-        if hasattr(self, "effects"):
-            found.length[:] = own_weight < self.task.exploration_threshold
-            found.weight[:], found.reward[:] = self.task.exploration_threshold, self.reward
-            found.effect[:, 0] = self.effects[actions]
-        return found
 
 
 def test_it_takes_at_most_20_lines():

@@ -1,0 +1,88 @@
+"""Entries of a mapping as a user gives them, by number or by name, and the numbers that they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+#: For each target variable or action its counterpart in the source, by number or name; or a dict from one to the other.
+Entries = Sequence[int | str | None] | Mapping[Any, Any]
+
+
+def as_entries(argument: str, values: Any) -> tuple[Any, ...]:
+    """
+    Store what a user gave so that it can be compared and hashed: a dict as pairs of key and value.
+
+    :param argument: name of the argument
+    :raises ValueError: if it is neither a sequence nor a dict
+    """
+    if isinstance(values, Mapping):
+        return tuple((key, value) for key, value in values.items())
+    if isinstance(values, str) or not isinstance(values, Sequence | np.ndarray):
+        raise ValueError(
+            f"{argument} must be a sequence with one entry for each target variable or action, or a dict from their names, "
+            f"got {values!r}"
+        )
+    # Pairs that were written to a file come back as lists.
+    return tuple(tuple(each) if _is_pair(each) else each for each in values)
+
+
+def has_names(entries: Sequence[Any]) -> bool:
+    """Whether the tasks' names are needed to tell which numbers the entries are."""
+    return any(isinstance(each, str | tuple) for each in entries)
+
+
+def numbers(
+    argument: str, entries: Sequence[Any], target_names: Sequence[str], source_names: Sequence[str], default: Any = None
+) -> tuple[Any, ...]:
+    """
+    Replace names by the numbers that they stand for.
+
+    :param argument: "state" or "action", for messages
+    :param entries: one for each target variable or action, or pairs of one of these and its counterpart
+    :param target_names: names of the target's variables or actions; ``source_names``: of the source's
+    :param default: what a target variable that is in no pair is mapped to
+    :return: one entry for each target variable or action, if ``entries`` are pairs; entries that are no names as they were
+    :raises ValueError: if a name is not that of one variable or action, or one is in two pairs
+    """
+    if not any(isinstance(each, tuple) for each in entries):
+        return tuple(_number(argument, each, source_names, "source") for each in entries)
+    found = dict.fromkeys(range(len(target_names)), default)
+    for pair in entries:
+        if not isinstance(pair, tuple):
+            raise ValueError(f"{argument} must be entries or pairs, not both, got {tuple(entries)!r}")
+        target = _number(argument, pair[0], target_names, "target")
+        if target not in found:
+            raise ValueError(f"{argument} must have keys from 0 to {len(target_names) - 1} or names, got {pair[0]!r}")
+        if sum(_number(argument, each[0], target_names, "target") == target for each in entries) > 1:
+            raise ValueError(f"{argument} must have each of the target's {_kind(argument)} once, got {pair[0]!r} twice")
+        found[target] = _number(argument, pair[1], source_names, "source")
+    missing = [target_names[k] for k, each in found.items() if each is None]
+    if argument == "action" and missing:
+        raise ValueError(f"action must have a source action for each target action, got none for {', '.join(missing)}")
+    return tuple(found.values())
+
+
+def _number(argument: str, entry: Any, names: Sequence[str], task: str) -> Any:
+    if not isinstance(entry, str):
+        return entry
+    if list(names).count(entry) != 1:
+        raise ValueError(
+            f"{argument} must hold names of the {task}'s {_kind(argument)}, {', '.join(names)}, got {entry!r}"
+            + (
+                ", which is the name of several"
+                if entry in names
+                else "; a task that names none has s0, s1, ... and a0, a1, ..."
+            )
+        )
+    return list(names).index(entry)
+
+
+def _kind(argument: str) -> str:
+    return "actions" if argument == "action" else "variables"
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 2

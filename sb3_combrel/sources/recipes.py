@@ -1,0 +1,150 @@
+"""Sources by name: a file of instances, or a task that is learnt once and kept in a file."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from sb3_combrel.sources.source_instances import SourceInstances
+
+CACHE_VARIABLE = "SB3_COMBREL_CACHE"
+FITTED_RMAX = "fitted_rmax"
+LEARNERS = ("q_learning", FITTED_RMAX)
+DEFAULT_RECIPE: Mapping[str, Any] = {"n_instances": 1000, "total_timesteps": 30_000, "seed": 0}
+
+
+def check_source(source: Any) -> None:
+    """
+    Check that a source can be found, without reading or learning it.
+
+    :param source: what :func:`find_source` takes, or a list of such
+    :raises FileNotFoundError: if there is neither a file nor a task of that name
+    :raises ValueError: if it is something else
+    """
+    if isinstance(source, SourceInstances):
+        return
+    if isinstance(source, str | os.PathLike):
+        if not _file_of(source) and task_spec(str(source)) is None:
+            raise _nothing_there(source)
+    elif isinstance(source, Mapping) and source:
+        _check_recipe(source)
+    elif isinstance(source, Sequence) and len(source) > 0:
+        for each in source:
+            check_source(each)
+    else:
+        raise ValueError(
+            "source must be SourceInstances, a path to them, or a list of these; or a task to learn them from, the id of an "
+            f"environment or a recipe such as {{'env': 'MountainCar-v0'}}, got {source!r}"
+        )
+
+
+def find_source(source: Any) -> SourceInstances:
+    """
+    Read source instances from a file, or learn a task for them.
+
+    :param source: source instances; the path of a file of them; the id of an environment, learnt with
+        :data:`DEFAULT_RECIPE`; or a recipe: a dict with ``env``, the id, and arguments of
+        :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
+        :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
+    :raises FileNotFoundError: if there is neither a file nor a task of that name
+    :raises ValueError: if it is none of these
+    """
+    if isinstance(source, SourceInstances):
+        return source
+    if isinstance(source, Mapping):
+        _check_recipe(source)
+        default = {**DEFAULT_RECIPE, "total_timesteps": None} if source.get("learner") == FITTED_RMAX else DEFAULT_RECIPE
+        return learn_or_read({name: value for name, value in {**default, **source}.items() if value is not None})
+    if not isinstance(source, str | os.PathLike):
+        raise ValueError(f"source must be a file, the id of an environment or a recipe, got {source!r}")
+    file = _file_of(source)
+    if file is not None:
+        return SourceInstances.load(file)
+    if task_spec(str(source)) is not None:
+        return learn_or_read({**DEFAULT_RECIPE, "env": str(source)})
+    raise _nothing_there(source)
+
+
+def learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
+    """
+    Learn a task by Q-learning or Fitted R-Max and return instances of it; read them from a file if that was done before.
+
+    Processes that start at the same time each learn the task, with the same seed and so with the same result; files are
+    written completely or not at all.
+
+    :param recipe: see :func:`find_source`
+    :raises ValueError: if the task cannot be learnt so
+    """
+    file = cache_file(recipe)
+    if file.is_file():
+        return SourceInstances.load(file)
+    arguments = dict(recipe)
+    env_id = arguments.pop("env")
+    learner = arguments.pop("learner", "q_learning")
+    print(f"Learning the source task {env_id} by {learner}; kept in {file}")
+    try:
+        by_model = learner == FITTED_RMAX
+        source = (SourceInstances.from_fitted_rmax if by_model else SourceInstances.from_q_learning)(env_id, **arguments)
+    except (TypeError, gym.error.Error) as error:
+        raise ValueError(f"the source task cannot be learnt by the recipe {dict(recipe)}: {error}") from error
+    source.save(file)
+    return source
+
+
+def cache_file(recipe: Mapping[str, Any]) -> Path:
+    """
+    Return the file for the instances of a recipe, in the folder SB3_COMBREL_CACHE (a variable), or ~/.cache/sb3_combrel.
+
+    :param recipe: see :func:`learn_or_read`
+    """
+    folder = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "sb3_combrel")
+    text = json.dumps(dict(recipe), sort_keys=True, default=str)
+    name = re.sub(r"\W+", "-", str(recipe["env"]))
+    return folder / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
+
+
+def _check_recipe(recipe: Mapping[str, Any]) -> None:
+    if not isinstance(recipe.get("env"), str):
+        raise ValueError(f"the recipe of a source needs 'env', the id of its task, got {dict(recipe)!r}")
+    learner = recipe.get("learner", LEARNERS[0])
+    if learner not in LEARNERS:
+        raise ValueError(f"the recipe's learner must be {' or '.join(LEARNERS)}, got {learner!r}")
+
+
+def _file_of(source: str | os.PathLike[str]) -> Path | None:
+    path = Path(source)
+    with_suffix = path.with_name(path.name + ".npz") if path.name else path
+    return next((file for file in (path, with_suffix) if file.is_file()), None)
+
+
+def _nothing_there(source: object) -> FileNotFoundError:
+    file = Path(str(source) or "source").with_suffix(".npz")
+    return FileNotFoundError(
+        f"there is no source file {source}, looked for in {Path.cwd()}, and no environment of that name; write one with "
+        f"SourceInstances.record(...).save({str(file)!r}), or: sb3-combrel record combrel/MountainCar2D-v0 --output {file}"
+    )
+
+
+def task_spec(name: str) -> EnvSpec | None:
+    """
+    Find the environment of an id; a module before a colon is imported first, as by ``gymnasium.make``.
+
+    :param name: the id; those of this project need no import of ``combrel_envs``
+    :return: None if there is none
+    """
+    module, _, env_id = f"combrel_envs:{name}".rpartition(":") if name.startswith("combrel/") else name.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        return gym.spec(env_id)
+    except (gym.error.Error, ImportError, ValueError):
+        return None

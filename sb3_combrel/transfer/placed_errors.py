@@ -1,0 +1,104 @@
+"""Where in the state space the target's own transitions contradict what a source predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.report import Contradiction
+
+# Each state variable's range is divided into so many parts.
+N_PARTS = 4
+# A part with fewer transitions says nothing.
+MIN_TRANSITIONS = 10
+MAX_CONTRADICTIONS = 8
+# Effects are squared unit coordinates; less than this is no movement.
+NO_MOVEMENT = 1e-18
+AT_ONCE = 256
+_N, _ERROR, _EFFECT, _WORSE = range(4)
+
+
+class PlacedErrors:
+    """
+    Sums of squared prediction errors and squared effects, by target action and by part of each state variable's range.
+
+    :param task: the target task
+    """
+
+    def __init__(self, task: TargetTask):
+        self.task = task
+        self._waiting: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
+        self._sums = np.zeros((task.n_actions, task.n_variables, N_PARTS, 4))
+
+    def note(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray) -> None:
+        """
+        Add a transition whose effect was predicted.
+
+        :param state: unit coordinates; ``effect``: next state minus state; ``predicted``: what was predicted of it
+        """
+        # Many at once take a tenth of the time.
+        self._waiting.append((state.copy(), action, effect, predicted))
+        if len(self._waiting) >= AT_ONCE:
+            self._add_waiting()
+
+    def _add_waiting(self) -> None:
+        states, actions, effects, predicted = (np.array(column) for column in zip(*self._waiting, strict=True))
+        self._waiting.clear()
+        parts = np.clip((states * N_PARTS).astype(np.int64), 0, N_PARTS - 1)
+        # Column by column, and one transition after the other: sums do not depend on how many are added at once.
+        error, moved = (sum(column**2 for column in each.T) for each in (effects - predicted, effects))
+        rows = np.column_stack([np.ones(len(actions)), error, moved, error > moved])
+        for v, part in enumerate(parts.T):
+            np.add.at(self._sums[:, v], (actions, part), rows)
+
+    @property
+    def sums(self) -> np.ndarray:
+        """
+        Of each target action, variable and part: number of transitions, squared errors, squared effects, and number of those
+        whose error is the larger one; shape (n_actions, n_variables, N_PARTS, 4).
+        """
+        if self._waiting:
+            self._add_waiting()
+        return self._sums
+
+    def forget(self) -> None:
+        """Forget all transitions."""
+        self._waiting.clear()
+        self._sums[:] = 0.0
+
+    @property
+    def of_actions(self) -> np.ndarray:
+        """Sums by target action: number, squared error, squared effect, number that are worse; shape (n_actions, 4)."""
+        # Each transition is in one part of every variable.
+        return self.sums[:, 0].sum(axis=1)
+
+    def errors(self) -> np.ndarray:
+        """Return the mean squared error over that of "no change", by target action, NaN where nothing moved."""
+        sums = self.of_actions
+        moved = sums[:, _EFFECT] > NO_MOVEMENT
+        return np.where(moved, sums[:, _ERROR] / np.where(moved, sums[:, _EFFECT], 1.0), np.nan)
+
+    def error(self) -> float:
+        """Return the same over all actions."""
+        _, error, effect, _ = self.of_actions.sum(axis=0).tolist()
+        return error / effect if effect > NO_MOVEMENT else np.nan
+
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """Return the parts in which predictions are worse than "no change", the largest excess of squared error first."""
+        excess = self.sums[..., _ERROR] - self.sums[..., _EFFECT]
+        worse = (self.sums[..., _N] >= MIN_TRANSITIONS) & (excess > NO_MOVEMENT)
+        order = sorted(map(tuple, np.argwhere(worse).tolist()), key=lambda cell: -excess[cell])
+        return tuple(self._contradiction(*cell) for cell in order[:MAX_CONTRADICTIONS])
+
+    def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
+        n, error, effect, _ = self.sums[action, variable, part].tolist()
+        low, high = (float(bound[variable]) for bound in (self.task.scaling.low, self.task.scaling.high))
+        width = (high - low) / N_PARTS
+        return Contradiction(
+            target_action=self.task.action_names[action],
+            variable=self.task.state_names[variable],
+            low=low + part * width,
+            high=low + (part + 1) * width,
+            n_compared=int(n),
+            error=error / effect if effect > NO_MOVEMENT else np.inf,
+        )

@@ -1,0 +1,226 @@
+"""``sb3_combrel.compare``: does transfer help? Checks before any run, figures, sentence, picture."""
+
+import subprocess
+import sys
+from itertools import combinations
+
+import numpy as np
+import pytest
+from helpers.own_method import Mine
+from helpers.walk import Walk, walk_source
+
+import sb3_combrel
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
+from sb3_combrel.experiments import compare as module
+from sb3_combrel.experiments.compare import RunResult, compare, returns_over_steps, smallest_p_value
+from sb3_combrel.experiments.engine_jobs import JobError
+from sb3_combrel.experiments.suite_runs import EpisodeRecorder
+from sb3_combrel.experiments.transfer_measures import LearningCurves, compare_learning
+
+LEARNER = dict(model_breadth=0.15, resolution=3, degree=0)
+METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1)))}
+
+
+@pytest.fixture(scope="module")
+def result():
+    return compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER)
+
+
+def test_each_run_is_that_of_the_learner_with_its_seed(result):
+    for method, transfer in METHODS.items():
+        for row, seed in enumerate([3, 1]):
+            recorder = EpisodeRecorder()
+            FittedRMax(Walk(), transfer=transfer, seed=seed, **LEARNER).learn(150, recorder, log_interval=None)
+            curves, n = result.curves[method], len(recorder.episodes.steps)
+            assert curves.n_episodes[row] == n > 1
+            np.testing.assert_array_equal(curves.returns[row, :n], recorder.episodes.returns)
+            np.testing.assert_array_equal(curves.steps[row, :n], recorder.episodes.steps)
+
+
+def test_measures_are_those_of_taylor_and_stone(result):
+    with_transfer, without = result.curves["TIMBREL"], result.curves["none"]
+    n = min(10, *with_transfer.n_episodes, *without.n_episodes)
+    measures = compare_learning(with_transfer, without, threshold=result.threshold, n_last=n, n_first=min(5, n))
+    ours = result.measures["TIMBREL"]
+    for name in ("jumpstart", "asymptotic_performance", "total_reward_by_steps", "time_to_threshold"):
+        np.testing.assert_equal(getattr(ours, name)[2:], getattr(measures, name)[2:])
+    last = [row[:count][-n:].mean() for row, count in zip(without.returns, without.n_episodes, strict=True)]
+    assert result.threshold == pytest.approx(np.median(last))
+    assert result.n_steps == min(np.nansum(curves.steps, axis=1).min() for curves in (with_transfer, without))
+
+
+def test_the_reports_of_the_runs_are_kept(result):
+    assert list(result.reports) == ["TIMBREL"]
+    assert [report.n_steps for report in result.reports["TIMBREL"]] == [150, 150]
+
+
+def test_the_table_has_a_row_for_each_measure_and_the_figure_a_curve_for_each_method(result):
+    lines = result.table.splitlines()
+    assert [line.split(" | ")[0][2:] for line in lines[2:]] == [
+        "jumpstart",
+        "asymptotic performance",
+        "mean return over steps",
+        "transfer ratio, over steps",
+        f"steps to a return of {result.threshold:.4g}",
+    ]
+    assert len({line.count("|") for line in lines}) == 1
+    measure = result.measures["TIMBREL"].total_reward_by_steps
+    assert lines[4].split(" | ")[2:5] == [
+        f"{measure.without.mean() / result.n_steps:.4g}",
+        f"{measure.with_transfer.mean() / result.n_steps:.4g}",
+        f"{measure.effect / result.n_steps:+.3g}",
+    ]
+    [axes] = result.figure().axes
+    assert [line.get_label() for line in axes.get_lines()] == ["none (2 runs)", "TIMBREL (2 runs)"]
+    curve = axes.get_lines()[1]
+    expected = returns_over_steps(result.curves["TIMBREL"], curve.get_xdata()).mean(axis=0)
+    np.testing.assert_allclose(curve.get_ydata(), expected)
+    assert str(result) == f"{result.sentence}\n\n{result.table}"
+
+
+def test_returns_over_steps_are_those_of_the_episode_under_way():
+    curves = LearningCurves.from_rows([[-3.0, -2.0, -4.0], [-5.0, -1.0]], [[3, 2, 4], [5, 1]])
+    found = returns_over_steps(curves, np.arange(6.0))
+    np.testing.assert_array_equal(found, [[-3, -3, -3, -2, -2, -4], [-5, -5, -5, -5, -5, -1]])
+
+
+# ---------------------------------------------------------------------------------------- sentences
+
+
+def made_up(monkeypatch, returns, **arguments):
+    """Compare methods whose episodes have these returns, of 10 steps each; one row a seed."""
+    monkeypatch.setattr(module, "carry_out", lambda run: RunResult(tuple(returns[run.method][run.seed]), (10.0,) * 12, None))
+    n = len(next(iter(returns.values())))
+    # The learner itself is not asked.
+    return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
+
+
+def around(mean, n_runs, spread=1.0):
+    return mean + spread * np.random.default_rng(int(abs(mean))).normal(size=(n_runs, 12))
+
+
+@pytest.mark.parametrize(
+    ("mean", "says"),
+    [(-50.0, "transfer helped"), (-70.0, "transfer harmed"), (-60.2, "not shown that transfer helps or harms")],
+)
+def test_the_sentence_says_whether_transfer_helped(monkeypatch, mean, says):
+    returns = around(mean, 6)
+    found = made_up(monkeypatch, {"none": around(-60.0, 6), "COMBREL": returns})
+    assert found.sentence.startswith("COMBREL: ") and says in found.sentence
+    assert f"its mean return over 120 steps is {returns.mean():.4g}, that of none" in found.sentence
+    assert (found.p_values["COMBREL"] < 0.05) == ("helped" in says or "harmed" in says)
+
+
+@pytest.mark.parametrize("n_runs", [1, 2, 3])
+def test_with_too_few_runs_nothing_is_claimed(monkeypatch, n_runs):
+    found = made_up(monkeypatch, {"none": around(-60.0, n_runs), "COMBREL": around(-5.0, n_runs)})
+    assert "too few runs to tell" in found.sentence and "helped" not in found.sentence
+
+
+def test_several_methods_are_corrected_for_their_number(monkeypatch):
+    runs = {"none": around(-60.0, 5), "one": around(-50.0, 5), "two": around(-40.0, 5)}
+    found = made_up(monkeypatch, runs)
+    smallest = 2 / 252
+    assert found.p_values == pytest.approx({"one": 2 * smallest, "two": 2 * smallest})
+    assert found.sentence.count("transfer helped") == 2
+    assert [line.split(" | ")[1] for line in found.table.splitlines()[2:]] == ["one"] * 5 + ["two"] * 5
+
+
+def test_the_threshold_may_be_given(monkeypatch):
+    found = made_up(monkeypatch, {"none": around(-60.0, 4), "COMBREL": around(-5.0, 4)}, threshold=-10)
+    assert "steps to a return of -10 | COMBREL | inf | 50 |" in found.table
+
+
+@pytest.mark.parametrize(("n_first", "n_second"), [(2, 2), (3, 3), (4, 4), (2, 5), (3, 4)])
+def test_the_smallest_p_value_is_that_of_the_most_extreme_groups(n_first, n_second):
+    values = np.arange(n_first + n_second, dtype=float) ** 1.3
+    observed = abs(values[:n_first].mean() - values[n_first:].mean())
+    apart = [
+        abs(values[list(group)].mean() - np.delete(values, list(group)).mean())
+        for group in combinations(range(len(values)), n_first)
+    ]
+    assert smallest_p_value(n_first, n_second, 1) <= np.mean(np.array(apart) >= observed - 1e-12)
+    assert smallest_p_value(1, 5, 1) == 1.0
+
+
+# ------------------------------------------------------------------------------------------- checks
+
+GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            dict(env="Nowhere-v0"),
+            "env must be the id of an environment or a function that makes one; there is no 'Nowhere-v0'",
+        ),
+        (dict(env=Walk()), r"a function that makes one, as each run has its own, got .*lambda: MyEnv\(\)"),
+        (dict(env=lambda: 3), "none: env must make Gymnasium environments, got 3"),
+        (dict(env="Pendulum-v1"), "none: FittedRMax needs Discrete actions"),
+        (dict(methods=[None]), "methods must be a dict from names to transfer methods"),
+        (dict(methods={"none": None}), "methods must have at least two"),
+        (dict(methods={"none": None, "x": 3}), "got 3 for 'x'"),
+        (dict(methods={"none": None, "x": COMBREL}), "got .*COMBREL.* for 'x'"),
+        (dict(methods={"a": None, "b": None}), "baseline must be one of a, b, as 2 methods are without transfer"),
+        (dict(methods={"a": Mine(), "b": Mine()}), "baseline must be one of a, b, as 0 methods are without transfer"),
+        (dict(baseline="nobody"), "baseline must be one of none, TIMBREL, got 'nobody'"),
+        (
+            dict(methods={"none": None, "x": "sb3_combrel.Nothing"}),
+            "x: transfer names 'sb3_combrel.Nothing', which does not exist",
+        ),
+        (
+            dict(methods={"none": None, "x": TIMBREL(walk_source(), InterTaskMapping((0,), (0, 1)))}),
+            "x: state must have 2 entries",
+        ),
+        (dict(seeds=0), "seeds must be a whole number of at least 1, got 0"),
+        (dict(seeds=[]), "seeds must be different whole numbers"),
+        (dict(seeds=[1, 1]), "seeds must be different whole numbers"),
+        (dict(seeds=[-1]), "seeds must be a whole number from 0"),
+        (dict(seeds="ten"), "seeds must be a whole number"),
+        (dict(steps=0), "steps must be a whole number"),
+        (dict(n_jobs=0), "n_jobs must be a whole number"),
+        (dict(threshold=np.inf), "threshold must be a finite number"),
+        (dict(learner=3), "learner must be a dict of arguments of FittedRMax"),
+        (dict(learner={"breadth": 1}), "learner must have arguments out of .*model_breadth.*, got 'breadth'"),
+        (dict(learner={"seed": 1}), "learner must have arguments out of .*, got 'seed'"),
+        (dict(learner={"model_breadth": -1}), "none: model_breadth must be"),
+    ],
+)
+def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
+    def refuse(run):
+        raise AssertionError("the error should have come before")
+
+    monkeypatch.setattr(module, "carry_out", refuse)
+    with pytest.raises(ValueError, match=message):
+        compare(**{**GOOD, **change})
+
+
+def test_a_run_that_is_too_short_for_an_episode_is_named():
+    with pytest.raises(ValueError, match="steps=3 is too few: no episode ended in the run of none, seed 0"):
+        compare(**{**GOOD, "steps": 3})
+
+
+# ---------------------------------------------------------------------------------------- processes
+
+
+@pytest.mark.integration
+def test_in_processes_the_results_are_the_same(result):
+    here = compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER, n_jobs=2)
+    assert str(here) == str(result)
+    assert list(map(str, here.reports["TIMBREL"])) == list(map(str, result.reports["TIMBREL"]))
+    with pytest.raises(JobError, match=r"none, seed \d: ValueError: steps=3 is too few"):
+        compare(**{**GOOD, "steps": 3, "n_jobs": 2})
+
+
+@pytest.mark.integration
+def test_it_is_exported_and_imported_only_when_asked_for():
+    assert sb3_combrel.compare is compare
+    assert "compare" in sb3_combrel.__all__
+    code = (
+        "import sys, sb3_combrel; assert 'sb3_combrel.experiments' not in sys.modules; "
+        "assert 'scipy.stats' not in sys.modules; sb3_combrel.compare; assert 'sb3_combrel.experiments.compare' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    with pytest.raises(AttributeError, match="has no attribute 'contrast'"):
+        _ = sb3_combrel.contrast

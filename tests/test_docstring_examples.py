@@ -1,0 +1,51 @@
+"""The examples in the docstrings of what users import run as they are written, but for shorter."""
+
+import inspect
+import re
+import textwrap
+
+import gymnasium
+import numpy as np
+import pytest
+from helpers.walk import small, walk_source
+
+import combrel_envs  # noqa: F401 - registers the environments
+import sb3_combrel
+
+SHORT_CAR = "ShortMountainCar4D-v0"
+
+
+def examples_of(docstring):
+    """The indented blocks after a line that ends in two colons."""
+    blocks = re.findall(r"::\n\n((?:(?:    .*)?\n)+)", inspect.cleandoc(docstring) + "\n")
+    return [textwrap.dedent(block) for block in blocks]
+
+
+@pytest.fixture(autouse=True)
+def short_task():
+    gymnasium.register(SHORT_CAR, gymnasium.spec("combrel/MountainCar4D-v0").entry_point, max_episode_steps=20)
+    yield
+    del gymnasium.registry[SHORT_CAR]
+
+
+def test_examples_are_found():
+    assert examples_of("Text::\n\n    a = 1\n\n    b = 2\n\nMore.") == ["a = 1\n\nb = 2\n\n"]
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", sb3_combrel.__all__)
+def test_whatever_is_exported_has_an_example_that_runs(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    documented = getattr(sb3_combrel, name)
+    found = examples_of(documented.__doc__)
+    assert found, f"{name} has no example"
+    source = sb3_combrel.SourceInstances.record(None, "combrel/MountainCar2D-v0", n_instances=300, seed=0)
+    small(transfer=sb3_combrel.COMBREL(walk_source())).learn(40).save("car")
+    names = {each: getattr(sb3_combrel, each) for each in sb3_combrel.__all__}
+    for example in found:
+        short = re.sub(r"steps=[\d_]+", "steps=60", example).replace("seeds=10", "seeds=2")
+        short = short.replace("combrel/MountainCar4D-v0", SHORT_CAR)
+        exec(compile(short, name, "exec"), names | {"sb3_combrel": sb3_combrel, "source": source, "np": np})
+    written = {path.name for path in tmp_path.iterdir()}
+    expected = {"compare": "curves.png", "explain": "explained", "SourceInstances": "source.npz"}
+    assert expected.get(name, "car.zip") in written

@@ -1,0 +1,304 @@
+"""What transfer did, as a report: against plain computations, for every method, and after saving and loading."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers import factored as f
+from helpers.dashboard import NamedWalk
+from helpers.own_method import Mine
+from helpers.walk import METHODS as ON_WALK
+from helpers.walk import Walk, small, walk_source
+
+from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
+from sb3_combrel.transfer.placed_errors import MIN_TRANSITIONS, N_PARTS, PlacedErrors
+from sb3_combrel.transfer.report import NotBoundError, TransferReport
+
+TWO = f.copies_mapping(2)
+
+
+def bound(transfer, n_variables=4, n_actions=5, seed=0):
+    task = dataclasses.replace(f.target_task(n_variables, n_actions), takes_prior=True)
+    transfer.bind(task, np.random.default_rng(seed))
+    return transfer
+
+
+def shown(transfer, transitions):
+    for state, action, effect in zip(*transitions, strict=True):
+        transfer.observe(state, int(action), -1.0, state + effect, False)
+    return transfer
+
+
+# ------------------------------------------------------------------------------------------- prior
+
+
+@pytest.fixture(scope="module")
+def factored():
+    """COMBREL after transitions of a target that is two copies of a noisy source, and these transitions."""
+    transitions = f.walk(TWO, 200, seed=1)
+    transfer = shown(bound(COMBREL(f.oscillator_source(noise=0.004), "factored", use="prior")), transitions)
+    return transfer, transitions
+
+
+def test_the_mapping_of_a_prior_is_named_with_compliances_and_errors_of_the_targets_transitions(factored):
+    transfer, (states, actions, effects) = factored
+    report = transfer.report()
+    scale = np.abs(effects).mean(axis=0) ** 2
+    places = {0: [0, 1], 1: [2, 3]}
+    assert [each.target_action for each in report.mappings] == [f"a{k}" for k in range(5)]
+    assert report.mappings[3].mapping == "Wait on (s0, s1), Down on (s2, s3)"
+    for a, each in enumerate(report.mappings):
+        rows = actions == a
+        used = {copy: TWO.copies[copy].action[a] for copy in (0, 1)}
+        predicted = np.zeros((rows.sum(), 4))
+        for copy, place in places.items():
+            number = next(k for k, row in enumerate(transfer._prior.copies.state) if row[place].tolist() == [0, 1])
+            predicted[:, place] = f.predicted_by(transfer._prior.copies, number, used[copy], states[rows])[:, place]
+        squared = (effects[rows] - predicted) ** 2
+        assert each.compliance == pytest.approx(np.exp(-(squared / scale).sum(axis=1)).mean(), rel=1e-3)
+        assert each.no_change_compliance == pytest.approx(np.exp(-(effects[rows] ** 2 / scale).sum(axis=1)).mean())
+        assert each.error == pytest.approx(squared.sum() / (effects[rows] ** 2).sum(), rel=1e-3)
+        assert each.n_compared == rows.sum()
+        assert each.compliance > each.next_best_compliance and each.error < each.next_best_error
+        # One of the two copies is moved by another source action.
+        ours, theirs = each.mapping.split(" on "), each.next_best.split(" on ")
+        assert len(ours) == len(theirs) and ours != theirs
+
+
+def test_the_next_best_division_lacks_a_copy_and_predicts_worse(factored):
+    report = factored[0].report()
+    assert report.next_best and not {"(s0, s1)", "(s2, s3)"} <= set(report.next_best.split(" and "))
+    assert report.next_best_error > report.error
+
+
+def test_steps_that_rest_on_a_prior_are_those_whose_outcome_it_claims_to_know():
+    transfer, states, actions, effects = bound(COMBREL(f.oscillator_source(), "factored", use="prior")), *f.walk(TWO, 150)
+    claimed = 0
+    for state, action, effect in zip(states, actions, effects, strict=True):
+        claimed += transfer.prior(state[None], np.array([action])).weight[0] > 0.0
+        transfer.observe(state, int(action), -1.0, state + effect, False)
+    report = transfer.report()
+    assert (report.n_steps, report.n_rested) == (150, claimed) and 0 < claimed < 150
+
+
+def test_the_compliance_in_logs_stays_when_no_more_transitions_are_recorded():
+    transfer = bound(COMBREL(f.oscillator_source(noise=0.01), "factored", use="prior", max_transitions=60))
+    states, actions, effects = f.walk(TWO, 300, seed=3)
+    shown(transfer, (states[:60], actions[:60], effects[:60]))
+    before = transfer._prior.mean_compliance()
+    shown(transfer, (states[60:], actions[60:], effects[60:]))
+    np.testing.assert_array_equal(transfer._prior.mean_compliance(), before)
+
+
+@pytest.mark.filterwarnings("ignore:what was transferred")
+def test_where_the_target_contradicts_a_source_is_said_by_action_variable_and_raw_range():
+    def turned(states, actions):
+        # In the upper part of the first variable everything goes the other way.
+        return f.oscillate(states, actions) * np.where(states[:, :1] > 0.75, -1.0, 1.0)
+
+    rng = np.random.default_rng(0)
+    states, actions = rng.random((400, 2)), rng.integers(3, size=400)
+    transfer = bound(TIMBREL(f.oscillator_source(), f.copies_mapping(1), use="prior"), 2, 3)
+    shown(transfer, (states, actions, turned(states, actions)))
+    report = transfer.report()
+    found = [each for each in report.contradictions if each.variable == "s0"]
+    assert {(each.low, each.high) for each in found} == {(0.75, 1.0)}
+    assert {each.target_action for each in found} == {"a0", "a1", "a2"}
+    # Twice the effect is missed.
+    assert all(each.error == pytest.approx(4.0, rel=0.1) for each in found)
+    assert report.n_worse == pytest.approx(0.25 * report.n_compared, rel=0.3)
+    assert "s0 from 0.75 to 1" in str(report)
+
+
+def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
+    """After a switch the errors are those that the new mapping would have made from the start."""
+    wrong, right = f.walk(f.copies_mapping(2, [0, 2, 1, 3]), 40, seed=2), f.walk(TWO, 500, seed=3)
+    transfer = bound(COMBREL(f.oscillator_source(), "factored", use="prior"))
+    shown(transfer, wrong)
+    before = transfer.describe_prior()
+    shown(transfer, right)
+    assert transfer.describe_prior() != before and transfer.statistics()["transfer/switches"] >= 1
+    prior, errors = transfer._prior, PlacedErrors(transfer.task)
+    for state, action, effect in zip(*(np.concatenate(parts) for parts in zip(wrong, right, strict=True)), strict=True):
+        predicted, _, _, weight = prior.copies.predict(prior._used, prior._work_space, state[None], np.array([action]))
+        if weight[0] >= prior.copies.threshold:
+            errors.note(state, int(action), effect, predicted[0])
+    np.testing.assert_allclose(prior.errors.sums, errors.sums, rtol=1e-6, atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------- instances
+
+
+def test_errors_by_place_are_those_of_a_loop():
+    rng, task = np.random.default_rng(0), f.target_task(2, 3)
+    errors, rows = PlacedErrors(task), []
+    for _ in range(300):
+        state, effect, predicted = rng.uniform(-0.1, 1.1, 2), *(0.1 * rng.normal(size=(2, 2)))
+        rows.append((state, int(rng.integers(3)), effect, predicted))
+        errors.note(*rows[-1])
+    for action in range(3):
+        its = [(s, e, p) for s, a, e, p in rows if a == action]
+        squared = sum(((e - p) ** 2).sum() for _, e, p in its), sum((e**2).sum() for _, e, _ in its)
+        assert errors.errors()[action] == pytest.approx(squared[0] / squared[1])
+    expected = set()
+    for a in range(3):
+        for v in range(2):
+            for part in range(N_PARTS):
+                last = part == N_PARTS - 1
+                inside = [
+                    (e, p)
+                    for s, b, e, p in rows
+                    if a == b and (s[v] >= part / N_PARTS or part == 0) and (s[v] < (part + 1) / N_PARTS or last)
+                ]
+                missed, moved = (
+                    sum((x**2).sum() for x in each) for each in zip(*((e - p, e) for e, p in inside), strict=True)
+                )
+                if len(inside) >= MIN_TRANSITIONS and missed > moved:
+                    expected.add((f"a{a}", f"s{v}", part / N_PARTS, len(inside), round(missed / moved, 9)))
+    found = errors.contradictions()
+    listed = {(e.target_action, e.variable, e.low, e.n_compared, round(e.error, 9)) for e in found}
+    assert listed <= expected and len(found) == min(8, len(expected)) and len(found) > 0
+
+
+@pytest.mark.parametrize("name", ["TIMBREL", "COMBREL"])
+def test_steps_that_rest_on_instances_are_those_whose_action_had_some(name, monkeypatch):
+    method, rested, last = type(ON_WALK[name]()), [], {}
+
+    def noted(self, transferred):
+        last["length"] = transferred.length.copy()
+        note_use(self, transferred)
+
+    def observed(self, state, action, *rest):
+        rested.append(bool(last.get("length", np.zeros(2))[action] > 0))
+        last.clear()
+        observe(self, state, action, *rest)
+
+    note_use, observe = method.note_use, method.observe
+    monkeypatch.setattr(method, "note_use", noted)
+    monkeypatch.setattr(method, "observe", observed)
+    model = small(transfer=ON_WALK[name](), model_breadth=0.03, resolution=5).learn(120)
+    report = model.transfer.report()
+    assert (report.n_steps, report.n_rested) == (120, sum(rested)) and sum(rested) > 0
+    assert report.n_compared == sum(rested) == sum(each.n_compared for each in report.mappings)
+
+
+def test_the_confidence_of_combrel_is_that_of_its_choices_and_they_are_the_best():
+    source = SourceInstances.record(None, NamedWalk(), n_instances=200, seed=0)
+    transfer = COMBREL(source, "signed_injective", use="instances", min_compliance=1.0)
+    model = small(NamedWalk(), transfer=transfer, degree=0).learn(150)
+    selector = model.transfer._selector
+    # Choices that are due wait until there is more to renew, or an episode ends.
+    selector.end_episode()
+    selector.changed(np.zeros((2, len(selector.task.sample_states)), dtype=np.bool_))
+    report = model.transfer.report()
+    for action, each in enumerate(report.mappings):
+        n = len(selector.task.sample_states)
+        pairs = action * n + np.flatnonzero(selector.choices()[action * n : (action + 1) * n] >= 0)
+        assert 0 < len(pairs) <= 500
+        assert each.compliance == pytest.approx(selector.mean_compliance(pairs).mean())
+        # What does not exceed the no-change baseline is not chosen.
+        assert each.compliance >= each.next_best_compliance and each.compliance > each.no_change_compliance
+    assert report.mappings[1].target_action == "forth" and "place<-" in report.mappings[1].mapping
+    uses = model.transfer.uses()
+    of_action = {c: n for c, n in uses.items() if model.transfer.candidate(c).target_action == 1}
+    assert report.mappings[1].share == max(of_action.values()) / sum(of_action.values())
+    assert report.mappings[1].n_mappings == len(of_action)
+
+
+# ------------------------------------------------------------------------------------- all methods
+
+SOURCE = walk_source()
+ALL = {
+    "COMBREL, prior": lambda: COMBREL(SOURCE),
+    "COMBREL, set as prior": lambda: COMBREL(SOURCE, "injective", use="prior"),
+    "COMBREL, instances": lambda: COMBREL(SOURCE, use="instances"),
+    "COMBREL, whole mappings": lambda: COMBREL(SOURCE, neighbors="state_action"),
+    "COMBREL, paper": lambda: COMBREL.paper(SOURCE),
+    "COMBREL, two sources": lambda: COMBREL([SOURCE, SOURCE], use="instances"),
+    "TIMBREL": lambda: TIMBREL(SOURCE, InterTaskMapping((0, 1), (0, 1))),
+    "TIMBREL, prior": lambda: TIMBREL(SOURCE, FactoredMapping([InterTaskMapping((0, 1), (0, 1))]), use="prior"),
+    "TIMBREL, random": lambda: TIMBREL(SOURCE),
+    "TIMBREL, random prior": lambda: TIMBREL(SOURCE, "random", mappings="factored", use="prior"),
+    "TIMBREL, pool": lambda: TIMBREL(SOURCE, "pool"),
+    "a user's own": lambda: Mine(reward=-2.0),
+}
+
+
+@pytest.mark.filterwarnings("ignore:what was transferred")
+@pytest.mark.parametrize("name", ALL)
+def test_every_method_reports_and_says_the_same_when_it_is_loaded(name, tmp_path):
+    model = small(transfer=ALL[name]()).learn(90)
+    report = model.transfer.report()
+    text = str(report)
+    assert isinstance(report, TransferReport) and text == str(model.policy.transfer.report())
+    assert text.startswith(type(model.transfer).__name__ + "(") and "nan" not in text
+    if name == "a user's own":
+        assert text.startswith("Mine(reward=-2.0)") and "says nothing of its mappings" in text
+    else:
+        assert report.n_steps == 90 and "of 90 steps" in text
+        assert [each.target_action for each in report.mappings] == ["a0", "a1"]
+    model.save(tmp_path / "model")
+    assert str(FittedRMax.load(tmp_path / "model").transfer.report()) == text
+
+
+def test_reporting_changes_nothing():
+    models = [small(transfer=COMBREL(SOURCE, use="instances")).learn(60) for _ in range(2)]
+    str(models[0].transfer.report())
+    one, other = (model.learn(60, reset_num_timesteps=False).get_parameters()["policy"] for model in models)
+    assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_results_that_are_not_there_yet_are_refused_with_what_to_do(name):
+    unbound = ALL[name]()
+    with pytest.raises(NotBoundError, match=r"after model = FittedRMax\(env, transfer=...\).learn\(\), .* model.transfer"):
+        unbound.report()
+    if name == "a user's own":
+        return
+    for result in (
+        unbound.mapping_counts,
+        unbound.choices,
+        unbound.statistics,
+        unbound.describe_prior,
+        lambda: unbound.sources,
+    ):
+        with pytest.raises(NotBoundError, match="has no results"):
+            result()
+    assert not hasattr(unbound, "sources")
+    with pytest.raises(ValueError, match=r"nothing to report before learning: call model.learn"):
+        small(transfer=unbound).transfer.report()
+
+
+def test_an_object_shows_its_arguments():
+    text = repr(COMBREL(SOURCE, n_neighbors=5, use="instances"))
+    assert text == f"COMBREL(source={SOURCE!r}, mappings='injective', n_neighbors=5, use='instances')"
+    given = TIMBREL(SOURCE, InterTaskMapping((0, 1), (0, 1)), breadth=0.2)
+    assert repr(given) == f"TIMBREL(source={SOURCE!r}, mapping=InterTaskMapping(state=(0, 1), action=(0, 1)), breadth=0.2)"
+    assert repr(COMBREL(SOURCE)) == f"COMBREL(source={SOURCE!r})"
+    assert repr(Mine()) == "Mine()" and repr(Mine(3.0)) == "Mine(reward=3.0)"
+
+
+def test_dir_has_what_is_for_the_user():
+    for transfer in (COMBREL(SOURCE), small(transfer=COMBREL(SOURCE)).transfer):
+        names = {name for name in dir(transfer) if not name.startswith("__")}
+        assert {"report", "describe_prior", "mapping_counts", "source", "mappings", "use"} <= names
+        assert not any(name.startswith("_") for name in names)
+        assert not {"bind", "observe", "transferred", "set_state", "note_use"} & names
+
+
+def test_the_model_holds_the_method_in_use(tmp_path):
+    given = COMBREL(SOURCE)
+    model = small(transfer=given).learn(40)
+    assert model.transfer is model.policy.transfer is not given and given.task is None
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
+    assert loaded.transfer is loaded.policy.transfer
+    loaded.set_parameters(model.get_parameters())
+    assert loaded.transfer is loaded.policy.transfer
+    assert str(loaded.transfer.report()) == str(model.transfer.report())
+    assert FittedRMax(Walk()).transfer is None
+    # One model's method may be given to another, which then has a copy that has learned nothing.
+    other = small(transfer=model.transfer)
+    assert other.transfer is not model.transfer
+    with pytest.raises(ValueError, match="nothing to report before learning"):
+        other.transfer.report()
