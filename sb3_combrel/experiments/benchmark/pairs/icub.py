@@ -1,0 +1,43 @@
+"""The iCub's torso is the source of its arm, both striking a ball (Section 5.2 of the COMBREL paper)."""
+
+from sb3_combrel import FactoredMapping, InterTaskMapping
+from sb3_combrel.experiments import icub_arm
+from sb3_combrel.experiments.benchmark.pair import Pair
+from sb3_combrel.experiments.suite_tasks import STRIKE, TORSO
+
+PITCH, YAW = 0, 1
+# Actions of the torso: 2k moves joint k in the negative, 2k + 1 in the positive direction.
+N_JOINTS = 4
+
+
+def moves_like(joint: int, torso_joint: int) -> InterTaskMapping:
+    """
+    Map one joint of the arm to one of the torso.
+
+    :param joint: of the arm; commands to others leave it where it is, as commands to the torso's other joint do there
+    :param torso_joint: 0 for pitch, 1 for yaw
+    """
+    state = [torso_joint if k == joint else None for k in range(N_JOINTS)]
+    rest = 2 * (1 - torso_joint)
+    action = [2 * torso_joint + a % 2 if a // 2 == joint else rest for a in range(2 * N_JOINTS)]
+    return InterTaskMapping(tuple(state), tuple(action))
+
+
+# A command moves a joint by two degrees. In parts of their ranges the elbow moves as far as the torso's pitch does; of the
+# shoulder's three joints each is nearer to the yaw.
+COPIES = (moves_like(0, YAW), moves_like(1, YAW), moves_like(2, YAW), moves_like(3, PITCH))
+
+PAIR = Pair(
+    name="icub",
+    description=(
+        "The iCub's torso to its right arm, two joints to four, both strike a ball. Known, to the length of a move: a command "
+        "moves a joint as the same kind of command moves one of the torso, and leaves the others. The ball's place is not."
+    ),
+    sources=(TORSO,),
+    target=icub_arm.TARGET_ID,
+    n_steps=5000,
+    threshold=50.0,
+    learner=STRIKE,
+    known=FactoredMapping(COPIES),
+    known_by_action=tuple(COPIES[a // 2] for a in range(2 * N_JOINTS)),
+)
