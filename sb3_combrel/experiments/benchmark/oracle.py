@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -28,20 +29,22 @@ class KnownCopies(TIMBREL):
         n_sources = len(load_sources(source))
         if len(mapping) != n_sources:
             raise ValueError(f"mapping must hold one factored mapping for each of {n_sources} sources, got {len(mapping)}")
-        # What arguments() returns.
-        self.mapping = tuple(mapping)  # type: ignore[assignment]
+        self.by_source = tuple(mapping)
+
+    def arguments(self) -> dict[str, Any]:
+        return {"source": self.source, "mapping": self.by_source}
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         sources = load_sources(self.source)
         copies = []
-        for number, (source, each) in enumerate(zip(sources, self.mapping, strict=True)):
-            each.check(  # type: ignore[union-attr]
+        for number, (source, each) in enumerate(zip(sources, self.by_source, strict=True)):
+            each.check(
                 n_source_variables=source.n_variables,
                 n_target_variables=task.n_variables,
                 n_source_actions=source.n_actions,
                 n_target_actions=task.n_actions,
             )
-            copies += [(number, copy) for copy in each.copies]  # type: ignore[union-attr]
+            copies += [(number, copy) for copy in each.copies]
         numbers = np.array([number for number, _ in copies], dtype=np.int64)
         state, sign = (np.array([getattr(copy, name) for _, copy in copies]) for name in ("state_index", "state_sign"))
         actions = np.array([copy.action for _, copy in copies], dtype=np.int64).T.copy()

@@ -58,8 +58,8 @@ class Pair:
     """
     One or several source tasks and a target task. Exactly one of ``n_steps`` and ``n_episodes`` is given.
 
-    Performance is the mean return of an episode of learning: over the episodes if ``n_episodes`` is given, over environment steps
-    (an episode counts as often as it has steps) if ``n_steps`` is.
+    Performance is the mean return of an episode of learning: over the episodes if ``n_episodes`` is given, over environment
+    steps (an episode counts as often as it has steps) if ``n_steps`` is.
 
     :param name: on the command line and in files: letters, digits, "-", "_" and "."
     :param description: in the report: what the tasks are, and what is known of how they correspond
@@ -69,11 +69,11 @@ class Pair:
     :param n_episodes: episodes to learn
     :param threshold: of the time to threshold: a return; None: it is not measured
     :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, chosen for learning without transfer
-    :param known: the known mapping, as a prior: a factored mapping, one :class:`InterTaskMapping` for each target action, or for
-        several sources one factored mapping for each; None if nobody knows it
-    :param known_by_action: the known mapping, for instances: one :class:`InterTaskMapping`, or one for each target action. It says
-        which variables an action moves, and by it is decided whether a method has chosen the known mapping: the variables that it
-        maps must be mapped to the same source variables, by the same source action. None if nobody knows it
+    :param known: the known mapping, as a prior: a factored mapping, one :class:`InterTaskMapping` for each target action, or
+        for several sources one factored mapping for each; None if nobody knows it
+    :param known_by_action: the known mapping, for instances: one :class:`InterTaskMapping`, or one for each target action. It
+        says which variables an action moves, and by it is decided whether a method has chosen the known mapping: the variables
+        that it maps must be mapped to the same source variables, by the same source action. None if nobody knows it
     :param sources_by_action: number of the source of each of ``known_by_action``; () for the first source throughout
     :param mappings: the set that methods choose from with priors, "factored" or "signed_factored"
     :param instance_mappings: the set that they choose from with instances, such as "injective" or "signed_injective"
@@ -106,7 +106,9 @@ class Pair:
         if self.threshold is not None:
             check_finite("threshold", self.threshold)
         if not self.sources or not all(isinstance(source, Source) for source in self.sources):
-            raise ValueError(f"{self.name}: sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}")
+            raise ValueError(
+                f"{self.name}: sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}"
+            )
         several = isinstance(self.known, Sequence) and all(isinstance(each, FactoredMapping) for each in self.known)
         if several and len(self.known) != len(self.sources):  # type: ignore[arg-type]
             raise ValueError(

@@ -10,28 +10,25 @@ PITCH, YAW = 0, 1
 N_JOINTS = 4
 
 
-def moves_like(joint: int, torso_joint: int) -> InterTaskMapping:
+def moves_like_yaw(joint: int) -> InterTaskMapping:
     """
-    Map one joint of the arm to one of the torso.
+    Map one joint of the arm to the torso's yaw.
 
-    :param joint: of the arm; commands to others leave it where it is, as commands to the torso's other joint do there
-    :param torso_joint: 0 for pitch, 1 for yaw
+    :param joint: of the arm; commands to others leave it where it is, as commands to the torso's pitch leave the yaw
     """
-    state = [torso_joint if k == joint else None for k in range(N_JOINTS)]
-    rest = 2 * (1 - torso_joint)
-    action = [2 * torso_joint + a % 2 if a // 2 == joint else rest for a in range(2 * N_JOINTS)]
+    state = [YAW if k == joint else None for k in range(N_JOINTS)]
+    action = [2 * YAW + a % 2 if a // 2 == joint else 2 * PITCH for a in range(2 * N_JOINTS)]
     return InterTaskMapping(tuple(state), tuple(action))
 
 
-# A command moves a joint by two degrees. In parts of their ranges the elbow moves as far as the torso's pitch does; of the
-# shoulder's three joints each is nearer to the yaw.
-COPIES = (moves_like(0, YAW), moves_like(1, YAW), moves_like(2, YAW), moves_like(3, PITCH))
+# The torso's pitch would do as well, but the table stops it, where it stops no joint of the arm.
+COPIES = tuple(moves_like_yaw(joint) for joint in range(N_JOINTS))
 
 PAIR = Pair(
     name="icub",
     description=(
         "The iCub's torso to its right arm, two joints to four, both strike a ball. Known, to the length of a move: a command "
-        "moves a joint as the same kind of command moves one of the torso, and leaves the others. The ball's place is not."
+        "moves a joint as the same kind of command moves the torso's yaw, and leaves the others. The ball's place is not."
     ),
     sources=(TORSO,),
     target=icub_arm.TARGET_ID,

@@ -7,8 +7,8 @@ from sb3_combrel.experiments.benchmark.pairs.point_robot import ROBOT_2D
 PAIR = Pair(
     name="nothing-in-common",
     description=(
-        "A point robot among walls to MountainCar-v0. The robot's moves are long, the same everywhere, and stop with the command; "
-        "the car's depend on the hill and on its velocity. The right answer is to transfer nothing."
+        "A point robot among walls to MountainCar-v0. The robot's moves are long, the same everywhere, and stop with the "
+        "command; the car's depend on the hill and on its velocity. The right answer is to transfer nothing."
     ),
     sources=(ROBOT_2D,),
     target=make_car,

@@ -1,7 +1,5 @@
 """Pendulum to Acrobot, both in angles, which are periodic: nobody knows how they correspond."""
 
-import functools
-
 import gymnasium as gym
 from gymnasium.wrappers import DiscretizeAction
 

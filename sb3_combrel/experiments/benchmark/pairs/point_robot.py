@@ -16,8 +16,8 @@ UPWARD = InterTaskMapping(state=(None, None, 1), action=(0, 1, 2, 3, 2, 3))
 PAIR = Pair(
     name="point-robot",
     description=(
-        "A point among walls, from two variables to three; walls are as they were, and stand along the third axis too. Known: in "
-        "the plane everything is the same, and the third axis is like the second, which no wall bars."
+        "A point among walls, from two variables to three; walls are as they were, and stand along the third axis too. Known: "
+        "in the plane everything is the same, and the third axis is like the second, which no wall bars."
     ),
     sources=(ROBOT_2D,),
     target=functools.partial(make_point_robot, 3, SLIGHT_NOISE, "random"),
