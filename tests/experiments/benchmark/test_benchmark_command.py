@@ -177,7 +177,10 @@ class TestResuming:
 
     def test_more_seeds_and_methods_add_to_what_is_there(self, copied, files):
         done = again(copied, files, "--seeds", 4, "--methods", "none", "random-by-run")
-        assert sorted(done) == ["two-walks, none, seed 7003", *(f"two-walks, random-by-run, seed {s}" for s in range(7000, 7004))]
+        assert sorted(done) == [
+            "two-walks, none, seed 7003",
+            *(f"two-walks, random-by-run, seed {s}" for s in range(7000, 7004)),
+        ]
         assert [row["method"] for row in rows_of(copied / "two-walks.csv")] == ["none", "random-by-run"]
 
     def test_an_interrupted_call_is_continued(self, made, files, monkeypatch, tmp_path):

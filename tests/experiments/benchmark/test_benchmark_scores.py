@@ -9,7 +9,14 @@ from scipy import stats
 
 from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.report import estimate_text, note_of, pair_table, performance_table, rank_table, write_report
+from sb3_combrel.experiments.benchmark.report import (
+    estimate_text,
+    note_of,
+    pair_table,
+    performance_table,
+    rank_table,
+    write_report,
+)
 from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.benchmark.scores import Cell, cells_of, compare, interquartile, mean_ranks, performances, ranks
 from sb3_combrel.experiments.statistics import holm
@@ -133,7 +140,11 @@ class TestRanks:
         }
         performance = {name: performances(pair_of(name), cells[name]) for name in cells}
         found = mean_ranks(performance, cells)
-        assert {name: (each.rank, each.n_pairs) for name, each in found.items()} == {"a": (3.0, 2), "b": (1.5, 2), "c": (1.0, 1)}
+        assert {name: (each.rank, each.n_pairs) for name, each in found.items()} == {
+            "a": (3.0, 2),
+            "b": (1.5, 2),
+            "c": (1.0, 1),
+        }
 
     def test_with_too_few_runs_in_a_pair_there_is_no_interval(self):
         pair, cells = cells_by({"a": 0.0, "b": 1.0}, n_seeds=2)
@@ -153,7 +164,8 @@ class TestComparison:
             difference = abs(performance[name].mean() - performance[NONE].mean())
             splits = [set(chosen) for chosen in itertools.combinations(range(10), 5)]
             means = [
-                abs(np.mean([together[k] for k in s]) - np.mean([together[k] for k in range(10) if k not in s])) for s in splits
+                abs(np.mean([together[k] for k in s]) - np.mean([together[k] for k in range(10) if k not in s]))
+                for s in splits
             ]
             raw.append(np.mean(np.array(means) >= difference - 1e-12))
         np.testing.assert_allclose([found[name].p_value for name in "abc"], holm(np.array(raw)))
@@ -214,7 +226,9 @@ class TestTables:
     def test_performance_of_all_pairs(self, found):
         pair, cells, compared, _ = found
         table = performance_table([pair], self.METHODS, {pair.name: cells}, {pair.name: compared})
-        assert [row[1].endswith(end) for row, end in zip(table.rows, (" (2)", "* (1)", "", "* (3)"), strict=True)] == [True] * 4
+        assert [row[1].endswith(end) for row, end in zip(table.rows, (" (2)", "* (1)", "", "* (3)"), strict=True)] == [
+            True
+        ] * 4
         assert table.rows[2] == ("b", "")
 
     def test_a_report_without_any_run(self, tmp_path):
