@@ -9,7 +9,7 @@ from typing import Any
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, SourceInstances
 from sb3_combrel.experiments.benchmark.oracle import KnownCopies
-from sb3_combrel.experiments.benchmark.pair import Pair
+from sb3_combrel.experiments.benchmark.pair import Pair, check_name
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.transfer.base import Transfer
 
@@ -37,6 +37,7 @@ class Method:
     :param finds_mapping: whether it finds a mapping by itself, so that it takes target steps until it has one
     :param same_as: of a pair: name of another method that makes the same there, or None; it is then run once
     :param digest: of the file in which a third party defines it; "" for the package's own
+    :raises ValueError: if the name has other characters than letters, digits, "-", "_" and "."
     """
 
     name: str
@@ -45,6 +46,9 @@ class Method:
     finds_mapping: bool = False
     same_as: Callable[[Pair], str | None] | None = None
     digest: str = ""
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
 
     def run_as(self, pair: Pair) -> str:
         """Name of the method whose runs are this one's in a pair."""

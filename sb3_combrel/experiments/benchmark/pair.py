@@ -95,8 +95,7 @@ class Pair:
     instance_mappings: str = "injective"
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.name, str) and re.fullmatch(r"[\w.-]+", self.name)):
-            raise ValueError(f'name must be of letters, digits, "-", "_" and ".", got {self.name!r}')
+        check_name(self.name)
         if (self.n_steps is None) == (self.n_episodes is None):
             raise ValueError(
                 f"{self.name}: either n_steps or n_episodes must be given, got {self.n_steps!r} and {self.n_episodes!r}"
@@ -151,6 +150,16 @@ class Pair:
             **{name: described(value) for name, value in values.items()},
             "sources": {source.name: described(source.learn) for source in self.sources},
         }
+
+
+def check_name(name: object) -> None:
+    """
+    Check the name of a pair or a method, which is part of the names of files.
+
+    :raises ValueError: if it has other characters than letters, digits, "-", "_" and "."
+    """
+    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
+        raise ValueError(f'name must be of letters, digits, "-", "_" and ".", got {name!r}')
 
 
 def described(value: Any) -> Any:

@@ -92,7 +92,7 @@ class TestPerformance:
 
 class TestRanks:
     def test_the_best_has_1_and_equal_ones_share(self):
-        pair, cells = cells_by({"a": 0.0, "b": 5.0, "c": 10.0})
+        _, cells = cells_by({"a": 0.0, "b": 5.0, "c": 10.0})
         performance = {name: np.array(values) for name, values in {"a": [1.0] * 4, "b": [7.0] * 4, "c": [1.0] * 4}.items()}
         assert ranks(performance, cells) == {"a": 2.5, "b": 1.0, "c": 2.5}
 
@@ -152,11 +152,12 @@ class TestRanks:
         assert np.isnan(found["a"].low) and np.isnan(found["a"].high) and found["a"].rank in (1.0, 2.0)
 
 
-class TestComparison:
-    LEVELS = {NONE: 0.0, "a": 5.0, "b": 0.1, "c": -5.0}
+LEVELS = {NONE: 0.0, "a": 5.0, "b": 0.1, "c": -5.0}
 
+
+class TestComparison:
     def test_p_values_are_corrected_over_the_methods_of_a_pair(self):
-        pair, cells = cells_by(self.LEVELS)
+        pair, cells = cells_by(LEVELS)
         found, performance = compare(pair, cells), performances(pair, cells)
         raw = []
         for name in "abc":
@@ -173,7 +174,7 @@ class TestComparison:
         assert [found[name].better for name in "ac"] == [True, False]
 
     def test_measures_are_differences_to_no_transfer(self):
-        pair, cells = cells_by(self.LEVELS)
+        pair, cells = cells_by(LEVELS)
         found = compare(pair, cells)["a"].measures
         returns = {name: np.array([each.returns for each in cells[name].outcomes]) for name in ("a", NONE)}
         difference = returns["a"] - returns[NONE]
@@ -188,7 +189,7 @@ class TestComparison:
         assert set(found) == {"a", "b"} and all(each.measures is None and np.isnan(each.p_value) for each in found.values())
 
     def test_two_runs_are_not_tested(self):
-        pair, cells = cells_by(self.LEVELS, n_seeds=2)
+        pair, cells = cells_by(LEVELS, n_seeds=2)
         found = compare(pair, cells)
         assert all(np.isnan(each.p_value) for each in found.values())
         assert all(np.isnan(p) for p in found["a"].p_values.values())
@@ -246,11 +247,16 @@ class TestTables:
 
 def test_holm_and_ranks_agree_with_scipy_where_it_has_them():
     values = np.random.default_rng(0).normal(size=(4, 6))
-    pair, cells = cells_by({name: 0.0 for name in "abcd"})
+    _, cells = cells_by({name: 0.0 for name in "abcd"})
     found = ranks(dict(zip("abcd", values, strict=True)), cells)
     np.testing.assert_array_equal(list(found.values()), stats.rankdata([-naive_iqm(row) for row in values]))
 
 
+def test_a_method_whose_name_is_no_file_name_is_refused():
+    with pytest.raises(ValueError, match=r'name must be of letters, digits, "-", "_" and "\.", got \'a/b\''):
+        method_of("a/b")
+
+
 def test_each_method_of_the_package_says_what_it_is():
-    assert list(METHODS)[0] == NONE
+    assert next(iter(METHODS)) == NONE
     assert all(method.description and name == method.name for name, method in METHODS.items())
