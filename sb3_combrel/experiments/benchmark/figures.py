@@ -15,14 +15,14 @@ from sb3_combrel.experiments.transfer_measures import LearningCurves
 
 #: Moving average over so many episodes.
 WINDOW = 5
-_COLOURS = (*COLOURS, "#56B4E9", "#E69F00")
+_COLOURS = (*COLOURS, "#56B4E9", "#E69F00", "#000000", "#8C564B", "#999933")
 _LINES = ("-", "--", ":")
 #: A curve over environment steps has so many points.
 _N_POINTS = 100
 
 
 def style_of(number: int) -> tuple[str, str]:
-    """Colour and line of the method with this number; the first twenty-one differ."""
+    """Colour and line of the method with this number; the first thirty differ."""
     return _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS) % len(_LINES)]
 
 
@@ -37,7 +37,8 @@ def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Comp
     :return: the PNG and the SVG file
     """
     figure, (left, right) = panels_of(2, f"{pair.name}: {pair.budget}", sharey=False)
-    names = [name for name in cells if name in compared]
+    # Methods whose runs are the same are drawn once.
+    names = [name for name in compared if cells[name].run_as == name or cells[name].run_as not in compared]
     numbers = {name: number for number, name in enumerate(cells)}
     for name in names:
         curves = curves_of(cells[name].outcomes)

@@ -116,15 +116,26 @@ class BenchmarkJob:
         return self.method.make(sources, self.pair)
 
 
+def has_mapping(transfer: Any) -> bool:
+    """
+    Whether a transfer method has chosen a mapping for any state and action.
+
+    Where it does not name what it chooses for states of the sample, as methods of this package do, whether it has used one.
+    """
+    if getattr(transfer, "makes_choices", False):
+        return bool((transfer.choices() >= 0).any())
+    return bool(transfer.uses())
+
+
 class MappingRecorder(BaseCallback):
-    """Counts the steps until a transfer method first transfers something through a mapping that it has chosen."""
+    """Counts the steps until a transfer method has a mapping."""
 
     def __init__(self) -> None:
         super().__init__()
         self.steps: int | None = None
 
     def _on_step(self) -> bool:
-        if self.steps is None and self.model.agent.transfer.uses():  # type: ignore[attr-defined]
+        if self.steps is None and has_mapping(self.model.agent.transfer):  # type: ignore[attr-defined]
             self.steps = self.num_timesteps
         return True
 
@@ -208,7 +219,7 @@ def known_share(pair: Pair, transfer: Any) -> float | None:
 
 
 def _mapping_steps(method: Method, model: Any, mapping: MappingRecorder) -> int | None:
-    """What the method says of itself; or the steps until it first transferred something, all if it never did."""
+    """What the method says of itself; or the steps until it first had a mapping, all if it never had."""
     transfer = model.agent.transfer
     if hasattr(transfer, "mapping_steps"):
         return int(transfer.mapping_steps())

@@ -11,12 +11,12 @@ from gymnasium.utils.env_checker import check_env
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
 from sb3_combrel.experiments.benchmark.cart_with_pendulum import PARTS, CartWithPendulumEnv, make_cart_with_pendulum
 from sb3_combrel.experiments.benchmark.known import errors_of, known_error
-from sb3_combrel.experiments.benchmark.methods import METHODS, DoesNotFit
+from sb3_combrel.experiments.benchmark.methods import METHODS, DoesNotFit, Method
 from sb3_combrel.experiments.benchmark.pair import Pair, described, make_env, recorded
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
 from sb3_combrel.experiments.benchmark.pairs.mirrored_car import ACTIONS, ORDER, SIGNS, make_car, make_disguised
 from sb3_combrel.experiments.benchmark.renamed import disguise, disguised, mirrored
-from sb3_combrel.experiments.benchmark.runs import known_share
+from sb3_combrel.experiments.benchmark.runs import BenchmarkJob, carry_out, has_mapping, known_share
 from sb3_combrel.experiments.runs import chosen_on_purpose
 from sb3_combrel.transfer.candidates import MappedVariables
 
@@ -170,6 +170,54 @@ class TestAgreement:
         assert known_share(replace(self.PAIR, known_by_action=None), Chooser()) is None
         Chooser.uses = lambda self: {}
         assert known_share(self.PAIR, Chooser()) is None
+
+
+class TestStepsToAMapping:
+    class Chooser:
+        """Names a candidate for one of three pairs from some number of questions on."""
+
+        def __init__(self, makes_choices, n_before):
+            self.makes_choices, self.left = makes_choices, n_before
+
+        def choices(self):
+            self.left -= 1
+            return np.array([-1, 4 if self.left < 0 else -1, -1])
+
+        def uses(self):
+            self.left -= 1
+            return {4: 1} if self.left < 0 else {}
+
+    @pytest.mark.parametrize("makes_choices", [True, False])
+    def test_a_mapping_is_there_when_a_candidate_is_named(self, makes_choices):
+        transfer = self.Chooser(makes_choices, 2)
+        assert [has_mapping(transfer) for _ in range(4)] == [False, False, True, True]
+
+    def test_of_combrel_are_its_first_ten_transitions(self, sources):
+        """A prior is chosen after ten, which the recorder sees after the next step at the latest."""
+        pair = replace(PAIRS["mirrored-car"], n_steps=250)
+        for name, steps in (("COMBREL-factored", (10, 11)), ("COMBREL-instances", (1, 3)), ("oracle", (None,))):
+            found = carry_out(BenchmarkJob(pair, METHODS[name], 0, sources["mirrored-car"]))
+            assert not found.error and found.mapping_steps in steps and found.n_steps == 250
+
+    def test_a_method_may_say_what_it_spends(self, sources):
+        class Spender(COMBREL):
+            def mapping_steps(self):
+                return 77
+
+        pair, method = replace(PAIRS["mirrored-car"], n_steps=250), Method("spender", "", lambda source, pair: Spender(source))
+        assert carry_out(BenchmarkJob(pair, method, 0, sources["mirrored-car"])).mapping_steps == 77
+
+
+def test_a_budget_without_the_end_of_an_episode_is_an_error(sources):
+    pair = replace(PAIRS["mirrored-car"], n_steps=100)
+    found = carry_out(BenchmarkJob(pair, METHODS["none"], 0, sources["mirrored-car"]))
+    assert "no episode has ended within n_steps=100" in found.error and not found.misfit
+
+
+def test_a_learner_that_cannot_be_made_is_no_misfit_of_the_method(sources):
+    pair = replace(PAIRS["mirrored-car"], learner={"model_breadth": -1.0})
+    found = carry_out(BenchmarkJob(pair, METHODS["COMBREL"], 0, sources["mirrored-car"]))
+    assert found.error.startswith("ValueError: model_breadth must") and not found.misfit
 
 
 class TestMappedVariables:
