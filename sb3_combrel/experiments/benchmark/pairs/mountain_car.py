@@ -13,7 +13,7 @@ PAIR = Pair(
     sources=(CAR_2D,),
     target=functools.partial(make_task, mountain_car.TARGET_ID, max_episode_steps=CAP),
     n_episodes=20,
-    threshold=-250.0,
+    threshold=-220.0,
     known=mountain_car.factored_mapping(2),
     known_by_action=mountain_car.intuitive_mapping(),
 )
