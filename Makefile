@@ -3,7 +3,8 @@
 # make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
 # make reproduce   the figures and tables of the COMBREL paper, with controls, in reproduction/; REPRODUCE_ARGS="fig2 --runs 2"
-# make results   takes what was reproduced into README.md and docs/
+# make results   takes what was reproduced, and the results of the benchmark, into README.md and docs/
+# make benchmark   methods of transfer on pairs of tasks, in benchmark/; BENCHMARK_ARGS="--pairs icub --seeds 3"
 # make icub    of these Figure 5, the arm of the iCub with and without transfer from its torso, in setting "explore"
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
@@ -19,6 +20,7 @@ BIN := $(VENV)/bin
 PYTEST_WORKERS ?= 2
 DEMO_ARGS ?=
 REPRODUCE_ARGS ?= all
+BENCHMARK_ARGS ?=
 ICUB_ARGS ?=
 SUITE_ARGS ?=
 LINTED := sb3_combrel envs tests
@@ -33,7 +35,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard suite reproduce results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard suite reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -53,9 +55,14 @@ dashboard: $(VENV)/.installed-demo
 reproduce: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel reproduce $(REPRODUCE_ARGS)
 
-# Takes what was reproduced into README.md and docs/results.
+# A later call goes on with what is there.
+benchmark: $(VENV)/.installed-demo
+	$(BIN)/sb3-combrel benchmark $(BENCHMARK_ARGS)
+
+# Takes what was reproduced, and the results of the benchmark, into README.md and docs/.
 results:
 	$(BIN)/python -m sb3_combrel.experiments.paper.page
+	$(BIN)/python -m sb3_combrel.experiments.benchmark.page
 
 # A later call goes on with what is there. ICUB_ARGS="--runs 3 --episodes 100", for instance.
 icub: $(VENV)/.installed-demo

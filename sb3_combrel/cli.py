@@ -105,7 +105,7 @@ def reproduce(
     :param backend: joblib (local processes), or ray or dask: a cluster that is running
     :param address: of the cluster, such as 10.0.0.1:6379 (ray) or tcp://10.0.0.1:8786 (dask)
     """
-    from sb3_combrel.experiments.paper.reproduce import Engine
+    from sb3_combrel.experiments.carrying_out import Engine
     from sb3_combrel.experiments.paper.reproduce import reproduce as run
 
     made = run(target, setting=setting, runs=runs, episodes=episodes, output=output, engine=Engine(backend, jobs, address))
@@ -129,7 +129,45 @@ def explain(model: Path, /, output: Path | None = None) -> None:
         print("\nWritten:", *(file for name in names for file in sorted(output.glob(name))), sep="\n  ")
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"demo": demo, "record": record, "reproduce": reproduce, "explain": explain}
+def benchmark(
+    pairs: tuple[str, ...] = ("all",),
+    methods: tuple[str, ...] = ("all",),
+    seeds: int = 10,
+    first_seed: int = 7000,
+    jobs: int | None = None,
+    backend: str = "joblib",
+    address: str | None = None,
+    output: Path = Path("benchmark"),
+) -> None:
+    """
+    Compare methods of transfer on pairs of tasks with a known answer: a table and a picture a pair, and mean ranks.
+
+    It can be stopped at any time; the same command continues from there. More in docs/benchmark.md.
+
+    :param pairs: names of pairs, or all; or files of your own that end in .py and define PAIR (docs/add_to_the_benchmark.md)
+    :param methods: names of methods, or all; or your own: package.module:Name or path/to/file.py:Name
+    :param seeds: runs of each method on each pair
+    :param first_seed: seed of the first
+    :param jobs: local processes at a time; one a core by default
+    :param backend: joblib (local processes), or ray or dask: a cluster that is running
+    :param address: of the cluster, such as 10.0.0.1:6379 (ray) or tcp://10.0.0.1:8786 (dask)
+    :param output: folder for all results
+    """
+    from sb3_combrel.experiments.benchmark.command import benchmark as run
+    from sb3_combrel.experiments.carrying_out import Engine
+
+    engine = Engine(backend, jobs, address)
+    made = run(pairs, methods, seeds=seeds, first_seed=first_seed, output=output, engine=engine)
+    print("Written:", *made, sep="\n  ")
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "record": record,
+    "explain": explain,
+    "reproduce": reproduce,
+    "benchmark": benchmark,
+}
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -242,7 +242,7 @@ class TestCommandLine:
     def test_help_names_the_commands(self):
         status, written = call("--help")
         assert status == 0
-        assert all(name in written for name in ("demo", "record"))
+        assert all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
 
     def test_an_unknown_command_is_refused(self):
         assert call("dance")[0] == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,3 +50,48 @@ def draw_learning_curves(steps: Mapping[str, np.ndarray], path: Path, title: str
     axes.legend(frameon=False)
     figure.savefig(path, dpi=120)
     return path
+
+
+def moving_average(samples: np.ndarray, window: int) -> np.ndarray:
+    """
+    Compute the mean of ``window`` successive episodes, or of all where there are fewer.
+
+    :param samples: one run a row, shape (n_runs, n_episodes)
+    :param window: number of episodes
+    :return: shape (n_runs, n_episodes - window + 1)
+    """
+    window = min(window, samples.shape[1])
+    return np.lib.stride_tricks.sliding_window_view(samples.astype(np.float64), window, axis=1).mean(axis=-1)
+
+
+def panels_of(n: int, title: str, sharey: bool = True) -> tuple[Any, list[Any]]:
+    """Make a figure with ``n`` panels side by side; the figure and their axes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # The object-oriented interface leaves the caller's pyplot and its backend alone.
+    figure = Figure(figsize=(6.2 * n, 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    return figure, list(figure.subplots(1, n, sharey=sharey, squeeze=False)[0])
+
+
+def readable_ticks(axis: Any) -> None:
+    """Write numbers such as 200 on a logarithmic axis, not powers of ten."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:,.0f}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def save(figure: Any, path: Path) -> list[Path]:
+    """Save as PNG and SVG; without the date and random names, which would make every file differ."""
+    from matplotlib import rc_context
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
+    figure.savefig(png, dpi=110)
+    with rc_context({"svg.hashsalt": f"sb3_combrel {path.name}"}):
+        figure.savefig(svg, metadata={"Date": None})
+    return [png, svg]

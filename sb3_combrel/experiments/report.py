@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table as RichTable
 
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.runs import COLUMNS, Run
 from sb3_combrel.experiments.statistics import mean_of_runs, saving
 
@@ -108,3 +111,39 @@ def write_results(runs: Sequence[Run], path: Path) -> Path:
 def _mean_and_half(samples: np.ndarray) -> str:
     mean, _, high = mean_of_runs(samples)
     return f"{mean:,.0f}" if np.isnan(high) else f"{mean:,.0f} ± {high - mean:,.0f}"
+
+
+def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[Path]:
+    """
+    Write tables as Markdown, into one file, and as CSV, one file each; and show them.
+
+    :param tables: the tables
+    :param path: file to write, without its suffix
+    """
+    made = [path.with_suffix(".md")]
+    write_whole(made[0], "\n".join(table.as_markdown() for table in tables).encode())
+    for number, table in enumerate(tables, 1):
+        console.print(table.for_terminal())
+        file = path.with_name(f"{path.name}{'' if len(tables) == 1 else f'_{number}'}.csv")
+        write_whole(file, csv_text([table.header, *table.rows]).encode())
+        made.append(file)
+    return made
+
+
+def csv_text(rows: Sequence[Sequence[object]]) -> str:
+    """Return rows as the text of a CSV file."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def without_minus_zero(number: float, digits: int = 0) -> float:
+    """Round so that what is shown as zero has no minus sign."""
+    return round(number, digits) + 0.0
+
+
+def p_text(p_value: float) -> str:
+    """A p-value for a table: "-" where there is none."""
+    if np.isnan(p_value):
+        return "-"
+    return f"{p_value:.2f}" if p_value >= 0.01 else f"{p_value:.1g}"

@@ -185,6 +185,19 @@ def outside_bounds_on_purpose() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def chosen_on_purpose() -> Iterator[None]:
+    """
+    Suppress the warnings of what an experiment has chosen, which would come once for every run.
+
+    These are a grid of many or few points, a source that misleads, and observations outside the bounds that a task gives.
+    """
+    with warnings.catch_warnings(), outside_bounds_on_purpose():
+        warnings.filterwarnings("ignore", message="resolution=.* (is coarse|means)")
+        warnings.filterwarnings("ignore", message="what was transferred from")
+        yield
+
+
 def make_task(env_id: str, **kwargs: Any) -> Any:
     """
     Make one of the package's environments.

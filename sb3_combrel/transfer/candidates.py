@@ -41,6 +41,30 @@ class Candidate(NamedTuple):
     action_mapping: tuple[str, ...] = ()
 
 
+class MappedVariables(NamedTuple):
+    """
+    What a candidate makes of each target variable under its target action, in numbers; those of no source variable are -1.
+
+    :param target_action: number of the target action
+    :param source: number of the source task, int64, shape (n_target_variables,)
+    :param variable: variable of that source, int64, same shape
+    :param sign: -1 for a mirrored variable, 1 for others, 0 for those of no source variable, int64, same shape
+    :param action: action of that source that moves the variable, int64, same shape
+    """
+
+    target_action: int
+    source: np.ndarray
+    variable: np.ndarray
+    sign: np.ndarray
+    action: np.ndarray
+
+    @classmethod
+    def none(cls, target_action: int, n_variables: int) -> MappedVariables:
+        """No variable is mapped."""
+        none = np.full(n_variables, -1, dtype=np.int64)
+        return cls(target_action, none, none.copy(), np.zeros_like(none), none.copy())
+
+
 class Origin(NamedTuple):
     """
     Where a candidate comes from.
@@ -171,6 +195,17 @@ class Candidates:
         variables = whole[whole.index("(") + 1 : whole.index(";")]
         actions = tuple(self._whole_action_names(candidate)) if self.whole else ()
         return Candidate(action, self.sources[number].action_names[source_action], variables, actions)
+
+    def mapped_variables(self, candidate: int) -> MappedVariables:
+        """Return what a candidate makes of each target variable, in numbers."""
+        origin, row = self.origins[candidate], self.arrays.row[candidate]
+        found = MappedVariables.none(origin.target_action, self.task.n_variables)
+        mapped = self.table.variable[row] >= 0
+        found.source[mapped] = origin.source
+        found.variable[mapped] = self.table.variable[row][mapped]
+        found.sign[mapped] = np.where(self.table.sign[row][mapped] < 0, -1, 1)
+        found.action[mapped] = origin.source_action
+        return found
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""

@@ -20,7 +20,14 @@ from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.candidates import Candidate, Candidates, MappingsLike, SourceLike, load_sources
+from sb3_combrel.transfer.candidates import (
+    Candidate,
+    Candidates,
+    MappedVariables,
+    MappingsLike,
+    SourceLike,
+    load_sources,
+)
 from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.explaining import describe_sources, mappings_of_instances, report_of_prior
 from sb3_combrel.transfer.instances_check import InstancesCheck
@@ -299,6 +306,10 @@ class MappingTransfer(Transfer):
     def candidate(self, number: int) -> Candidate:
         """Return a candidate's parts, by name."""
         return self._prior.candidate(number) if self.use == "prior" else self.candidates.parts(number)
+
+    def mapped_variables(self, number: int) -> MappedVariables:
+        """Return what a candidate makes of each target variable, in numbers."""
+        return self._prior.mapped_variables(number) if self.use == "prior" else self.candidates.mapped_variables(number)
 
     @property
     def makes_choices(self) -> bool:

@@ -11,7 +11,7 @@ from sb3_combrel.mappings.factored_mapping import describe_copy
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import GOES_ON, TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
-from sb3_combrel.transfer.candidates import Candidate
+from sb3_combrel.transfer.candidates import Candidate, MappedVariables
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.placed_errors import PlacedErrors
@@ -396,6 +396,18 @@ class SourcePrior:
         moves = list(zip(rest[::2], rest[1::2], strict=True))
         names = " + ".join(self._action_name(copy, used) for copy, used in moves) or "nothing"
         return Candidate(action, names, " + ".join(describe_copy(self.copy_mapping(copy)) for copy, _ in moves))
+
+    def mapped_variables(self, number: int) -> MappedVariables:
+        """What a candidate makes of each target variable, in numbers."""
+        action, *rest = self._candidates[number]
+        found = MappedVariables.none(action, self.task.n_variables)
+        for copy, used in zip(rest[::2], rest[1::2], strict=True):
+            has = self.copies.state[copy] >= 0
+            found.source[has] = self.copies.source[copy]
+            found.variable[has] = self.copies.state[copy, has]
+            found.sign[has] = np.where(self.copies.sign[copy, has] < 0, -1, 1)
+            found.action[has] = used
+        return found
 
     def uses(self) -> dict[int, int]:
         """For how many of the target's transitions each candidate was in use."""

@@ -12,7 +12,15 @@ from helpers.walk import Walk, same_parameters, small, walk_source
 
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
-from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping, SoftHomomorphism, SourceInstances, SparseCodingMapping, ThreeWayRBM
+from sb3_combrel import (
+    TIMBREL,
+    FittedRMax,
+    InterTaskMapping,
+    SoftHomomorphism,
+    SourceInstances,
+    SparseCodingMapping,
+    ThreeWayRBM,
+)
 from sb3_combrel.transfer.learned_translation import LearnedTranslation, Standard, Triplets
 from sb3_combrel.transfer.sparse_coding import Regression, nearest_pairs, sparse_codes
 

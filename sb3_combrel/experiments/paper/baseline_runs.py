@@ -21,11 +21,13 @@ from sb3_combrel.experiments.baselines import (
     learn,
 )
 from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.paper.curves import STYLES, panels_of, save
+from sb3_combrel.experiments.figures import panels_of, save
+from sb3_combrel.experiments.paper.curves import STYLES
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR, Domain
 from sb3_combrel.experiments.paper.methods import Sources
-from sb3_combrel.experiments.paper.runs import Result, run_name
+from sb3_combrel.experiments.paper.runs import Result
 from sb3_combrel.experiments.report import Table
+from sb3_combrel.experiments.result_files import run_name
 
 N_RUNS = 5
 #: Environment steps, by domain. What exploration and learning rate are at a step depends on them.
@@ -55,6 +57,11 @@ class BaselineRun:
     def seed(self) -> int:
         """Seed of the algorithm and its environment."""
         return self.job.seed
+
+    @property
+    def title(self) -> str:
+        """What the run is called in messages."""
+        return f"{self.domain}, {self.method}, seed {self.seed}"
 
     @property
     def name(self) -> str:

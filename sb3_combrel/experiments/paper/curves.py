@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.figures import COLOURS
+from sb3_combrel.experiments.figures import COLOURS, moving_average, panels_of, readable_ticks, save
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.statistics import steps_to_reach
@@ -50,7 +49,7 @@ def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, 
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
         for method, samples in steps.items():
             colour, line = STYLES[method]
-            smooth = _moving_average(samples)
+            smooth = moving_average(samples, WINDOW)
             band = bootstrap_band(smooth)
             episodes = np.arange(samples.shape[1] - smooth.shape[1] + 1, samples.shape[1] + 1)
             axes.plot(episodes, band.mean, line, color=colour, label=f"{method} ({len(samples)} runs)")
@@ -130,42 +129,3 @@ def draw_selection(
         axes.set_ylabel(beside)
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4, frameon=False, fontsize="small")
     return save(figure, path)
-
-
-def _moving_average(samples: np.ndarray) -> np.ndarray:
-    """The mean of ``WINDOW`` episodes, or of all where there are fewer, shape (n_runs, n_episodes - window + 1)."""
-    window = min(WINDOW, samples.shape[1])
-    return np.lib.stride_tricks.sliding_window_view(samples.astype(np.float64), window, axis=1).mean(axis=-1)
-
-
-def panels_of(n: int, title: str, sharey: bool = True) -> tuple[Any, list[Any]]:
-    """Make a figure with ``n`` panels side by side; the figure and their axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # The object-oriented interface leaves the caller's pyplot and its backend alone.
-    figure = Figure(figsize=(6.2 * n, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title)
-    return figure, list(figure.subplots(1, n, sharey=sharey, squeeze=False)[0])
-
-
-def readable_ticks(axis: Any) -> None:
-    """Write numbers such as 200 on a logarithmic axis, not powers of ten."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter("{x:,.0f}")
-    axis.set_minor_formatter(NullFormatter())
-
-
-def save(figure: Any, path: Path) -> list[Path]:
-    """Save as PNG and SVG; without the date and random names, which would make every file differ."""
-    from matplotlib import rc_context
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
-    figure.savefig(png, dpi=110)
-    with rc_context({"svg.hashsalt": f"sb3_combrel {path.name}"}):
-        figure.savefig(svg, metadata={"Date": None})
-    return [png, svg]

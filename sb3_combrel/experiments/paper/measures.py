@@ -9,8 +9,7 @@ import numpy as np
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.paper.methods import METHODS, NO_TRANSFER
 from sb3_combrel.experiments.paper.runs import Result
-from sb3_combrel.experiments.paper.verdicts import p_text, without_minus_zero
-from sb3_combrel.experiments.report import Table
+from sb3_combrel.experiments.report import Table, p_text, without_minus_zero
 from sb3_combrel.experiments.statistics import holm
 from sb3_combrel.experiments.transfer_measures import Comparison, LearningCurves, compare_learning
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -30,7 +28,7 @@ from sb3_combrel.experiments.paper.selections import (
     state_mapping_table,
 )
 from sb3_combrel.experiments.paper.verdicts import CONTROL, PAPERS, judge, summary_table, verdict_table
-from sb3_combrel.experiments.report import Table
+from sb3_combrel.experiments.report import Table, csv_text, write_tables
 from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 
 #: Minutes that the paper gives for 200 episodes (Table 5).
@@ -74,23 +72,6 @@ def write_report(
     if any(target.name == "table6" for target in targets):
         tables = [measures_table(DOMAINS[name], of_domain) for name, of_domain in own.items()]
         made += write_tables(tables, output / "measures", console)
-    return made
-
-
-def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[Path]:
-    """
-    Write tables as Markdown, into one file, and as CSV, one file each; and show them.
-
-    :param tables: the tables
-    :param path: file to write, without its suffix
-    """
-    made = [path.with_suffix(".md")]
-    write_whole(made[0], "\n".join(table.as_markdown() for table in tables).encode())
-    for number, table in enumerate(tables, 1):
-        console.print(table.for_terminal())
-        file = path.with_name(f"{path.name}{'' if len(tables) == 1 else f'_{number}'}.csv")
-        write_whole(file, _csv_text([table.header, *table.rows]).encode())
-        made.append(file)
     return made
 
 
@@ -212,11 +193,5 @@ def _write_runs(results: Sequence[Result], path: Path) -> Path:
     for result in sorted(results, key=lambda each: (each.method, each.seed)):
         of_episodes = " ".join(map(str, result.steps))
         rows.append((result.method, result.seed, sum(result.steps), sum(result.terminated), of_episodes))
-    write_whole(path, _csv_text(rows).encode())
+    write_whole(path, csv_text(rows).encode())
     return path
-
-
-def _csv_text(rows: Sequence[Sequence[object]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()

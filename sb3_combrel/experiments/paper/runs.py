@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import json
 import time
-import warnings
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.paper.recording import SelectionRecorder, selections_at_sample, uses_of
-from sb3_combrel.experiments.runs import make_task
+from sb3_combrel.experiments.result_files import RESULTS, RunFiles, run_name
+from sb3_combrel.experiments.runs import chosen_on_purpose, make_task
 from sb3_combrel.experiments.suite_runs import UNLIMITED, EpisodeRecorder
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.transfer.base import Transfer
-
-RESULTS, TIMES = "runs", "times"
-
-
-def run_name(domain: str, method: str, seed: int) -> str:
-    """Return the name of a run in files."""
-    return f"{domain}_{method.lower().replace(',', '').replace(' ', '_')}_seed{seed}"
 
 
 @dataclass(frozen=True)
@@ -59,6 +51,11 @@ class Job:
     def name(self) -> str:
         """Name of the run in files."""
         return run_name(self.domain, self.method, self.seed)
+
+    @property
+    def title(self) -> str:
+        """What the run is called in messages."""
+        return f"{self.domain}, {self.method}, seed {self.seed}"
 
     def answered_by(self, result: Result) -> bool:
         """Whether a result is that of this job: of as many episodes."""
@@ -102,29 +99,6 @@ class Result:
         return json.dumps(content) + "\n"
 
 
-class AnyJob(Protocol):
-    """What is asked of a job besides being carried out."""
-
-    @property
-    def domain(self) -> str:
-        """Name of the domain."""
-
-    @property
-    def method(self) -> str:
-        """Name of the method."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the run."""
-
-    @property
-    def name(self) -> str:
-        """Name of the run in files."""
-
-    def answered_by(self, result: Result) -> bool:
-        """Whether a result is that of this job."""
-
-
 class TimedRecorder(EpisodeRecorder):
     """:class:`EpisodeRecorder` that also measures the processor time until the end of the first episode."""
 
@@ -147,7 +121,7 @@ def carry_out(job: Job) -> Result:
     """
     episodes = TimedRecorder(job.n_episodes)
     selections = SelectionRecorder()
-    with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, _on_purpose():
+    with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, chosen_on_purpose():
         model = FittedRMax(env, transfer=job.transfer, seed=job.seed, **job.learner)
         start = time.process_time()
         callbacks: list[BaseCallback] = [episodes, selections] if job.records_selections else [episodes]
@@ -172,53 +146,20 @@ def carry_out(job: Job) -> Result:
     )
 
 
-@contextmanager
-def _on_purpose() -> Iterator[None]:
-    """Suppress warnings of what an experiment has chosen, a grid of many or few points, or a source that misleads."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="resolution=.* (is coarse|means)")
-        warnings.filterwarnings("ignore", message="what was transferred from")
-        yield
-
-
-class ResultFiles:
+class ResultFiles(RunFiles[Result]):
     """
-    The results in a folder, one file a run, each written at once.
+    The results in a folder, see :class:`~sb3_combrel.experiments.result_files.RunFiles`.
 
     :param folder: the folder
     """
 
     def __init__(self, folder: Path):
-        self.folder = folder
-
-    def write(self, result: Result) -> None:
-        """Write a result, and its times apart: they differ from call to call."""
-        write_whole(self.folder / TIMES / f"{result.name}.json", (json.dumps(result.seconds) + "\n").encode())
-        write_whole(self.folder / RESULTS / f"{result.name}.json", result.text().encode())
-
-    def read(self, name: str) -> Result | None:
-        """Read a result; None if there is none, or a file that is not whole, as after a power failure."""
-        try:
-            content = json.loads((self.folder / RESULTS / f"{name}.json").read_text())
-            learning, first_episode = map(float, json.loads((self.folder / TIMES / f"{name}.json").read_text()))
-            return Result(**content, seconds=(learning, first_episode))
-        except (FileNotFoundError, ValueError, TypeError):
-            return None
-
-    def read_all(self, jobs: Iterable[AnyJob]) -> list[Result]:
-        """Read the results of all jobs that have one."""
-        found = (self.read(job.name) for job in jobs)
-        return [result for result in found if result is not None]
+        super().__init__(folder, Result)
 
     def read_domain(self, domain: str) -> list[Result]:
         """Read all results of a domain that are in the folder, whichever call they are from."""
         found = (self.read(path.stem) for path in sorted((self.folder / RESULTS).glob(f"{domain}_*.json")))
         return [result for result in found if result is not None]
-
-    def is_complete(self, job: AnyJob) -> bool:
-        """Whether a job's result is there."""
-        result = self.read(job.name)
-        return result is not None and job.answered_by(result)
 
 
 def steps_by_method(results: Iterable[Result]) -> dict[str, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -10,8 +9,8 @@ from rich.console import Console
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, PAPER, Domain
 from sb3_combrel.experiments.paper.methods import Sources
+from sb3_combrel.experiments.source_files import FOLDER, load_or
 
-FOLDER = "sources"
 SOURCE_SEED = 0
 #: Seed of the learner whose transitions of the arm's task the oracle has; no run has it.
 TARGET_SEED = 1
@@ -29,27 +28,14 @@ def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
     (other,) = (each for each in DOMAINS.values() if each.name != domain.name)
     target = None
     if domain.name == ICUB.name:
-        target = _load_or(output / FOLDER / f"{domain.name}_target.npz", lambda: _record_target(domain), console)
+        target = load_or(output / FOLDER / f"{domain.name}_target.npz", lambda: _record_target(domain), console)
     return Sources(_source(domain, output, console), _source(other, output, console), target)
 
 
 def _source(domain: Domain, output: Path, console: Console) -> SourceInstances:
-    return _load_or(output / FOLDER / f"{domain.name}.npz", lambda: domain.learn_source(SOURCE_SEED), console)
+    return load_or(output / FOLDER / f"{domain.name}.npz", lambda: domain.learn_source(SOURCE_SEED), console)
 
 
 def _record_target(domain: Domain) -> SourceInstances:
     max_value = domain.settings[PAPER].learner["max_value"]
     return SourceInstances.from_fitted_rmax(domain.target_id, N_TARGET_TRANSITIONS, TARGET_SEED, max_value=max_value)
-
-
-def _load_or(path: Path, learn: Callable[[], SourceInstances], console: Console) -> SourceInstances:
-    if path.exists():
-        try:
-            return SourceInstances.load(path)
-        except ValueError as error:
-            console.print(f"{error}: they are learned again.", markup=False, soft_wrap=True)
-    with console.status(f"Learning {path.stem} ..."):
-        found = learn()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    found.save(path)
-    return found

@@ -13,7 +13,7 @@ from sb3_combrel.experiments.effect_sizes import cliffs_delta
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.curves import WINDOW
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
-from sb3_combrel.experiments.report import Table
+from sb3_combrel.experiments.report import Table, p_text, without_minus_zero
 from sb3_combrel.experiments.statistics import holm, p_value_of_difference, steps_to_reach
 
 #: Significance level, after Holm's correction over the rows of a table.
@@ -205,15 +205,3 @@ def share_text(share: float) -> str:
 def interval_text(low: float, high: float) -> str:
     """An interval of shares for a table: "-" where there is none."""
     return "-" if np.isnan(low) else f"{share_text(low)} to {share_text(high)}"
-
-
-def without_minus_zero(number: float, digits: int = 0) -> float:
-    """Round so that what is shown as zero has no minus sign."""
-    return round(number, digits) + 0.0
-
-
-def p_text(p_value: float) -> str:
-    """A p-value for a table: "-" where there is none."""
-    if np.isnan(p_value):
-        return "-"
-    return f"{p_value:.2f}" if p_value >= 0.01 else f"{p_value:.1g}"

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from imageio.v3 import imread
 
+from sb3_combrel.experiments.figures import moving_average
 from sb3_combrel.experiments.paper import methods as m
-from sb3_combrel.experiments.paper.curves import STYLES, WINDOW, _moving_average, draw_curves, draw_selection, draw_times
+from sb3_combrel.experiments.paper.curves import STYLES, WINDOW, draw_curves, draw_selection, draw_times
 from sb3_combrel.experiments.paper.domains import DOMAINS, MOUNTAIN_CAR
 
 
@@ -85,8 +86,8 @@ def test_the_same_data_give_the_same_bytes(tmp_path):
 def test_moving_averages_of_fewer_episodes_than_the_window_are_of_all():
     samples = np.arange(14).reshape(2, 7) ** 2
     expected = [[np.mean(row[k : k + WINDOW]) for k in range(7 - WINDOW + 1)] for row in samples]
-    np.testing.assert_allclose(_moving_average(samples), expected)
-    np.testing.assert_allclose(_moving_average(samples[:, :2]), samples[:, :2].mean(axis=1, keepdims=True))
+    np.testing.assert_allclose(moving_average(samples, WINDOW), expected)
+    np.testing.assert_allclose(moving_average(samples[:, :2], WINDOW), samples[:, :2].mean(axis=1, keepdims=True))
 
 
 def test_every_method_has_a_colour_and_line_of_its_own():

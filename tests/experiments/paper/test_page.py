@@ -2,7 +2,8 @@
 
 import pytest
 
-from sb3_combrel.experiments.paper.page import copy_results, fill_in, tables_in
+from sb3_combrel.experiments.pages import fill_in, tables_in
+from sb3_combrel.experiments.paper.page import copy_results
 
 TABLES = "**First**\n\n| a | b |\n| --- | ---: |\n| 1 | 2 |\n\n**Second**\n\n| c |\n| --- |\n| 3 |\n"
 FIRST, SECOND = "| a | b |\n| --- | ---: |\n| 1 | 2 |", "| c |\n| --- |\n| 3 |"

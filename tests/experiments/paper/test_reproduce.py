@@ -19,10 +19,12 @@ from helpers.paper_results import made_up
 from imageio.v3 import imread
 
 from sb3_combrel import cli
+from sb3_combrel.experiments import carrying_out
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper import reproduce
 from sb3_combrel.experiments.paper.domains import DOMAINS
-from sb3_combrel.experiments.paper.runs import RESULTS, TIMES, ResultFiles
+from sb3_combrel.experiments.paper.runs import ResultFiles
+from sb3_combrel.experiments.result_files import RESULTS, TIMES
 
 # Of the paper's setting.
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig6")
@@ -209,7 +211,7 @@ class TestResume:
 
     def test_an_interrupted_call_leaves_complete_results_and_is_continued(self, prepare, complete, monkeypatch, tmp_path):
         folder = prepare(tmp_path / "output")
-        real, n_done = reproduce.carry_out_on, 2
+        real, n_done = carrying_out.carry_out_on, 2
 
         def interrupted(engine, function, jobs, **options):
             results = real(engine, function, jobs, **options)
@@ -221,7 +223,7 @@ class TestResume:
 
             return until_then()
 
-        monkeypatch.setattr(reproduce, "carry_out_on", interrupted)
+        monkeypatch.setattr(carrying_out, "carry_out_on", interrupted)
         status, _, errors = call("table5", *TINY, "--output", folder)
         assert (status, errors) == (130, "\nStopped. The same command goes on from here.\n")
         left = results_in(folder)
@@ -287,7 +289,7 @@ def test_results_of_dask_are_those_of_local_processes_to_the_byte(prepare, compl
 def made_before(tmp_path):
     """A folder with a result of the paper's setting, of two episodes."""
     folder = tmp_path / "made_before"
-    reproduce.prepare_folder(folder, "paper", {"mountain_car": 2})
+    reproduce.prepare_folder(folder, reproduce._settings("paper", {"mountain_car": 2}))
     ResultFiles(folder).write(made_up("mountain_car", m.COMBREL_PLAIN, 5000, [3, 4]))
     return folder
 
@@ -353,7 +355,7 @@ class TestBadInput:
         assert "(episodes of mountain_car was 2 and is 3)" in message
         assert all_but_times(made_before) == before
         # None were of the other domain.
-        reproduce.prepare_folder(made_before, "paper", {"icub": 3})
+        reproduce.prepare_folder(made_before, reproduce._settings("paper", {"icub": 3}))
 
     def test_results_of_other_arguments_of_the_methods(self, made_before, monkeypatch):
         car = DOMAINS["mountain_car"]

@@ -13,7 +13,8 @@ from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import DOMAINS, PAPER
 from sb3_combrel.experiments.paper.plan import jobs_of
 from sb3_combrel.experiments.paper.recording import selections_at_sample, uses_of
-from sb3_combrel.experiments.paper.runs import RESULTS, Job, Result, ResultFiles, carry_out
+from sb3_combrel.experiments.paper.runs import Job, Result, ResultFiles, carry_out
+from sb3_combrel.experiments.result_files import RESULTS
 from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 
 CAP = 300

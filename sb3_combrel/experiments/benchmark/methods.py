@@ -1,0 +1,168 @@
+"""The methods of the benchmark, by name."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, SourceInstances
+from sb3_combrel.experiments.benchmark.oracle import KnownCopies
+from sb3_combrel.experiments.benchmark.pair import Pair, check_name
+from sb3_combrel.experiments.benchmark.third_party import load_attribute
+from sb3_combrel.transfer.base import Transfer
+
+#: Instances of a pair's source, or a list of those of several.
+Sources = SourceInstances | list[SourceInstances]
+Make = Callable[[Sources, Pair], Transfer | None]
+
+#: What all others are compared with.
+NONE = "none"
+
+
+class DoesNotFit(ValueError):
+    """A method cannot be used with a pair; the message says why. Its cell in the tables stays empty."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    A method of transfer.
+
+    :param name: on the command line, in tables and in files
+    :param description: in the report, with its paper
+    :param make: makes the transfer method, not bound, of a pair's source or sources and the pair; None: no transfer. May raise
+        :class:`DoesNotFit`
+    :param finds_mapping: whether it finds a mapping by itself, so that it takes target steps until it has one
+    :param same_as: of a pair: name of another method that makes the same there, or None; it is then run once
+    :param digest: of the file in which a third party defines it; "" for the package's own
+    :raises ValueError: if the name has other characters than letters, digits, "-", "_" and "."
+    """
+
+    name: str
+    description: str
+    make: Make
+    finds_mapping: bool = False
+    same_as: Callable[[Pair], str | None] | None = None
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
+
+    def run_as(self, pair: Pair) -> str:
+        """Name of the method whose runs are this one's in a pair."""
+        other = None if self.same_as is None else self.same_as(pair)
+        return self.name if other is None else other
+
+
+def the_one(sources: Sources, name: str) -> SourceInstances:
+    """
+    Return the instances of the only source.
+
+    :param sources: of a pair
+    :param name: of the method that takes no more than one
+    :raises DoesNotFit: if there are several
+    """
+    if isinstance(sources, SourceInstances):
+        return sources
+    raise DoesNotFit(f"{name} takes one source, and the pair has {len(sources)}")
+
+
+def _oracle(sources: Sources, pair: Pair) -> Transfer:
+    if pair.known is None:
+        raise DoesNotFit("nobody knows the mapping")
+    if isinstance(pair.known, Sequence) and all(isinstance(each, FactoredMapping) for each in pair.known):
+        return KnownCopies(sources, pair.known)  # type: ignore[arg-type]
+    return TIMBREL(the_one(sources, "the oracle"), pair.known, use="prior")  # type: ignore[arg-type]
+
+
+def _timbrel(sources: Sources, pair: Pair) -> Transfer:
+    if pair.known_by_action is None:
+        raise DoesNotFit("TIMBREL needs a mapping by hand, and nobody knows one")
+    return TIMBREL(the_one(sources, "TIMBREL"), pair.known_by_action)
+
+
+def _same_as_factored(pair: Pair) -> str | None:
+    """COMBREL by default is COMBREL with factored mappings, unless the pair needs mirrored variables."""
+    return FACTORED if pair.mappings == "factored" else None
+
+
+FACTORED = "COMBREL-factored"
+_FACHANTIDIS = 'Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection", 2015'
+_TAYLOR = 'Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning", ECML 2008'
+
+#: In the order of tables. Another method of this package is another line.
+_METHODS: Sequence[Method] = (
+    Method(NONE, "No transfer: Fitted R-Max alone.", lambda sources, pair: None),
+    Method(
+        "random-by-state",
+        "Control: instances through a mapping that is drawn anew for each state, from the set that COMBREL-instances has.",
+        lambda sources, pair: TIMBREL(sources, "random", mappings=pair.instance_mappings),
+    ),
+    Method(
+        "random-by-run",
+        "Control: the source as a prior through a factored mapping that is drawn once for the run.",
+        lambda sources, pair: TIMBREL(sources, "random", mappings=pair.mappings, use="prior"),
+    ),
+    Method("oracle", "Control: the source as a prior through the known mapping.", _oracle),
+    Method("TIMBREL", f"Instances through the known mapping, by hand ({_TAYLOR}).", _timbrel),
+    Method(
+        "COMBREL-paper",
+        f"Instances through the mapping that complies best with the first episode ({_FACHANTIDIS}).",
+        lambda sources, pair: COMBREL.paper(sources, pair.instance_mappings),
+        finds_mapping=True,
+    ),
+    Method(
+        "COMBREL-instances",
+        "COMBREL with instances as this package has it: compliance online, with the guards of its defaults.",
+        lambda sources, pair: COMBREL(sources, pair.instance_mappings, use="instances"),
+        finds_mapping=True,
+    ),
+    Method(
+        "COMBREL",
+        "COMBREL by default: factored mappings as a prior, without mirrored variables.",
+        lambda sources, pair: COMBREL(sources),
+        finds_mapping=True,
+        same_as=_same_as_factored,
+    ),
+    Method(
+        FACTORED,
+        "COMBREL with factored mappings as a prior, mirrored ones too where the pair has such.",
+        lambda sources, pair: COMBREL(sources, pair.mappings, use="prior"),
+        finds_mapping=True,
+    ),
+)
+METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
+
+_HOW_TO_NAME = 'a method of your own is "package.module:Name" or "path/to/file.py:Name"'
+
+
+def method_of(text: str) -> Method:
+    """
+    Return the method of a name, or one that a third party defines.
+
+    :param text: one of :data:`METHODS`; or "package.module:Name" or "path/to/file.py:Name", where Name is a :class:`Method`, a
+        transfer class that is called with the source, or a function of the source and the pair that returns a transfer object
+    :raises ValueError: if there is no such method
+    """
+    if text in METHODS:
+        return METHODS[text]
+    if ":" not in text:
+        raise ValueError(f"methods must be of {', '.join(METHODS)}, or all; {_HOW_TO_NAME}; got {text!r}")
+    found, digest = load_attribute("methods", text)
+    if isinstance(found, Method):
+        return Method(**{**vars(found), "digest": digest})
+    name = text.rpartition(":")[2]
+    if inspect.isabstract(found):
+        raise ValueError(f"methods: {text} lacks {', '.join(sorted(found.__abstractmethods__))}, which a transfer method has")
+    if isinstance(found, type) and issubclass(found, Transfer):
+        make: Any = found
+        return Method(name, _first_line(found), lambda sources, pair: make(sources), finds_mapping=True, digest=digest)
+    if callable(found) and not isinstance(found, type):
+        return Method(name, _first_line(found), found, finds_mapping=True, digest=digest)
+    raise ValueError(f"methods: {text} must be a Method, a subclass of Transfer or a function, got {found!r}")
+
+
+def _first_line(found: Any) -> str:
+    return (inspect.getdoc(found) or "").partition("\n")[0]

@@ -1,0 +1,50 @@
+"""Takes results into the documentation: ``python -m sb3_combrel.experiments.benchmark.page`` (part of ``make results``)."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from sb3_combrel.experiments.benchmark.command import OUTPUT
+from sb3_combrel.experiments.benchmark.report import PAGE
+from sb3_combrel.experiments.pages import include
+
+#: What is copied. Runs, sources and SVG figures stay where they are.
+COPIED = ("*.md", "*.csv", "*.png")
+DOCS = Path("docs/results/benchmark")
+DOCS_PAGE = Path("docs/benchmark.md")
+
+
+def copy_results(output: Path, docs: Path) -> list[Path]:
+    """
+    Copy tables and pictures.
+
+    :param output: folder of the command
+    :param docs: folder to copy to
+    :return: the files
+    """
+    made = []
+    for pattern in COPIED:
+        for file in sorted(output.glob(pattern)):
+            docs.mkdir(parents=True, exist_ok=True)
+            made.append(Path(shutil.copyfile(file, docs / file.name)))
+    return made
+
+
+def main(output: Path = OUTPUT, docs: Path = DOCS, page: Path = DOCS_PAGE) -> None:
+    """
+    Copy the results, if there are any, and include them in the page.
+
+    :param output: folder of the command
+    :param docs: folder to copy to
+    :param page: a Markdown file with the marks of :func:`~sb3_combrel.experiments.pages.include`
+    """
+    if not (output / f"{PAGE}.md").exists():
+        print(f"{output} has no results of sb3-combrel benchmark")
+        return
+    made = copy_results(output, docs)
+    print(f"{len(made)} files copied to {docs}; {page}: {include(page)} files included")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""A pair of tasks: one or several sources, a target, the known mapping, budget, measure, and what the learner is told."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
+from sb3_combrel.common.checks import check_count, check_finite
+from sb3_combrel.experiments.runs import chosen_on_purpose, make_task
+from sb3_combrel.experiments.suite_tasks import Source
+from sb3_combrel.transfer.candidates import MappedVariables
+
+#: An environment: its id, or a function that makes it.
+Task = str | Callable[[], gym.Env]
+#: How a source is recorded, see :func:`recorded`.
+LEARNERS: dict[str, Callable[..., SourceInstances]] = {
+    "fitted_rmax": SourceInstances.from_fitted_rmax,
+    "q_learning": SourceInstances.from_q_learning,
+}
+
+
+def make_env(task: Task) -> gym.Env:
+    """Make the environment of a task."""
+    return make_task(task) if isinstance(task, str) else task()
+
+
+def recorded(name: str, task: Task, learner: str = "fitted_rmax", n_instances: int = 1000, **arguments: Any) -> Source:
+    """
+    Describe how a source is recorded: learned once for an output folder, with seed 0.
+
+    :param name: of its file; sources of the same name must be recorded in the same way
+    :param task: the environment, an id or a function that makes it
+    :param learner: "fitted_rmax" or "q_learning"
+    :param n_instances: instances to keep of all experience
+    :param arguments: of :meth:`SourceInstances.from_fitted_rmax` or :meth:`~SourceInstances.from_q_learning`
+    :raises ValueError: if the learner is unknown
+    """
+    if learner not in LEARNERS:
+        raise ValueError(f"learner must be one of {', '.join(LEARNERS)}, got {learner!r}")
+    check_count("n_instances", n_instances)
+    return Source(name, functools.partial(_learn, task, learner, n_instances, arguments))
+
+
+def _learn(task: Task, learner: str, n_instances: int, arguments: Mapping[str, Any]) -> SourceInstances:
+    with closing(make_env(task)) as env, chosen_on_purpose():
+        return LEARNERS[learner](env, n_instances, seed=0, **arguments)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """
+    One or several source tasks and a target task. Exactly one of ``n_steps`` and ``n_episodes`` is given.
+
+    Performance is the mean return of an episode of learning: over the episodes if ``n_episodes`` is given, over environment
+    steps (an episode counts as often as it has steps) if ``n_steps`` is.
+
+    :param name: on the command line and in files: letters, digits, "-", "_" and "."
+    :param description: in the report: what the tasks are, and what is known of how they correspond
+    :param sources: the source tasks, see :func:`recorded`
+    :param target: the target task, an id or a function that makes it; its episodes must have a limit
+    :param n_steps: environment steps to learn
+    :param n_episodes: episodes to learn
+    :param threshold: of the time to threshold: a return; None: it is not measured
+    :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, chosen for learning without transfer
+    :param known: the known mapping, as a prior: a factored mapping, one :class:`InterTaskMapping` for each target action, or
+        for several sources one factored mapping for each; None if nobody knows it
+    :param known_by_action: the known mapping, for instances: one :class:`InterTaskMapping`, or one for each target action. It
+        says which variables an action moves, and by it is decided whether a method has chosen the known mapping: the variables
+        that it maps must be mapped to the same source variables, by the same source action. None if nobody knows it
+    :param sources_by_action: number of the source of each of ``known_by_action``; () for the first source throughout
+    :param mappings: the set that methods choose from with priors, "factored" or "signed_factored"
+    :param instance_mappings: the set that they choose from with instances, such as "injective" or "signed_injective"
+    :raises ValueError: if an argument is out of its range
+    """
+
+    name: str
+    description: str
+    sources: tuple[Source, ...]
+    target: Task
+    n_steps: int | None = None
+    n_episodes: int | None = None
+    threshold: float | None = None
+    learner: Mapping[str, Any] = field(default_factory=dict)
+    known: FactoredMapping | Sequence[InterTaskMapping] | Sequence[FactoredMapping] | None = None
+    known_by_action: InterTaskMapping | Sequence[InterTaskMapping] | None = None
+    sources_by_action: Sequence[int] = ()
+    mappings: str = "factored"
+    instance_mappings: str = "injective"
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
+        if (self.n_steps is None) == (self.n_episodes is None):
+            raise ValueError(
+                f"{self.name}: either n_steps or n_episodes must be given, got {self.n_steps!r} and {self.n_episodes!r}"
+            )
+        check_count("n_steps", self.n_steps, none_allowed=True)
+        check_count("n_episodes", self.n_episodes, none_allowed=True)
+        if self.threshold is not None:
+            check_finite("threshold", self.threshold)
+        if not self.sources or not all(isinstance(source, Source) for source in self.sources):
+            raise ValueError(
+                f"{self.name}: sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}"
+            )
+        several = isinstance(self.known, Sequence) and all(isinstance(each, FactoredMapping) for each in self.known)
+        if several and len(self.known) != len(self.sources):  # type: ignore[arg-type]
+            raise ValueError(
+                f"{self.name}: known must have one factored mapping for each of the {len(self.sources)} sources, "
+                f"got {len(self.known)}"  # type: ignore[arg-type]
+            )
+
+    @property
+    def budget(self) -> str:
+        """How long is learnt, in words."""
+        return f"{self.n_episodes} episodes" if self.n_steps is None else f"{self.n_steps:,} environment steps"
+
+    def make_target(self) -> gym.Env:
+        """Make the environment of the target task."""
+        return make_env(self.target)
+
+    def agrees(self, mapped: MappedVariables) -> bool:
+        """
+        Whether what a method makes of a target action is what the known mapping makes of it.
+
+        :param mapped: what it makes of each target variable
+        :return: whether it is the same for all variables that ``known_by_action`` maps under that action
+        """
+        assert self.known_by_action is not None
+        one = isinstance(self.known_by_action, InterTaskMapping)
+        a = mapped.target_action
+        known: InterTaskMapping = self.known_by_action if one else self.known_by_action[a]  # type: ignore[index,assignment]
+        of = known.mapped
+        return bool(
+            (mapped.source[of] == (self.sources_by_action[a] if self.sources_by_action else 0)).all()
+            and (mapped.variable[of] == known.state_index[of]).all()
+            and (mapped.sign[of] == known.state_sign[of]).all()
+            and (mapped.action[of] == known.action[a]).all()
+        )
+
+    def settings(self) -> dict[str, Any]:
+        """What the results depend on, in words that JSON can hold."""
+        values = {name: value for name, value in vars(self).items() if name not in ("description", "sources", "threshold")}
+        return {
+            **{name: described(value) for name, value in values.items()},
+            "sources": {source.name: described(source.learn) for source in self.sources},
+        }
+
+
+def check_name(name: object) -> None:
+    """
+    Check the name of a pair or a method, which is part of the names of files.
+
+    :raises ValueError: if it has other characters than letters, digits, "-", "_" and "."
+    """
+    if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
+        raise ValueError(f'name must be of letters, digits, "-", "_" and ".", got {name!r}')
+
+
+def described(value: Any) -> Any:
+    """Return a value as JSON can hold it: functions by name, with what they are called with, and others as their ``repr``."""
+    if isinstance(value, functools.partial):
+        keywords = {name: described(each) for name, each in value.keywords.items()}
+        return {"function": described(value.func), "arguments": [described(each) for each in value.args], **keywords}
+    if callable(value) and hasattr(value, "__qualname__"):
+        return f"{value.__module__}.{value.__qualname__}"
+    if isinstance(value, Mapping):
+        return {str(name): described(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [described(each) for each in value]
+    return value if value is None or isinstance(value, bool | int | float | str) else repr(value)

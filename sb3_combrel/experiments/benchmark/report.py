@@ -1,0 +1,259 @@
+"""The files that ``sb3-combrel benchmark`` makes of the results: a table and a picture a pair, an overview, and the page."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from sb3_combrel.common.files import write_whole
+from sb3_combrel.experiments.benchmark.figures import draw_pair
+from sb3_combrel.experiments.benchmark.methods import NONE, Method
+from sb3_combrel.experiments.benchmark.pair import Pair
+from sb3_combrel.experiments.benchmark.runs import Outcome
+from sb3_combrel.experiments.benchmark.scores import (
+    ALPHA,
+    FEWEST_RUNS,
+    MEASURES,
+    Cell,
+    Comparison,
+    cells_of,
+    compare,
+    mean_ranks,
+    measure_name,
+    ranks,
+)
+from sb3_combrel.experiments.report import Table, csv_text, p_text, without_minus_zero, write_tables
+from sb3_combrel.experiments.statistics import Estimate
+from sb3_combrel.experiments.transfer_measures import Comparison as MeasuredDifference
+
+OVERVIEW, PAGE, RUNS = "overview", "benchmark", "runs.csv"
+_EMPTY = "-"
+_HEADER = (
+    "method",
+    "runs",
+    "performance",
+    "p",
+    "rank",
+    *(measure.replace("_", " ") for measure in MEASURES),
+    "known mapping",
+    "steps to a mapping",
+    "seconds",
+    "note",
+)
+
+
+def write_report(
+    pairs: Sequence[Pair],
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    outcomes: Sequence[Outcome],
+    output: Path,
+    command: Sequence[str],
+    console: Console,
+) -> list[Path]:
+    """
+    Make a table (Markdown, CSV) and a picture (PNG, SVG) for each pair, an overview, a CSV of all runs, and the page.
+
+    :param pairs: the pairs
+    :param methods: the methods, in the order of tables
+    :param seeds: seeds that count
+    :param outcomes: of all runs
+    :param output: folder to write to
+    :param command: the command that made them, for the page
+    :param console: where to show the tables
+    :return: the files
+    """
+    cells = {pair.name: cells_of(pair, methods, outcomes, seeds) for pair in pairs}
+    compared = {pair.name: compare(pair, cells[pair.name]) for pair in pairs}
+    made, sections = [], []
+    for pair in pairs:
+        own = cells[pair.name], compared[pair.name]
+        table = pair_table(pair, *own)
+        made += write_tables([table], output / pair.name, console)
+        made += draw_pair(pair, *own, output / pair.name)
+        sections.append(_section(pair, table))
+    overview = [rank_table(methods, cells, compared), performance_table(pairs, methods, cells, compared)]
+    made += write_tables(overview, output / OVERVIEW, console)
+    made.append(_write_runs(outcomes, output / RUNS))
+    page = output / f"{PAGE}.md"
+    write_whole(page, _page(methods, seeds, overview, sections, command).encode())
+    return [*made, page]
+
+
+def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Comparison]) -> Table:
+    """
+    Make the table of a pair: a row for each method.
+
+    :param pair: the pair
+    :param cells: by method
+    :param compared: what was computed of those that have runs
+    """
+    places = ranks({name: each.performance for name, each in compared.items()}, cells)
+    rows = []
+    for name, cell in cells.items():
+        found = compared.get(name)
+        if found is None:
+            rows.append((name, *[""] * (len(_HEADER) - 2), note_of(name, cell)))
+            continue
+        shares = [each.known_share for each in cell.outcomes if each.known_share is not None]
+        steps = [each.mapping_steps for each in cell.outcomes if each.mapping_steps is not None]
+        row = (
+            name,
+            str(len(cell.outcomes)),
+            estimate_text(found.estimate),
+            p_text(found.p_value),
+            f"{places[name]:g}",
+            *(_measure_text(pair, found, measure) for measure in MEASURES),
+            f"{np.mean(shares):.0%}" if shares else _EMPTY,
+            f"{np.mean(steps):,.0f}" if steps else _EMPTY,
+            f"{np.mean([each.seconds[0] for each in cell.outcomes]):.1f}",
+            note_of(name, cell),
+        )
+        rows.append(row)
+    return Table(f"{pair.name}, {pair.budget}", _HEADER, rows)
+
+
+def note_of(name: str, cell: Cell) -> str:
+    """What the table says of a method besides numbers: why it does not fit, which runs failed, whose runs they are."""
+    notes = []
+    if cell.misfit:
+        notes.append(f"does not fit: {cell.misfit}")
+    for error in dict.fromkeys(cell.errors.values()):
+        seeds = [str(seed) for seed, each in cell.errors.items() if each == error]
+        notes.append(f"failed (seed {', '.join(seeds)}): {error}")
+    if cell.run_as != name:
+        notes.append(f"the same as {cell.run_as}")
+    # In Markdown a bar would end the cell.
+    return "; ".join(notes).replace("|", "\\|")
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """An interquartile mean with its interval, if there is one."""
+    mean = number_text(float(estimate.mean))
+    if not np.isfinite(estimate.low):
+        return mean
+    return f"{mean} [{number_text(float(estimate.low))}, {number_text(float(estimate.high))}]"
+
+
+def number_text(number: float) -> str:
+    """A return for a table."""
+    digits = 0 if abs(number) >= 1000 else 1
+    return f"{without_minus_zero(number, digits):,.{digits}f}"
+
+
+def _measure_text(pair: Pair, found: Comparison, measure: str) -> str:
+    """The effect of a measure against no transfer and, in brackets, its corrected p-value."""
+    if found.measures is None:
+        return _EMPTY
+    comparison: MeasuredDifference | None = getattr(found.measures, measure_name(pair, measure))
+    if comparison is None or not np.isfinite(comparison.effect):
+        return _EMPTY
+    p_value = found.p_values[measure]
+    percent = measure == "transfer_ratio"
+    effect = without_minus_zero(comparison.effect, 2 if percent else 1)
+    text = f"{effect:+.0%}" if percent else f"{effect:+,.0f}" if abs(effect) >= 100 else f"{effect:+.1f}"
+    return text if np.isnan(p_value) else f"{text} ({p_text(p_value)})"
+
+
+def rank_table(
+    methods: Sequence[Method], cells: Mapping[str, Mapping[str, Cell]], compared: Mapping[str, Mapping[str, Comparison]]
+) -> Table:
+    """
+    Make the table of mean ranks: and in how many pairs a method is better and worse than no transfer, by the corrected tests.
+
+    :param methods: the methods
+    :param cells: by pair and method
+    :param compared: by pair and method, of those that have runs
+    """
+    performance = {pair: {name: each.performance for name, each in found.items()} for pair, found in compared.items()}
+    found = mean_ranks(performance, cells)
+    rows = []
+    for name in sorted(found, key=lambda each: found[each].rank):
+        rank = found[name]
+        tested = [of_pair[name] for of_pair in compared.values() if name in of_pair and of_pair[name].p_value < ALPHA]
+        better = sum(each.better for each in tested)
+        interval = _EMPTY if np.isnan(rank.low) else f"{rank.low:.1f} to {rank.high:.1f}"
+        against = (_EMPTY, _EMPTY) if name == NONE else (str(better), str(len(tested) - better))
+        rows.append((name, f"{rank.rank:.2f}", interval, str(rank.n_pairs), *against))
+    rows += [(method.name, "", "", "0", "", "") for method in methods if method.name not in found]
+    header = ("method", "mean rank", "95% interval", "pairs", "better than none", "worse than none")
+    return Table(f"Mean rank over pairs, and in how many a method differs from none (p < {ALPHA:g})", header, rows)
+
+
+def performance_table(
+    pairs: Sequence[Pair],
+    methods: Sequence[Method],
+    cells: Mapping[str, Mapping[str, Cell]],
+    compared: Mapping[str, Mapping[str, Comparison]],
+) -> Table:
+    """
+    Make the table of performance: interquartile means, and ranks in brackets; a row for each method, a column for each pair.
+
+    :param pairs: the pairs
+    :param methods: the methods
+    :param cells: by pair and method
+    :param compared: by pair and method, of those that have runs
+    """
+    places = {
+        name: ranks({method: each.performance for method, each in found.items()}, cells[name])
+        for name, found in compared.items()
+    }
+    rows = []
+    for method in methods:
+        row = [method.name]
+        for pair in pairs:
+            found = compared[pair.name].get(method.name)
+            failed = cells[pair.name][method.name].errors
+            if found is None:
+                row.append("failed" if failed else "")
+            else:
+                mark = "*" if found.p_value < ALPHA else ""
+                row.append(f"{number_text(float(found.estimate.mean))}{mark} ({places[pair.name][method.name]:g})")
+        rows.append(tuple(row))
+    title = f"Performance, interquartile mean (rank); *: differs from none (p < {ALPHA:g})"
+    return Table(title, ("method", *(pair.name for pair in pairs)), rows)
+
+
+def _section(pair: Pair, table: Table) -> str:
+    over = "episodes" if pair.n_steps is None else "environment steps"
+    threshold = "" if pair.threshold is None else f" Threshold: a return of {pair.threshold:g}."
+    text = f"{pair.description} Budget: {pair.budget}. Performance: mean return of an episode over {over}.{threshold}"
+    return f"### {pair.name}\n\n{text}\n\n![{pair.name}]({pair.name}.png)\n\n{table.as_markdown()}"
+
+
+def _page(
+    methods: Sequence[Method], seeds: Sequence[int], overview: Sequence[Table], sections: Sequence[str], command: Sequence[str]
+) -> str:
+    """The results as Markdown, with the command."""
+    few = len(seeds) < FEWEST_RUNS
+    parts = [
+        f"Made by `{shlex.join(command)}`, seeds {seeds[0]} to {seeds[-1]}.",
+        *([f"**{few_runs(len(seeds))}**"] if few else []),
+        *(table.as_markdown() for table in overview),
+        Table("The methods", ("method", "what it is"), [(each.name, each.description) for each in methods]).as_markdown(),
+        *sections,
+    ]
+    return "\n\n".join(part.strip("\n") for part in parts) + "\n"
+
+
+def few_runs(n_seeds: int) -> str:
+    """What is said where there are too few seeds for an interval."""
+    return (
+        f"seeds={n_seeds} is too few for intervals and tests, which need at least {FEWEST_RUNS} runs of each method: tables "
+        "have means alone"
+    )
+
+
+def _write_runs(outcomes: Sequence[Outcome], path: Path) -> Path:
+    """Write one line for each run, as far as it got."""
+    columns = ("pair", "method", "seed", "n_steps", "known_share", "mapping_steps", "misfit", "error")
+    rows: list[Sequence[object]] = [(*columns, "steps_of_episodes", "returns_of_episodes")]
+    for each in sorted(outcomes, key=lambda one: (one.pair, one.method, one.seed)):
+        values = ["" if getattr(each, name) is None else getattr(each, name) for name in columns]
+        rows.append((*values, " ".join(map(str, each.steps)), " ".join(f"{total:.10g}" for total in each.returns)))
+    write_whole(path, csv_text(rows).encode())
+    return path

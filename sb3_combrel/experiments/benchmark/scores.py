@@ -1,0 +1,282 @@
+"""What a pair's runs say of each method: performance, rank, and measures of transfer with corrected p-values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from sb3_combrel.experiments.benchmark.methods import NONE, Method
+from sb3_combrel.experiments.benchmark.pair import Pair
+from sb3_combrel.experiments.benchmark.runs import Outcome
+from sb3_combrel.experiments.bootstrap import bootstrap_band
+from sb3_combrel.experiments.statistics import Estimate, holm, interquartile_mean, p_value_of_difference
+from sb3_combrel.experiments.transfer_measures import (
+    LearningCurves,
+    TransferMeasures,
+    compare_learning,
+    total_reward,
+    total_reward_by_steps,
+)
+
+#: With fewer runs of each method there are neither intervals nor tests.
+FEWEST_RUNS = 3
+#: Level of a test, after Holm's correction over the rows of a pair's table.
+ALPHA = 0.05
+#: Episodes of the jumpstart, and of the asymptotic performance; fewer where a run has fewer.
+N_FIRST, N_LAST = 5, 10
+#: Taylor & Stone's measures, by the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`; the areas
+#: are those over environment steps where the budget is in steps.
+MEASURES = ("jumpstart", "asymptotic_performance", "total_reward", "transfer_ratio", "time_to_threshold")
+_AREAS = ("total_reward", "transfer_ratio")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """
+    What came of a method in a pair.
+
+    :param outcomes: of the runs that succeeded, by seed
+    :param misfit: why the method does not fit the pair, or ""
+    :param errors: of the runs that failed, by seed
+    :param run_as: name of the method whose runs these are
+    """
+
+    outcomes: tuple[Outcome, ...]
+    misfit: str = ""
+    errors: Mapping[int, str] = field(default_factory=dict)
+    run_as: str = ""
+
+
+class Comparison(NamedTuple):
+    """
+    A method against no transfer.
+
+    :param performance: of each run with the method, shape (n_runs,)
+    :param estimate: their interquartile mean, with its bootstrap interval
+    :param p_value: of the permutation test that both perform alike in the mean, by Holm's method over the pair's methods; NaN
+        for no transfer itself, and with too few runs
+    :param better: whether its mean performance is higher
+    :param measures: Taylor & Stone's, or None for no transfer itself and where it has no runs
+    :param p_values: of each of :data:`MEASURES`, by Holm's method over the pair's methods
+    """
+
+    performance: np.ndarray
+    estimate: Estimate
+    p_value: float
+    better: bool
+    measures: TransferMeasures | None
+    p_values: Mapping[str, float]
+
+
+def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Outcome], seeds: Sequence[int]) -> dict[str, Cell]:
+    """
+    Gather the outcomes of a pair by method.
+
+    :param pair: the pair
+    :param methods: the methods
+    :param outcomes: of any runs
+    :param seeds: seeds that count
+    """
+    own = sorted((each for each in outcomes if each.pair == pair.name and each.seed in seeds), key=lambda each: each.seed)
+    cells = {}
+    for method in methods:
+        run_as = method.run_as(pair)
+        of_method = [each for each in own if each.method == run_as]
+        misfits = [each.misfit for each in of_method if each.misfit]
+        cells[method.name] = Cell(
+            tuple(each for each in of_method if each.succeeded),
+            misfits[0] if misfits else "",
+            {each.seed: each.error for each in of_method if each.error},
+            run_as,
+        )
+    return cells
+
+
+def curves_of(outcomes: Sequence[Outcome]) -> LearningCurves:
+    """Return the learning curves of some runs."""
+    return LearningCurves.from_rows([each.returns for each in outcomes], [each.steps for each in outcomes])
+
+
+def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
+    """
+    Compute the performance of each run: the mean return of an episode, over episodes or over environment steps.
+
+    Over steps, all runs of the pair are compared over as many as the shortest has in episodes that have ended.
+
+    :param pair: the pair
+    :param cells: by method
+    :return: for each method with runs, shape (n_runs,)
+    """
+    curves = {name: curves_of(cell.outcomes) for name, cell in cells.items() if cell.outcomes}
+    if pair.n_steps is None:
+        return {name: total_reward(each, pair.n_episodes) / float(pair.n_episodes or 1) for name, each in curves.items()}
+    n_steps = int(min((each.n_steps.min() for each in curves.values()), default=1))
+    return {name: total_reward_by_steps(each, n_steps) / n_steps for name, each in curves.items()}
+
+
+def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, Comparison]:
+    """
+    Compare the methods of a pair with no transfer, where that has been run.
+
+    :param pair: the pair
+    :param cells: by method
+    :return: by method, of those with runs
+    """
+    of_runs = performances(pair, cells)
+    without = of_runs.get(NONE)
+    raw, measures = {}, {}
+    floor = min((min(each.returns) for name in of_runs for each in cells[name].outcomes), default=0.0)
+    for name, its_own in of_runs.items():
+        # Of methods whose runs are the same, one is tested.
+        if without is None or name == NONE or (cells[name].run_as != name and cells[name].run_as in of_runs):
+            continue
+        measures[name] = _measures(pair, cells[name], cells[NONE], floor)
+        enough = min(len(its_own), len(without)) >= FEWEST_RUNS
+        raw[name] = p_value_of_difference(its_own, without, "permutation") if enough else np.nan
+    corrected = _holm(raw)
+    of_measures = {measure: _holm(_p_values(pair, measures, measure)) for measure in MEASURES}
+    found = {}
+    for name, its_own in of_runs.items():
+        tested = cells[name].run_as if cells[name].run_as in measures else name
+        found[name] = Comparison(
+            its_own,
+            interquartile(its_own),
+            corrected.get(tested, np.nan),
+            without is not None and bool(its_own.mean() > without.mean()),
+            measures.get(tested),
+            {measure: of_measures[measure].get(tested, np.nan) for measure in MEASURES},
+        )
+    return found
+
+
+def interquartile(performance: np.ndarray) -> Estimate:
+    """Compute the interquartile mean of runs with its 95% bootstrap interval, NaN with fewer than :data:`FEWEST_RUNS`."""
+    found = bootstrap_band(performance, "iqm")
+    if len(performance) >= FEWEST_RUNS:
+        return found
+    return Estimate(found.mean, np.array(np.nan), np.array(np.nan))
+
+
+def measure_name(pair: Pair, measure: str) -> str:
+    """The field of a measure: areas are over environment steps where the pair's budget is in steps."""
+    return f"{measure}_by_steps" if measure in _AREAS and pair.n_steps is not None else measure
+
+
+def _measures(pair: Pair, cell: Cell, without: Cell, floor: float) -> TransferMeasures:
+    both = curves_of(cell.outcomes), curves_of(without.outcomes)
+    shortest = int(min(each.n_episodes.min() for each in both))
+    return compare_learning(
+        *both,
+        threshold=pair.threshold,
+        n_first=min(N_FIRST, shortest),
+        n_last=min(N_LAST, shortest),
+        floor=min(0.0, floor),
+    )
+
+
+def _p_values(pair: Pair, measures: Mapping[str, TransferMeasures], measure: str) -> dict[str, float]:
+    found = {}
+    for name, of_method in measures.items():
+        comparison = getattr(of_method, measure_name(pair, measure))
+        if comparison is None or min(len(comparison.with_transfer), len(comparison.without)) < FEWEST_RUNS:
+            found[name] = np.nan
+        else:
+            found[name] = comparison.p_value
+    return found
+
+
+def _holm(p_values: Mapping[str, float]) -> dict[str, float]:
+    return dict(zip(p_values, holm(np.array(list(p_values.values()))).tolist(), strict=True))
+
+
+def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, float]:
+    """
+    Rank the methods of a pair by the interquartile mean of their performance; 1 is the best, equal ones share their ranks.
+
+    Methods whose runs are the same count as one.
+
+    :param performance: of each method's runs, shape (n_runs,)
+    :param cells: by method
+    """
+    distinct = _distinct(performance, cells)
+    means = np.array([float(interquartile_mean(each)) for each in distinct.values()])
+    found = dict(zip(distinct, stats.rankdata(-means).tolist(), strict=True))
+    return {name: found[cells[name].run_as] for name in performance}
+
+
+class MeanRank(NamedTuple):
+    """
+    The mean rank of a method over pairs.
+
+    :param rank: the mean
+    :param low: lower bound of its 95% bootstrap interval, NaN where a pair has too few runs; ``high``: upper bound
+    :param n_pairs: number of pairs
+    """
+
+    rank: float
+    low: float
+    high: float
+    n_pairs: int
+
+
+def mean_ranks(
+    performance: Mapping[str, Mapping[str, np.ndarray]],
+    cells: Mapping[str, Mapping[str, Cell]],
+    n_resamples: int = 2000,
+    seed: int = 0,
+) -> dict[str, MeanRank]:
+    """
+    Average the ranks of each method over pairs, with bootstrap intervals.
+
+    In each draw the runs of every pair and method are drawn with replacement, and ranked anew. A method is ranked in the pairs
+    where it has runs, among the methods that have. So that places in pairs with many and with few methods count alike, ranks
+    are stretched to the number of methods of the pair that has most: the best has 1, the last that number. Methods whose runs
+    are the same count as one.
+
+    :param performance: of the runs, shape (n_runs,), by pair and method
+    :param cells: by pair and method
+    :param n_resamples: number of draws
+    :param seed: of the draws
+    """
+    rng = np.random.default_rng(seed)
+    distinct = {pair: _distinct(of_methods, cells[pair]) for pair, of_methods in performance.items()}
+    most = max(map(len, distinct.values()), default=0)
+    observed: dict[str, list[float]] = {}
+    drawn: dict[str, list[np.ndarray]] = {}
+    for pair, of_pair in distinct.items():
+        means = [np.array([interquartile_mean(each)]) for each in of_pair.values()]
+        resampled = [_resampled(each, n_resamples, rng) for each in of_pair.values()]
+        enough = min(map(len, of_pair.values()), default=0) >= FEWEST_RUNS
+        of_means, of_draws = (dict(zip(of_pair, _stretched(each, most), strict=True)) for each in (means, resampled))
+        for name in performance[pair]:
+            run_as = cells[pair][name].run_as
+            observed.setdefault(name, []).append(float(of_means[run_as][0]))
+            drawn.setdefault(name, []).append(of_draws[run_as] if enough else np.full(n_resamples, np.nan))
+    found = {}
+    for name, of_pairs in observed.items():
+        low, high = np.percentile(np.mean(drawn[name], axis=0), (2.5, 97.5)).tolist()
+        found[name] = MeanRank(float(np.mean(of_pairs)), low, high, len(of_pairs))
+    return found
+
+
+def _distinct(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
+    """The performance by whose runs it is: of methods whose runs are the same, once."""
+    return {cells[name].run_as: its_own for name, its_own in performance.items()}
+
+
+def _stretched(means: Sequence[np.ndarray], most: int) -> np.ndarray:
+    """Ranks of the methods in each draw, from 1 to ``most``; ``means``: of each method, shape (n_draws,)."""
+    if not means:
+        return np.zeros((0, 0))
+    found = stats.rankdata(-np.array(means), axis=0)
+    return np.ones_like(found) if len(found) < 2 else 1.0 + (found - 1.0) * (most - 1.0) / (len(found) - 1.0)
+
+
+def _resampled(samples: np.ndarray, n_resamples: int, rng: np.random.Generator) -> np.ndarray:
+    """The interquartile mean of each draw of runs, shape (n_resamples,)."""
+    drawn = rng.integers(len(samples), size=(n_resamples, len(samples)))
+    return interquartile_mean(samples[drawn], axis=1)

@@ -1,0 +1,330 @@
+"""``sb3-combrel benchmark`` with the method and the pair of a third party, from the files of the page that says how."""
+
+import csv
+import itertools
+import json
+import re
+import shutil
+
+import pytest
+from helpers.benchmark_files import PAGE, call, command, fail, succeed, write_files
+from helpers.clusters import dask_cluster
+from imageio.v3 import imread
+
+from sb3_combrel.experiments import carrying_out
+from sb3_combrel.experiments.benchmark.methods import METHODS
+from sb3_combrel.experiments.benchmark.page import main as take_into_docs
+from sb3_combrel.experiments.benchmark.pairs import PAIRS
+from sb3_combrel.experiments.pages import include
+from sb3_combrel.experiments.result_files import RESULTS, TIMES
+
+FAILING = '''
+from sb3_combrel import COMBREL
+from sb3_combrel.transfer.base import Transfer
+
+
+class Sulking(COMBREL):
+    """Raises an exception in its second episode."""
+
+    episodes = 0
+
+    def end_episode(self, truncated):
+        self.episodes += 1
+        if self.episodes == 2:
+            raise RuntimeError("no | more")
+        super().end_episode(truncated)
+
+
+def picky(source, pair):
+    """Fits no pair."""
+    raise ValueError("it takes two to walk")
+
+
+class NoMethod(Transfer):
+    """Has not what a method needs."""
+
+
+NUMBER = 3
+'''
+DYING = '''
+import os
+from pathlib import Path
+
+from sb3_combrel import COMBREL
+
+
+class Dying(COMBREL):
+    """Ends the process that it is in."""
+
+    def end_episode(self, truncated):
+        os._exit(1)
+'''
+TINY = ("--seeds", 1, "--jobs", 1)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder with the files of the page, and some that fail."""
+    folder = tmp_path_factory.mktemp("files")
+    assert write_files(folder) == ["my_method.py", "two_walks.py"]
+    (folder / "failing.py").write_text(FAILING)
+    (folder / "dying.py").write_text(DYING)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(files, tmp_path_factory):
+    """What the command of the page makes: its output folder, and what it prints."""
+    patch = pytest.MonkeyPatch()
+    patch.chdir(files)
+    printed = succeed(*command(), "--jobs", "1")
+    patch.undo()
+    return files / "walks", printed
+
+
+@pytest.fixture
+def copied(made, tmp_path):
+    return shutil.copytree(made[0], tmp_path / "walks")
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def again(copied, files, *args):
+    """Call the page's command once more, for a copy of its output; the titles of the runs that are made."""
+    patch = pytest.MonkeyPatch()
+    patch.chdir(files)
+    own = command()
+    own[own.index("walks")] = str(copied)
+    printed = succeed(*own, "--jobs", "1", *args)
+    patch.undo()
+    return re.findall(r"^  (two-walks, \S+, seed \d+)", printed, re.MULTILINE)
+
+
+def all_but_times(folder):
+    """The content of the results."""
+    return {path.name: path.read_bytes() for path in (folder / RESULTS).iterdir()}
+
+
+class TestThePage:
+    def test_every_method_of_the_command_has_a_row_with_numbers(self, made):
+        rows = rows_of(made[0] / "two-walks.csv")
+        names = [row["method"] for row in rows]
+        assert names == ["none", "oracle", "COMBREL-factored", "DrawnMappings", "wide_prior"]
+        for row in rows:
+            assert row["runs"] == "3" and row["note"] == ""
+            assert re.fullmatch(r"-\d+\.\d \[-\d+\.\d, -\d+\.\d\]", row["performance"])
+            assert float(row["seconds"]) >= 0.0
+        assert [row["known mapping"] for row in rows][:2] == ["-", "100%"]
+        assert [row["steps to a mapping"] for row in rows][:2] == ["-", "-"]
+        assert all(float(row["steps to a mapping"]) >= 1 for row in rows[2:])
+
+    def test_there_are_a_picture_a_page_and_all_runs(self, made):
+        folder, printed = made
+        assert imread(folder / "two-walks.png").shape[0] > 400
+        assert (folder / "two-walks.svg").read_text().rstrip().endswith("</svg>")
+        page = (folder / "benchmark.md").read_text()
+        assert "sb3-combrel benchmark --pairs two_walks.py --methods none" in page and "seeds 7000 to 7002" in page
+        assert "![two-walks](two-walks.png)" in page and "A walk on a line to the same walk, mirrored." in page
+        assert "COMBREL with instances, whose mapping is drawn in proportion to compliance." in page
+        assert "COMBREL with a smoother model of the source." in page
+        assert len(rows_of(folder / "runs.csv")) == 5 * 3
+        for line in ("two-walks.md", "two-walks.csv", "two-walks.png", "two-walks.svg", "benchmark.md"):
+            assert line in printed
+
+    def test_the_known_mapping_helps(self, made):
+        """Not a test of the methods: of which column is which, and of its sign."""
+        rows = {row["method"]: row for row in rows_of(made[0] / "two-walks.csv")}
+        performance = {name: float(row["performance"].split()[0]) for name, row in rows.items()}
+        assert performance["oracle"] > performance["none"]
+        assert rows["oracle"]["jumpstart"].startswith("+") and rows["oracle"]["transfer ratio"].startswith("+")
+        assert float(rows["oracle"]["rank"]) < float(rows["none"]["rank"])
+
+    def test_results_are_taken_into_the_documentation(self, made, tmp_path):
+        page = tmp_path / "benchmark.md"
+        page.write_text("before\n<!-- results: results/b/benchmark.md -->\nformer\n<!-- end of results -->\nafter\n")
+        for _ in range(2):
+            take_into_docs(made[0], tmp_path / "results" / "b", page)
+            text = page.read_text()
+            assert text.startswith("before\n") and text.endswith("<!-- end of results -->\nafter\n") and "former" not in text
+            assert "![two-walks](results/b/two-walks.png)" in text
+            assert (tmp_path / "results" / "b" / "two-walks.png").exists()
+        assert include(page) == 1
+        assert not (tmp_path / "results" / "b" / RESULTS).exists()
+
+    def test_the_documentation_has_a_place_for_results(self, tmp_path):
+        text = (PAGE.parent / "benchmark.md").read_text()
+        assert text.count("<!-- results: results/benchmark/benchmark.md -->") == text.count("<!-- end of results -->") == 1
+
+
+class TestResuming:
+    def test_a_second_call_makes_no_run_and_the_same_files(self, copied, files):
+        before = {path.name: path.read_bytes() for path in copied.iterdir() if path.is_file()}
+        assert again(copied, files) == []
+        after = {path.name: path.read_bytes() for path in copied.iterdir() if path.is_file()}
+        # The page names the command, and its output is another one; it is not in it.
+        assert after == before
+
+    def test_only_what_is_missing_is_made_and_it_is_the_same(self, copied, files):
+        before = all_but_times(copied)
+        (copied / RESULTS / "two-walks_oracle_seed7001.json").unlink()
+        damaged = copied / RESULTS / "two-walks_none_seed7000.json"
+        damaged.write_text(damaged.read_text()[:50])
+        assert sorted(again(copied, files)) == ["two-walks, none, seed 7000", "two-walks, oracle, seed 7001"]
+        assert all_but_times(copied) == before
+
+    def test_more_seeds_and_methods_add_to_what_is_there(self, copied, files):
+        done = again(copied, files, "--seeds", 4, "--methods", "none", "random-by-run")
+        assert sorted(done) == [
+            "two-walks, none, seed 7003",
+            *(f"two-walks, random-by-run, seed {s}" for s in range(7000, 7004)),
+        ]
+        assert [row["method"] for row in rows_of(copied / "two-walks.csv")] == ["none", "random-by-run"]
+
+    def test_an_interrupted_call_is_continued(self, made, files, monkeypatch, tmp_path):
+        real = carrying_out.carry_out_on
+
+        def interrupted(engine, function, jobs, **options):
+            results = real(engine, function, jobs, **options)
+
+            def until_then():
+                yield from itertools.islice(results, 2)
+                results.close()
+                raise KeyboardInterrupt
+
+            return until_then()
+
+        args = ["--pairs", files / "two_walks.py", "--methods", "none", "oracle", "--seeds", 2, "--jobs", 1]
+        args += ["--output", tmp_path / "out"]
+        monkeypatch.setattr(carrying_out, "carry_out_on", interrupted)
+        assert call(*args)[0] == 130
+        assert len(all_but_times(tmp_path / "out")) == 2
+        monkeypatch.undo()
+        assert "2 of 4 runs were complete already" in succeed(*args)
+        assert all_but_times(tmp_path / "out").items() <= all_but_times(made[0]).items()
+
+
+@pytest.fixture(scope="module")
+def failed(files, tmp_path_factory):
+    """The output of methods that fail beside one that does not."""
+    folder = tmp_path_factory.mktemp("failed")
+    own = [f"{files / 'failing.py'}:{name}" for name in ("Sulking", "picky")]
+    args = ("--pairs", files / "two_walks.py", "--methods", "none", *own, "TIMBREL", *TINY, "--output", folder)
+    return folder, succeed(*args), args
+
+
+class TestFailures:
+    def test_what_does_not_fit_has_an_empty_cell_and_a_reason(self, failed):
+        folder, printed, _ = failed
+        row = {row["method"]: row for row in rows_of(folder / "two-walks.csv")}["picky"]
+        assert row.pop("note") == "does not fit: it takes two to walk"
+        assert set(row.values()) == {"picky", ""}
+        assert "two-walks, picky, seed 7000 does not fit: it takes two to walk" in printed
+
+    def test_a_run_that_fails_has_its_error_in_the_table_and_the_others_go_on(self, failed):
+        folder, printed, _ = failed
+        rows = {row["method"]: row for row in rows_of(folder / "two-walks.csv")}
+        assert rows["Sulking"]["note"] == "failed (seed 7000): RuntimeError: no \\| more"
+        assert rows["TIMBREL"]["runs"] == rows["none"]["runs"] == "1"
+        assert "Sulking, seed 7000 failed: RuntimeError: no | more" in printed
+        overview = rows_of(folder / "overview_2.csv")
+        assert [row["two-walks"].split(" ")[0] for row in overview][1:3] == ["failed", ""]
+        kept = json.loads((folder / RESULTS / "two-walks_sulking_seed7000.json").read_text())
+        assert "in end_episode" in kept["traceback"]
+
+    def test_it_is_tried_again(self, failed):
+        _, _, args = failed
+        printed = succeed(*args)
+        assert "2 of 4 runs were complete already" in printed
+        assert re.findall(r"two-walks, (\S+), seed 7000:", printed) == ["Sulking", "picky"]
+
+    def test_one_seed_is_too_few_for_intervals(self, failed):
+        folder, printed, _ = failed
+        words = "seeds=1 is too few for intervals and tests, which need at least 3 runs of each method"
+        assert words in printed and words in (folder / "benchmark.md").read_text()
+        row = rows_of(folder / "two-walks.csv")[-1]
+        assert re.fullmatch(r"-\d+\.\d", row["performance"]) and row["p"] == "-" and "(" not in row["jumpstart"]
+
+    @pytest.mark.integration
+    def test_a_worker_that_dies(self, files, tmp_path):
+        args = ("--pairs", files / "two_walks.py", "--methods", f"{files / 'dying.py'}:Dying", "none", *TINY)
+        succeed(*args, "--output", tmp_path / "out")
+        rows = {row["method"]: row for row in rows_of(tmp_path / "out" / "two-walks.csv")}
+        assert rows["none"]["runs"] == "1"
+        assert re.match(r"failed \(seed 7000\): .*died", rows["Dying"]["note"])
+
+    def test_a_source_that_cannot_be_learned(self, files, tmp_path):
+        text = (files / "two_walks.py").read_text()
+        broken = text.replace('recorded("walk", make_walk,', 'recorded("walk", lambda: 1 / 0,').replace("two-walks", "broken")
+        (tmp_path / "broken.py").write_text(broken)
+        args = ("--pairs", tmp_path / "broken.py", "--methods", "none", "oracle", *TINY, "--output", tmp_path / "out")
+        assert "broken: its source could not be learned: ZeroDivisionError" in succeed(*args)
+        for row in rows_of(tmp_path / "out" / "broken.csv"):
+            assert row["note"].startswith("failed (seed 7000): its source could not be learned: ZeroDivisionError")
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        "options, words",
+        [
+            (("--pairs", "chess"), "pairs must be of mountain-car, .* or all; a pair of your own .* got 'chess'"),
+            (("--pairs", "nowhere.py"), "pairs: there is no file nowhere.py"),
+            (("--methods", "SARSA"), "methods must be of none, .* or all; a method of your own .* got 'SARSA'"),
+            (("--methods", "nowhere.py:M"), "methods: there is no file nowhere.py"),
+            (("--methods", "no_such_module:M"), "methods: no_such_module cannot be imported: ModuleNotFoundError"),
+            (("--methods", "failing.py:Gone"), "methods: failing.py defines no Gone"),
+            (("--methods", "failing.py:NUMBER"), "methods: failing.py:NUMBER must be a Method, .* got 3"),
+            (("--methods", "failing.py:NoMethod"), "methods: failing.py:NoMethod lacks observe, transferred"),
+            (("--pairs", "failing.py"), "pairs: failing.py defines no PAIR"),
+            (("--methods", "none", "none"), "methods must have different names, got none twice"),
+            (("--seeds", "0"), "seeds must be .* got 0"),
+            (("--first-seed", "-1"), "first_seed must be .* got -1"),
+            (("--jobs", "0"), "jobs must be .* got 0"),
+            (("--backend", "slurm"), "engine must be one of .* got 'slurm'"),
+            (("--backend", "dask"), "engine dask needs the address of a running cluster"),
+        ],
+    )
+    def test_nothing_is_learned_or_written(self, options, words, files, tmp_path, monkeypatch):
+        monkeypatch.chdir(files)
+        assert re.search(words, fail(*options, "--output", tmp_path / "out"))
+        assert not (tmp_path / "out").exists()
+
+    def test_a_file_that_raises(self, tmp_path, monkeypatch):
+        (tmp_path / "bad.py").write_text("1 / 0\n")
+        monkeypatch.chdir(tmp_path)
+        assert "pairs: bad.py cannot be imported: ZeroDivisionError: division by zero" in fail("--pairs", "bad.py")
+
+    def test_a_pair_that_has_changed_since(self, copied, files, tmp_path):
+        changed = tmp_path / "two_walks.py"
+        changed.write_text((files / "two_walks.py").read_text().replace("n_episodes=6", "n_episodes=7"))
+        message = fail("--pairs", changed, "--methods", "none", "--output", copied)
+        assert "has results of other settings (pair two-walks was" in message and "use another --output" in message
+
+    def test_two_sources_of_one_name(self, files, tmp_path):
+        text = (files / "two_walks.py").read_text().replace("two-walks", "other").replace("n_episodes=5", "n_episodes=4")
+        (tmp_path / "other.py").write_text(text)
+        message = fail("--pairs", files / "two_walks.py", tmp_path / "other.py", "--output", tmp_path / "out")
+        assert "other: another pair has a source of the name 'walk' that is recorded in another way" in message
+
+
+@pytest.mark.integration
+def test_a_cluster_gives_the_same_results(made, files, tmp_path):
+    """What the files define goes to workers that do not have them."""
+    with dask_cluster(1) as address:
+        args = ("--pairs", files / "two_walks.py", "--methods", "oracle", f"{files / 'my_method.py'}:DrawnMappings")
+        succeed(*args, "--seeds", 1, "--backend", "dask", "--address", address, "--output", tmp_path / "out")
+    found = all_but_times(tmp_path / "out")
+    assert len(found) == 2 and found.items() <= all_but_times(made[0]).items()
+
+
+def test_times_are_kept_apart(made):
+    assert {path.name for path in (made[0] / TIMES).iterdir()} == set(all_but_times(made[0]))
+
+
+def test_help_and_documentation_name_what_there_is():
+    text = (PAGE.parent / "benchmark.md").read_text()
+    assert "sb3-combrel benchmark" in text
+    # Names that a file system and a command line take as they are.
+    assert all(re.fullmatch(r"[\w.-]+", name) for name in (*METHODS, *PAIRS))

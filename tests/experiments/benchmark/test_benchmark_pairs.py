@@ -1,0 +1,357 @@
+"""The pairs of the benchmark: their tasks, their known mappings, and which choices count as those."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
+from sb3_combrel.experiments.benchmark.cart_with_pendulum import PARTS, CartWithPendulumEnv, make_cart_with_pendulum
+from sb3_combrel.experiments.benchmark.known import errors_of, known_error
+from sb3_combrel.experiments.benchmark.methods import METHODS, DoesNotFit, Method
+from sb3_combrel.experiments.benchmark.pair import Pair, described, make_env, recorded
+from sb3_combrel.experiments.benchmark.pairs import PAIRS
+from sb3_combrel.experiments.benchmark.pairs.mirrored_car import ACTIONS, ORDER, SIGNS, make_car, make_disguised
+from sb3_combrel.experiments.benchmark.renamed import disguise, disguised, mirrored
+from sb3_combrel.experiments.benchmark.runs import BenchmarkJob, carry_out, has_mapping, known_share
+from sb3_combrel.experiments.runs import chosen_on_purpose
+from sb3_combrel.transfer.candidates import MappedVariables
+
+
+def random_instances(task, n=300, seed=0, **options):
+    """Instances of random actions, which take no time to learn."""
+    with closing(make_env(task)) as env, chosen_on_purpose():
+        return SourceInstances.record(None, env, n, seed, **options)
+
+
+@pytest.fixture(scope="module")
+def sources():
+    """For each pair instances of random actions in tasks of the same spaces as its sources."""
+    from sb3_combrel.experiments.benchmark.pairs import pendulum_acrobot
+    from sb3_combrel.experiments.cart_pole import LEARNER, make_cart_pole
+    from sb3_combrel.experiments.point_robot import make_point_robot
+
+    robot = random_instances(lambda: make_point_robot(2, 0.003, "random"))
+    return {
+        "mountain-car": (random_instances("combrel/MountainCar2D-v0"),),
+        "icub": (random_instances("combrel/ICubTorsoStrike-v0"),),
+        "mirrored-car": (random_instances(make_car),),
+        "cart-pole": (random_instances(make_cart_pole, bounds=LEARNER["bounds"]),),
+        "pendulum-acrobot": (random_instances(pendulum_acrobot.make_pendulum),),
+        "point-robot": (robot,),
+        "two-sources": tuple(random_instances(lambda p=p: make_cart_with_pendulum(p)) for p in ("cart", "pendulum")),
+        "nothing-in-common": (robot,),
+    }
+
+
+class TestEveryPair:
+    def test_all_of_the_issue_are_there(self, sources):
+        assert set(PAIRS) == set(sources)
+
+    @pytest.mark.parametrize("name", PAIRS)
+    def test_episodes_have_a_limit(self, name):
+        with closing(PAIRS[name].make_target()) as env:
+            limit = env.get_wrapper_attr("_max_episode_steps")
+            assert limit <= (PAIRS[name].n_steps or limit)
+
+    @pytest.mark.parametrize("name", PAIRS)
+    @pytest.mark.parametrize("method", METHODS)
+    def test_every_method_fits_or_says_why_not(self, name, method, sources):
+        pair, given = PAIRS[name], sources[name]
+        unfit = {"oracle": pair.known is None, "TIMBREL": pair.known_by_action is None or len(given) > 1}
+        try:
+            transfer = METHODS[method].make(given[0] if len(given) == 1 else list(given), pair)
+        except DoesNotFit as error:
+            assert unfit.get(method, False) and ("nobody knows" in str(error) or "one source" in str(error))
+            return
+        assert not unfit.get(method, False)
+        with closing(pair.make_target()) as env, chosen_on_purpose():
+            learner = FittedRMax(env, transfer=transfer, seed=0, **pair.learner)
+        assert (learner.agent.transfer is None) == (method == "none")
+
+    @pytest.mark.parametrize("name", [name for name, pair in PAIRS.items() if pair.known is not None])
+    def test_the_oracle_chooses_the_known_mapping_only(self, name, sources):
+        pair, given = PAIRS[name], sources[name]
+        transfer = METHODS["oracle"].make(given[0] if len(given) == 1 else list(given), pair)
+        with closing(pair.make_target()) as env, chosen_on_purpose():
+            bound = FittedRMax(env, transfer=transfer, seed=0, **pair.learner).agent.transfer
+        for action in range(bound.task.n_actions):
+            mapped = bound.mapped_variables(int(bound.choices()[action * len(bound.task.sample_states)]))
+            assert mapped.target_action == action and pair.agrees(mapped)
+
+
+class TestKnownMappings:
+    @pytest.mark.parametrize("name", ["mirrored-car", "two-sources", "icub"])
+    def test_predicts_nearly_as_well_as_the_best_of_the_set(self, name, sources):
+        pair = PAIRS[name]
+        target = random_instances(pair.target, 800, seed=1)
+        found = errors_of(pair, sources[name], target)
+        assert found.least <= found.known + 1e-12 and found.least <= found.chosen + 1e-12
+        assert found.known < 0.5 and found.known < 1.3 * found.least + 0.02
+
+    def test_another_mapping_predicts_worse(self, sources):
+        pair = PAIRS["mirrored-car"]
+        target = random_instances(pair.target, 300, seed=1)
+        right = errors_of(pair, sources["mirrored-car"], target).known
+        for wrong in (disguise(ORDER, (1, 1), ACTIONS), disguise(ORDER, SIGNS, (0, 1, 2)), disguise((0, 1), SIGNS, ACTIONS)):
+            other = replace(pair, known=FactoredMapping((wrong,)))
+            assert errors_of(other, sources["mirrored-car"], target).known > 1.5 * right
+
+    def test_the_error_of_a_known_mapping_is_that_of_its_predictions(self, sources):
+        """Against the mean over transitions of what the prior itself predicts."""
+        pair, (source,) = PAIRS["mirrored-car"], sources["mirrored-car"]
+        target = random_instances(pair.target, 200, seed=1)
+        found = errors_of(pair, (source,), target).known
+        with closing(pair.make_target()) as env:
+            bound = FittedRMax(env, transfer=METHODS["oracle"].make(source, pair), seed=0).agent.transfer
+        scaling = bound.task.scaling
+        states, after = scaling.to_unit(target.states), scaling.to_unit(target.next_states)
+        predicted = bound._prior.predict(states, target.actions).effect
+        naive = ((after - states - predicted) ** 2).sum() / ((after - states) ** 2).sum()
+        assert found == pytest.approx(naive, rel=1e-6)
+
+    def test_nobody_knows_one(self):
+        with pytest.raises(ValueError, match="known must be a mapping, got None: nobody knows that of nothing-in-common"):
+            errors_of(PAIRS["nothing-in-common"], (random_instances(make_car, 50),), random_instances(make_car, 50))
+
+    def test_one_that_is_not_in_the_set(self, sources):
+        pair = replace(PAIRS["mirrored-car"], mappings="factored")
+        with pytest.raises(ValueError, match="known must be made of copies of the pair's set of mappings"):
+            errors_of(pair, sources["mirrored-car"], random_instances(pair.target, 50))
+        assert callable(known_error)
+
+
+def mapped(action, source, variable, sign, used):
+    return MappedVariables(action, *(np.array(each) for each in (source, variable, sign, used)))
+
+
+class TestAgreement:
+    """Target variables x, y; under action 0 the known mapping is of x, under action 1 of a mirrored y."""
+
+    PAIR = Pair(
+        "agreement",
+        "Made up.",
+        (recorded("nothing", "CartPole-v1"),),
+        "CartPole-v1",
+        n_episodes=1,
+        known_by_action=(InterTaskMapping((1, None), (2, 0)), InterTaskMapping((None, 0), (0, 3), (1, -1))),
+    )
+
+    @pytest.mark.parametrize(
+        "decision, agrees",
+        [
+            (mapped(0, [0, -1], [1, -1], [1, 0], [2, -1]), True),
+            (mapped(0, [0, 0], [1, 0], [1, 1], [2, 5]), True),
+            (mapped(0, [0, -1], [0, -1], [1, 0], [2, -1]), False),
+            (mapped(0, [0, -1], [1, -1], [-1, 0], [2, -1]), False),
+            (mapped(0, [0, -1], [1, -1], [1, 0], [1, -1]), False),
+            (mapped(0, [1, -1], [1, -1], [1, 0], [2, -1]), False),
+            (mapped(0, [-1, -1], [-1, -1], [0, 0], [-1, -1]), False),
+            (mapped(1, [-1, 0], [-1, 0], [0, -1], [-1, 3]), True),
+            (mapped(1, [-1, 0], [-1, 0], [0, 1], [-1, 3]), False),
+        ],
+    )
+    def test_only_what_the_action_moves_counts(self, decision, agrees):
+        assert self.PAIR.agrees(decision) is agrees
+
+    def test_the_share_is_weighted_by_uses(self):
+        class Chooser:
+            def uses(self):
+                return {0: 3, 1: 1}
+
+            def mapped_variables(self, number):
+                return mapped(0, [0, -1], [1 - number, -1], [1, 0], [2, -1])
+
+        assert known_share(self.PAIR, Chooser()) == 0.75
+        assert known_share(self.PAIR, object()) is None and known_share(self.PAIR, None) is None
+        assert known_share(replace(self.PAIR, known_by_action=None), Chooser()) is None
+        Chooser.uses = lambda self: {}
+        assert known_share(self.PAIR, Chooser()) is None
+
+
+class TestStepsToAMapping:
+    class Chooser:
+        """Names a candidate for one of three pairs from some number of questions on."""
+
+        def __init__(self, makes_choices, n_before):
+            self.makes_choices, self.left = makes_choices, n_before
+
+        def choices(self):
+            self.left -= 1
+            return np.array([-1, 4 if self.left < 0 else -1, -1])
+
+        def uses(self):
+            self.left -= 1
+            return {4: 1} if self.left < 0 else {}
+
+    @pytest.mark.parametrize("makes_choices", [True, False])
+    def test_a_mapping_is_there_when_a_candidate_is_named(self, makes_choices):
+        transfer = self.Chooser(makes_choices, 2)
+        assert [has_mapping(transfer) for _ in range(4)] == [False, False, True, True]
+
+    def test_of_combrel_are_its_first_ten_transitions(self, sources):
+        """A prior is chosen after ten, which the recorder sees after the next step at the latest."""
+        pair = replace(PAIRS["mirrored-car"], n_steps=250)
+        for name, steps in (("COMBREL-factored", (10, 11)), ("COMBREL-instances", (1, 3)), ("oracle", (None,))):
+            found = carry_out(BenchmarkJob(pair, METHODS[name], 0, sources["mirrored-car"]))
+            assert not found.error and found.mapping_steps in steps and found.n_steps == 250
+
+    def test_a_method_may_say_what_it_spends(self, sources):
+        class Spender(COMBREL):
+            def mapping_steps(self):
+                return 77
+
+        pair, method = replace(PAIRS["mirrored-car"], n_steps=250), Method("spender", "", lambda source, pair: Spender(source))
+        assert carry_out(BenchmarkJob(pair, method, 0, sources["mirrored-car"])).mapping_steps == 77
+
+
+def test_a_budget_without_the_end_of_an_episode_is_an_error(sources):
+    pair = replace(PAIRS["mirrored-car"], n_steps=100)
+    found = carry_out(BenchmarkJob(pair, METHODS["none"], 0, sources["mirrored-car"]))
+    assert "no episode has ended within n_steps=100" in found.error and not found.misfit
+
+
+def test_a_learner_that_cannot_be_made_is_no_misfit_of_the_method(sources):
+    pair = replace(PAIRS["mirrored-car"], learner={"model_breadth": -1.0})
+    found = carry_out(BenchmarkJob(pair, METHODS["COMBREL"], 0, sources["mirrored-car"]))
+    assert found.error.startswith("ValueError: model_breadth must") and not found.misfit
+
+
+class TestMappedVariables:
+    @pytest.mark.parametrize("use", ["instances", "prior"])
+    def test_of_a_given_mapping_with_mirrored_variables(self, use, sources):
+        source, mapping = sources["mirrored-car"][0], disguise(ORDER, SIGNS, ACTIONS)
+        given = FactoredMapping((mapping,)) if use == "prior" else mapping
+        with closing(make_disguised()) as env:
+            bound = FittedRMax(env, transfer=TIMBREL(source, given, use=use), seed=0).agent.transfer
+        n_points = len(bound.task.sample_states)
+        for action in range(3):
+            found = bound.mapped_variables(int(bound.choices()[action * n_points]))
+            assert found.target_action == action and found.action.tolist() == [ACTIONS[action]] * 2
+            assert (found.source.tolist(), found.variable.tolist(), found.sign.tolist()) == ([0, 0], list(ORDER), list(SIGNS))
+
+    def test_agree_with_the_names_of_all_candidates(self, sources):
+        """Of two sources, one of which has a variable left out: by the text that says the same."""
+        given = list(sources["two-sources"])
+        with closing(PAIRS["two-sources"].make_target()) as env:
+            bound = FittedRMax(env, transfer=COMBREL(given, "injective", use="instances"), seed=0).agent.transfer
+        for number in range(0, len(bound.candidates), 7):
+            found, parts = bound.mapped_variables(number), bound.candidate(number)
+            has = found.source >= 0
+            (source,) = set(found.source[has].tolist())
+            assert found.target_action == parts.target_action
+            assert {given[source].action_names[a] for a in found.action[has]} == {parts.source_action}
+            for v, name in enumerate(bound.task.state_names):
+                words = f"{name}<-{given[source].state_names[found.variable[v]]}" if has[v] else f"{name}<-"
+                assert (words.replace("<-", "") in parts.state_mapping.replace("<-", "").replace(" ", "")) or not has[v]
+            assert (found.variable[~has] == -1).all() and (found.sign[~has] == 0).all() and (found.action[~has] == -1).all()
+
+
+class TestDisguise:
+    def test_is_the_same_task_under_the_mapping(self):
+        """Every step of the disguised car is one of the car's, to rounding."""
+        plain, other = make_car(), make_disguised()
+        box, mapping = plain.observation_space, disguise(ORDER, SIGNS, ACTIONS)
+        first, _ = plain.reset(seed=3)
+        seen, _ = other.reset(seed=3)
+        rng = np.random.default_rng(0)
+        for _ in range(150):
+            unit = (seen - other.observation_space.low) / (other.observation_space.high - other.observation_space.low)
+            back = box.low + mapping.target_to_source(unit[None].astype(np.float64), 2)[0] * (box.high - box.low)
+            np.testing.assert_allclose(back, first, atol=1e-6)
+            action = int(rng.integers(3))
+            seen, reward, *ends, _ = other.step(action)
+            first, own_reward, *own_ends, _ = plain.step(mapping.action[action])
+            assert (reward, ends) == (own_reward, own_ends)
+        assert other.observation_space.contains(seen)
+
+    @pytest.mark.parametrize(
+        "order, signs, actions, words",
+        [
+            ((0, 0), (1, 1), (0, 1, 2), "order must hold each of 0 to 1 once"),
+            ((0, 1), (1,), (0, 1, 2), "one bool for each of the 2 variables"),
+            ((0, 1), (1, 1), (0, 1, 1), "order must hold each of 0 to 2 once"),
+        ],
+    )
+    def test_refuses_what_does_not_fit(self, order, signs, actions, words):
+        with pytest.raises(ValueError, match=words):
+            disguised(make_car(), order, signs, actions)
+
+    def test_variables_without_bounds_are_not_mirrored(self):
+        with pytest.raises(ValueError, match="where bounds are finite"):
+            mirrored(gym.make("CartPole-v1"), (False, True, False, False))
+
+
+class TestCartWithPendulum:
+    @pytest.mark.parametrize("parts", PARTS)
+    def test_gymnasium_finds_nothing_wrong(self, parts):
+        check_env(CartWithPendulumEnv(parts), skip_render_check=True)
+
+    def test_another_part_is_refused(self):
+        with pytest.raises(ValueError, match="parts must be one of cart, pendulum, both, got 'wheel'"):
+            CartWithPendulumEnv("wheel")
+
+    def test_the_cart_moves_as_it_does_alone_and_so_does_the_pendulum_without_pushes(self):
+        for alone, columns, actions in (("cart", slice(0, 2), (0, 1, 2)), ("pendulum", slice(2, 4), (0, 3, 4))):
+            both, part = CartWithPendulumEnv("both"), CartWithPendulumEnv(alone)
+            both.reset(seed=5)
+            part.reset(seed=5)
+            for action in np.random.default_rng(0).integers(0, 3, size=200).tolist():
+                np.testing.assert_array_equal(both.step(actions[action])[0][columns], part.step(action)[0])
+
+    def test_a_torque_alone_does_not_lift_the_pendulum(self):
+        env = CartWithPendulumEnv("pendulum")
+        env.reset(seed=0)
+        assert not any(env.step(2)[2] for _ in range(300))
+        # With the velocity it does.
+        env.reset(seed=0)
+        state, ended = env.reset(seed=0)[0], False
+        for _ in range(300):
+            state, _, ended, _, _ = env.step(2 if state[1] > 0 else 1)
+            if ended:
+                break
+        assert ended and np.cos(state[0]) >= 0.9
+
+    def test_pushes_move_the_cart_to_its_goal_and_pull_the_pendulum(self):
+        env = CartWithPendulumEnv("cart")
+        env.reset(seed=0)
+        steps = next(k for k in range(300) if env.step(2)[2])
+        assert 20 <= steps <= 60
+        both = CartWithPendulumEnv("both")
+        turned = []
+        for action in (0, 2):
+            both.reset(seed=0)
+            turned.append(both.step(action)[0][3])
+        assert turned[0] != turned[1]
+
+
+class TestPairArguments:
+    @pytest.mark.parametrize(
+        "options, words",
+        [
+            ({"name": "a b"}, 'name must be of letters, digits, "-", "_" and ".", got'),
+            ({"n_steps": 5}, "either n_steps or n_episodes must be given, got 5 and 1"),
+            ({"n_episodes": None}, "got None and None"),
+            ({"n_episodes": 0}, "n_episodes must be .* got 0"),
+            ({"threshold": np.nan}, "threshold must be .* got nan"),
+            ({"sources": ()}, "sources must be a tuple of at least one Source"),
+            ({"known": (FactoredMapping((disguise(ORDER, SIGNS, ACTIONS),)),) * 2}, "each of the 1 sources, got 2"),
+        ],
+    )
+    def test_wrong_ones_are_named(self, options, words):
+        given = {"name": "p", "description": "", "sources": (recorded("s", "CartPole-v1"),), "target": "CartPole-v1"}
+        with pytest.raises(ValueError, match=words):
+            Pair(**{**given, "n_episodes": 1, **options})
+
+    def test_a_learner_that_does_not_exist(self):
+        with pytest.raises(ValueError, match="learner must be one of fitted_rmax, q_learning, got 'sarsa'"):
+            recorded("s", "CartPole-v1", "sarsa")
+
+    def test_settings_tell_pairs_apart(self):
+        one, other = (recorded("s", "CartPole-v1", n_episodes=n) for n in (5, 6))
+        assert described(one.learn) != described(other.learn)
+        assert PAIRS["icub"].settings() != replace(PAIRS["icub"], n_steps=4999).settings()
+        assert PAIRS["icub"].settings() == replace(PAIRS["icub"], description="In other words.").settings()

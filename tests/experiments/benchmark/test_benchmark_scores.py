@@ -1,0 +1,262 @@
+"""Performance, ranks, tests and tables against naive computations on made-up runs."""
+
+import itertools
+
+import numpy as np
+import pytest
+from helpers.paper_results import quiet
+from scipy import stats
+
+from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
+from sb3_combrel.experiments.benchmark.pair import Pair
+from sb3_combrel.experiments.benchmark.report import (
+    estimate_text,
+    note_of,
+    pair_table,
+    performance_table,
+    rank_table,
+    write_report,
+)
+from sb3_combrel.experiments.benchmark.runs import Outcome
+from sb3_combrel.experiments.benchmark.scores import Cell, cells_of, compare, interquartile, mean_ranks, performances, ranks
+from sb3_combrel.experiments.statistics import holm
+from sb3_combrel.experiments.suite_tasks import Source
+
+
+def pair_of(name="made-up", **options):
+    """A pair that nobody learns; 8 episodes unless ``n_steps`` is given."""
+    budget = {} if "n_steps" in options else {"n_episodes": 8}
+    return Pair(name, "Made up.", (Source("nothing", None),), "CartPole-v1", **budget, **options)
+
+
+def method_of(name, same_as=None):
+    return Method(name, f"Made-up {name}.", None, same_as=None if same_as is None else lambda pair: same_as)
+
+
+def outcome(pair, method, seed, returns, steps=None, **others):
+    steps = [10] * len(returns) if steps is None else steps
+    found = {"known_share": 0.5, "mapping_steps": 3, "seconds": (1.5, 0.5)} | others
+    return Outcome(f"{pair}_{method}_{seed}", pair, method, seed, list(steps), list(returns), [True] * len(steps), **found)
+
+
+def made_up(levels, pair="made-up", n_seeds=5, n_episodes=8, seed=0):
+    """Outcomes of methods whose returns are normal around a level."""
+    rng = np.random.default_rng(seed)
+    return [
+        outcome(pair, name, number, rng.normal(level, 1.0, n_episodes).tolist())
+        for name, level in levels.items()
+        for number in range(n_seeds)
+    ]
+
+
+def naive_iqm(values):
+    """The mean of what is left when a quarter of the values, rounded down, is taken away at each end."""
+    values, cut = sorted(values), len(values) // 4
+    return np.mean(values[cut : len(values) - cut])
+
+
+def cells_by(levels, **options):
+    outcomes = made_up(levels, **options)
+    pair = pair_of(options.get("pair", "made-up"))
+    return pair, cells_of(pair, [method_of(name) for name in levels], outcomes, range(100))
+
+
+class TestPerformance:
+    def test_over_episodes_it_is_the_mean_return(self):
+        pair, cells = cells_by({NONE: 0.0, "a": 3.0})
+        for name, found in performances(pair, cells).items():
+            np.testing.assert_allclose(found, [np.mean(each.returns) for each in cells[name].outcomes])
+
+    def test_over_steps_each_step_counts_the_return_of_its_episode(self):
+        pair = pair_of(n_steps=50)
+        runs = {NONE: ([1.0, 4.0], [20, 30]), "a": ([2.0, 3.0, 5.0], [10, 10, 25])}
+        outcomes = [outcome("made-up", name, 0, returns, steps) for name, (returns, steps) in runs.items()]
+        found = performances(pair, cells_of(pair, [method_of(name) for name in runs], outcomes, [0]))
+        # The shortest has 45 steps in episodes that have ended.
+        for name, (returns, steps) in runs.items():
+            by_step = np.repeat(returns, steps)[:45]
+            np.testing.assert_allclose(found[name], [by_step.mean()])
+
+    @pytest.mark.parametrize("n_seeds", [3, 4, 7, 10])
+    def test_the_estimate_is_the_interquartile_mean_within_its_interval(self, n_seeds):
+        values = np.random.default_rng(n_seeds).normal(size=n_seeds)
+        found = interquartile(values)
+        assert found.mean == pytest.approx(naive_iqm(values))
+        assert values.min() <= found.low <= found.mean <= found.high <= values.max()
+
+    def test_fewer_than_three_runs_have_no_interval(self):
+        found = interquartile(np.array([1.0, 2.0]))
+        assert found.mean == 1.5 and np.isnan(found.low) and np.isnan(found.high)
+        assert estimate_text(found) == "1.5"
+
+
+class TestRanks:
+    def test_the_best_has_1_and_equal_ones_share(self):
+        _, cells = cells_by({"a": 0.0, "b": 5.0, "c": 10.0})
+        performance = {name: np.array(values) for name, values in {"a": [1.0] * 4, "b": [7.0] * 4, "c": [1.0] * 4}.items()}
+        assert ranks(performance, cells) == {"a": 2.5, "b": 1.0, "c": 2.5}
+
+    def test_methods_with_the_same_runs_count_as_one(self):
+        pair = pair_of()
+        methods = [method_of("a"), method_of("b", same_as="c"), method_of("c"), method_of("d")]
+        cells = cells_of(pair, methods, made_up({"a": 0.0, "c": 5.0, "d": -5.0}), range(5))
+        assert cells["b"].outcomes == cells["c"].outcomes and cells["b"].run_as == "c"
+        assert ranks(performances(pair, cells), cells) == {"a": 2.0, "b": 1.0, "c": 1.0, "d": 3.0}
+        compared = compare(pair, cells)
+        assert note_of("b", cells["b"]) == "the same as c"
+        np.testing.assert_array_equal(compared["b"].performance, compared["c"].performance)
+
+    def test_mean_ranks_are_those_of_a_naive_computation(self):
+        levels = {"one": {"a": 0.0, "b": 0.2, "c": 0.4}, "two": {"a": 0.3, "b": 0.0, "c": 0.2}}
+        cells = {name: cells_by(of, pair=name, seed=k)[1] for k, (name, of) in enumerate(levels.items())}
+        performance = {name: performances(pair_of(name), cells[name]) for name in levels}
+        found = mean_ranks(performance, cells)
+        for method in "abc":
+            places = []
+            for of_methods in performance.values():
+                mine = naive_iqm(of_methods[method])
+                places.append(1 + sum(naive_iqm(other) > mine for other in of_methods.values()))
+            assert found[method].rank == pytest.approx(np.mean(places)) and found[method].n_pairs == 2
+            assert 1.0 <= found[method].low <= found[method].high <= 3.0
+        # Every draw hands out all places.
+        assert sum(each.rank for each in found.values()) == pytest.approx(6.0)
+
+    def test_the_interval_covers_what_draws_of_runs_give(self):
+        pair, cells = cells_by({"a": 0.0, "b": 0.1}, n_seeds=4)
+        performance = performances(pair, cells)
+        found = mean_ranks({"made-up": performance}, {"made-up": cells}, n_resamples=20_000)
+        # All draws of four runs of each.
+        draws = [np.array([naive_iqm(d) for d in itertools.product(performance[name], repeat=4)]) for name in "ab"]
+        worse = np.mean(draws[0][:, None] < draws[1])
+        assert 0.025 < worse < 0.975, "the example must be undecided"
+        assert (found["a"].low, found["a"].high) == (1.0, 2.0)
+        sure = mean_ranks({"made-up": {"a": performance["a"] - 9.0, "b": performance["b"]}}, {"made-up": cells})
+        assert (sure["a"].rank, sure["a"].low, sure["a"].high) == (2.0, 2.0, 2.0)
+
+    def test_where_cells_are_empty_ranks_are_stretched(self):
+        cells = {
+            "one": cells_by({"a": 0.0, "b": 10.0, "c": 20.0}, pair="one")[1],
+            "two": cells_by({"a": 0.0, "b": 10.0}, pair="two")[1],
+        }
+        performance = {name: performances(pair_of(name), cells[name]) for name in cells}
+        found = mean_ranks(performance, cells)
+        assert {name: (each.rank, each.n_pairs) for name, each in found.items()} == {
+            "a": (3.0, 2),
+            "b": (1.5, 2),
+            "c": (1.0, 1),
+        }
+
+    def test_with_too_few_runs_in_a_pair_there_is_no_interval(self):
+        pair, cells = cells_by({"a": 0.0, "b": 1.0}, n_seeds=2)
+        found = mean_ranks({"made-up": performances(pair, cells)}, {"made-up": cells})
+        assert np.isnan(found["a"].low) and np.isnan(found["a"].high) and found["a"].rank in (1.0, 2.0)
+
+
+LEVELS = {NONE: 0.0, "a": 5.0, "b": 0.1, "c": -5.0}
+
+
+class TestComparison:
+    def test_p_values_are_corrected_over_the_methods_of_a_pair(self):
+        pair, cells = cells_by(LEVELS)
+        found, performance = compare(pair, cells), performances(pair, cells)
+        raw = []
+        for name in "abc":
+            together = np.concatenate([performance[name], performance[NONE]])
+            difference = abs(performance[name].mean() - performance[NONE].mean())
+            splits = [set(chosen) for chosen in itertools.combinations(range(10), 5)]
+            means = [
+                abs(np.mean([together[k] for k in s]) - np.mean([together[k] for k in range(10) if k not in s]))
+                for s in splits
+            ]
+            raw.append(np.mean(np.array(means) >= difference - 1e-12))
+        np.testing.assert_allclose([found[name].p_value for name in "abc"], holm(np.array(raw)))
+        assert np.isnan(found[NONE].p_value) and found[NONE].measures is None
+        assert [found[name].better for name in "ac"] == [True, False]
+
+    def test_measures_are_differences_to_no_transfer(self):
+        pair, cells = cells_by(LEVELS)
+        found = compare(pair, cells)["a"].measures
+        returns = {name: np.array([each.returns for each in cells[name].outcomes]) for name in ("a", NONE)}
+        difference = returns["a"] - returns[NONE]
+        assert found.jumpstart.effect == pytest.approx(difference[:, :5].mean())
+        assert found.asymptotic_performance.effect == pytest.approx(difference.mean())
+        assert found.total_reward.effect == pytest.approx(difference.sum(axis=1).mean())
+        assert found.floor == pytest.approx(min(min(each.returns) for cell in cells.values() for each in cell.outcomes))
+
+    def test_without_no_transfer_nothing_is_compared(self):
+        pair, cells = cells_by({"a": 0.0, "b": 1.0})
+        found = compare(pair, cells)
+        assert set(found) == {"a", "b"} and all(each.measures is None and np.isnan(each.p_value) for each in found.values())
+
+    def test_two_runs_are_not_tested(self):
+        pair, cells = cells_by(LEVELS, n_seeds=2)
+        found = compare(pair, cells)
+        assert all(np.isnan(each.p_value) for each in found.values())
+        assert all(np.isnan(p) for p in found["a"].p_values.values())
+
+
+class TestTables:
+    METHODS = (method_of(NONE), method_of("a"), method_of("b"), method_of("c"))
+
+    @pytest.fixture
+    def found(self):
+        """Cells and comparisons: "b" does not fit, one run of "c" failed."""
+        outcomes = made_up({NONE: 0.0, "a": 5.0, "c": -5.0})
+        outcomes = [each for each in outcomes if (each.method, each.seed) != ("c", 4)]
+        outcomes += [outcome("made-up", "c", 4, [], error="ValueError: no"), outcome("made-up", "b", 0, [], misfit="too wide")]
+        pair = pair_of()
+        cells = cells_of(pair, self.METHODS, outcomes, range(5))
+        return pair, cells, compare(pair, cells), outcomes
+
+    def test_a_row_for_each_method(self, found):
+        pair, cells, compared, _ = found
+        table = pair_table(pair, cells, compared)
+        rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
+        assert [rows[name]["runs"] for name in (NONE, "a", "b", "c")] == ["5", "5", "", "4"]
+        assert [rows[name]["rank"] for name in (NONE, "a", "c")] == ["2", "1", "3"]
+        assert rows["b"]["note"] == "does not fit: too wide" and rows["c"]["note"] == "failed (seed 4): ValueError: no"
+        assert rows["a"]["known mapping"] == "50%" and rows["a"]["steps to a mapping"] == "3" and rows["a"]["seconds"] == "1.5"
+        assert rows["a"]["performance"].startswith(f"{naive_iqm([np.mean(e.returns) for e in cells['a'].outcomes]):.1f} [")
+
+    def test_better_and_worse_than_none_are_counted(self, found):
+        pair, cells, compared, _ = found
+        table = rank_table(self.METHODS, {pair.name: cells}, {pair.name: compared})
+        assert [row[0] for row in table.rows] == ["a", NONE, "c", "b"]
+        assert [row[-2:] for row in table.rows] == [("1", "0"), ("-", "-"), ("0", "1"), ("", "")]
+
+    def test_performance_of_all_pairs(self, found):
+        pair, cells, compared, _ = found
+        table = performance_table([pair], self.METHODS, {pair.name: cells}, {pair.name: compared})
+        assert [row[1].endswith(end) for row, end in zip(table.rows, (" (2)", "* (1)", "", "* (3)"), strict=True)] == [
+            True
+        ] * 4
+        assert table.rows[2] == ("b", "")
+
+    def test_a_report_without_any_run(self, tmp_path):
+        pair = pair_of()
+        outcomes = [outcome("made-up", each.name, 0, [], error="RuntimeError: never") for each in self.METHODS]
+        made = write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], quiet())
+        assert all(path.exists() for path in made) and "RuntimeError: never" in (tmp_path / "made-up.md").read_text()
+
+    def test_only_the_seeds_asked_for_count(self):
+        pair = pair_of()
+        cells = cells_of(pair, [method_of("a")], made_up({"a": 0.0}), [1, 3])
+        assert [each.seed for each in cells["a"].outcomes] == [1, 3]
+        assert isinstance(cells["a"], Cell)
+
+
+def test_holm_and_ranks_agree_with_scipy_where_it_has_them():
+    values = np.random.default_rng(0).normal(size=(4, 6))
+    _, cells = cells_by({name: 0.0 for name in "abcd"})
+    found = ranks(dict(zip("abcd", values, strict=True)), cells)
+    np.testing.assert_array_equal(list(found.values()), stats.rankdata([-naive_iqm(row) for row in values]))
+
+
+def test_a_method_whose_name_is_no_file_name_is_refused():
+    with pytest.raises(ValueError, match=r'name must be of letters, digits, "-", "_" and "\.", got \'a/b\''):
+        method_of("a/b")
+
+
+def test_each_method_of_the_package_says_what_it_is():
+    assert next(iter(METHODS)) == NONE
+    assert all(method.description and name == method.name for name, method in METHODS.items())
