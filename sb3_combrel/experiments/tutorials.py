@@ -2,7 +2,7 @@
 Execute the tutorials, and write what their cells print and draw into them.
 
 A tutorial is a notebook in jupytext's Markdown format: fences of ``python`` and ``bash`` are its cells. What a cell printed
-stands below it between two comments, so that it can be read without running anything; figures are saved by the cells themselves.
+stands below it between two comments, so that it can be read without running anything; cells save their figures themselves.
 Run as ``python -m sb3_combrel.experiments.tutorials``.
 """
 

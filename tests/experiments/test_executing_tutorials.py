@@ -79,8 +79,8 @@ class TestExecuting:
 
     def test_commands_are_those_of_this_environment(self, tmp_path):
         file = tmp_path / "1_small.md"
-        file.write_text("```bash\npython -c 'import sb3_combrel, sys; print(sys.prefix)'\n```\n")
-        assert execute(file) == [sys.prefix]
+        file.write_text(TEXT.replace("echo $((1 + 2))", "python -c 'import sb3_combrel, sys; print(sys.prefix)'"))
+        assert execute(file) == ["", "2", sys.prefix]
 
     def test_the_command_writes_outputs_into_the_files(self, tmp_path, monkeypatch, capsys):
         file = tmp_path / "1_small.md"
