@@ -4,6 +4,7 @@ import re
 import shutil
 from pathlib import Path
 
+import jupytext
 import pytest
 
 from sb3_combrel.experiments.tutorials import execute, figures_of, recorded_outputs, tutorial_files
@@ -32,6 +33,12 @@ def test_all_cells_run(file, tmp_path):
     assert not missing, "figures that the tutorial shows and no cell has saved"
     prints = [output != "" for output in outputs]
     assert prints == [recorded is not None for recorded in recorded_outputs(text)], "make tutorials renews what is recorded"
+
+
+@pytest.mark.parametrize("file", FILES, ids=named)
+def test_jupyter_need_not_ask_for_a_kernel(file):
+    assert jupytext.read(file).metadata["kernelspec"]["name"] == "python3"
+    assert file.read_text().startswith("<!--\n"), "a code host would show the header"
 
 
 def test_there_are_five_and_the_index_has_them():
