@@ -9,6 +9,7 @@
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make suite   the learner on all tasks, as in docs/results/learner.md (hours); SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
+# make tutorials   execute all cells of tutorials/, and renew the outputs and figures in them
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
 # Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
@@ -35,7 +36,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard suite reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -58,6 +59,11 @@ reproduce: $(VENV)/.installed-demo
 # A later call goes on with what is there.
 benchmark: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel benchmark $(BENCHMARK_ARGS)
+
+# Executes all tutorials and renews their outputs and figures.
+tutorials: $(VENV)/.installed-all gl
+	$(BIN)/python -m sb3_combrel.experiments.warm_up
+	$(BIN)/python -m sb3_combrel.experiments.tutorials
 
 # Takes what was reproduced, and the results of the benchmark, into README.md and docs/.
 results:
