@@ -13,7 +13,10 @@ from unittest import mock
 
 PROGRAM = "python -m sb3_combrel.zoo"
 NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[zoo]'"
-OF_EXTRA = ("rl_zoo3", "sb3_contrib", "optuna", "seaborn", "pytablewriter", "pandas", "matplotlib", "yaml", "huggingface_sb3")
+OF_EXTRA = (
+    *("rl_zoo3", "sb3_contrib", "optuna", "seaborn", "pytablewriter", "pandas", "matplotlib", "yaml"),
+    *("huggingface_sb3", "huggingface_hub"),
+)
 FUNCTIONS = {
     "train": "rl_zoo3.train",
     "enjoy": "rl_zoo3.enjoy",
@@ -26,6 +29,8 @@ SCRIPTS = {
     "record_video": "rl_zoo3.record_video",
     "record_training": "rl_zoo3.record_training",
     "benchmark": "rl_zoo3.benchmark",
+    "push_to_hub": "rl_zoo3.push_to_hub",
+    "load_from_hub": "rl_zoo3.load_from_hub",
 }
 """Commands that are scripts and do their work as ``__main__`` only; they know no ``--gym-packages``."""
 
@@ -53,12 +58,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(command: str, args: list[str]) -> int:
+    from sb3_combrel.zoo import hub
     from sb3_combrel.zoo.registration import register
 
     register()
     with mock.patch.object(sys, "argv", [f"{PROGRAM} {command}", *args]):
         if command in FUNCTIONS:
             getattr(importlib.import_module(FUNCTIONS[command]), command)()
+        elif command in hub.COMMANDS:
+            with hub.mended():
+                _run_script(command)
         else:
             _run_script(command)
     return 0

@@ -1,0 +1,101 @@
+"""RL-Zoo's commands for the Hugging Face hub, made to work with the versions that RL-Zoo itself installs, and with these algorithms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from sb3_combrel.zoo.algorithm import ZooFittedRMax
+from sb3_combrel.zoo.registration import ALGORITHMS
+
+COMMANDS = ("push_to_hub", "load_from_hub")
+#: Words of RL-Zoo's model card, and what they are for this package's algorithms.
+_REWORDED = {
+    "python -m rl_zoo3.": "python -m sb3_combrel.zoo ",
+    "pip install rl_zoo3": 'pip install "sb3-combrel[zoo]"',
+    "Install the RL Zoo (with SB3 and SB3-Contrib)": "Install sb3_combrel (with the RL Zoo)",
+    "If you installed the RL Zoo3 via pip": "If you installed it via pip",
+    ZooFittedRMax.__name__: "FittedRMax",
+}
+TAG = "sb3_combrel"
+
+
+@contextmanager
+def mended() -> Iterator[None]:
+    """
+    Let RL-Zoo's ``push_to_hub`` and ``load_from_hub`` work while it lasts.
+
+    RL-Zoo 2.9 takes a function from huggingface_sb3 that version 3 has under another name, and expects that a file that is
+    missing on the hub is reported by an exception of ``requests``, which huggingface_hub no longer uses. Model cards of this
+    package's algorithms name its own commands.
+
+    :raises ConnectionError: if the hub cannot be reached
+    """
+    import huggingface_sb3
+    from huggingface_hub import errors, repocard
+
+    upload = _module_of_upload()
+    with ExitStack() as patches:
+        patches.enter_context(mock.patch.object(upload, "generate_metadata", _metadata_with_tag(upload), create=True))
+        patches.enter_context(mock.patch.object(repocard, "metadata_save", _reworded(repocard.metadata_save)))
+        patches.enter_context(mock.patch.object(huggingface_sb3, "load_from_hub", _as_expected(huggingface_sb3.load_from_hub)))
+        try:
+            yield
+        except errors.HTTPError as error:
+            if isinstance(error, OSError):  # the hub's own answer, in a sentence
+                raise
+            raise ConnectionError(f"the Hugging Face hub cannot be reached ({error})") from error
+
+
+def _module_of_upload() -> Any:
+    # Its package has a function of the same name, which hides the module from ``import ... as``.
+    import importlib
+
+    return importlib.import_module("huggingface_sb3.push_to_hub")
+
+
+def _metadata_with_tag(upload: Any) -> Callable[..., dict[str, Any]]:
+    """Return what RL-Zoo calls to make the data of a model card."""
+    generate = getattr(upload, "generate_metadata", None) or upload._generate_metadata
+
+    def generate_metadata(model_name: str, *others: Any) -> dict[str, Any]:
+        ours = model_name == ZooFittedRMax.__name__
+        made = generate(_REWORDED[model_name] if ours else model_name, *others)
+        data: dict[str, Any] = made if isinstance(made, dict) else made.to_dict()
+        return {**data, "tags": [*data["tags"], TAG]} if ours else data
+
+    return generate_metadata
+
+
+def _reworded(metadata_save: Callable[..., None]) -> Callable[..., None]:
+    """Return a function that also puts this package's commands into the card of one of its algorithms."""
+
+    def save(local_path: str | Path, data: dict[str, Any]) -> None:
+        card = Path(local_path)
+        text = card.read_text(encoding="utf-8")
+        if any(f"--algo {name} " in text for name in ALGORITHMS):
+            for theirs, ours in _REWORDED.items():
+                text = text.replace(theirs, ours)
+            card.write_text(text, encoding="utf-8")
+        metadata_save(card, data)
+
+    return save
+
+
+def _as_expected(load_from_hub: Callable[..., str]) -> Callable[..., str]:
+    """Return a function that reports a missing file by the exception that RL-Zoo expects."""
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+    from requests.exceptions import HTTPError
+
+    def load(repo_id: str, filename: str) -> str:
+        try:
+            return load_from_hub(repo_id, filename)
+        except LocalEntryNotFoundError:  # the hub could not be asked
+            raise
+        except EntryNotFoundError as error:
+            raise HTTPError(f"{repo_id} on the Hugging Face hub has no file {filename}") from error
+
+    return load
