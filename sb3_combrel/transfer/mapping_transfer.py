@@ -302,7 +302,9 @@ class MappingTransfer(Transfer):
 
     def describe_prior(self) -> str:
         """
-        Say what the source is taken for: "East: Right on (x, vx), Neutral on (y, vy); West: ..."; with ``use="prior"``.
+        Say what the source is taken for, with ``use="prior"``: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
+
+        Target variables are named first, then the source variables that they are taken for, where these have other names.
 
         :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
         """
