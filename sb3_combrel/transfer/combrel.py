@@ -73,7 +73,7 @@ class COMBREL(MappingTransfer):
         :func:`~sb3_combrel.sources.recipes.find_source`
     :param mappings: None: "factored" with ``use="prior"``, "injective" with "instances"; or a set. "injective" (each source
         variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
-        "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
+        "balanced", these with ``signed_`` before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
         "factored" and "signed_factored" (with ``use="prior"`` only): the target's variables are divided among copies of the
         source, or of some of its variables, each moved by a source action of its own, and variables that stay; a
         ``FactoredMapping``; a list of mappings or a ``MappingSet``. Where every target variable is mapped, as in

@@ -156,7 +156,7 @@ def transition_compliances(weights: Floats, effects: Floats, virtual: VirtualSou
 
 
 def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource, delta: float) -> Floats:
-    """Compute lambda^R_ij = w_ij phi(|r_i - r_j|), the formula below Eq. 2.
+    """Compute ``lambda^R_ij = w_ij phi(|r_i - r_j|)``, the formula below Eq. 2.
 
     :param weights: w_ij, shape (t, m)
     :param rewards: r_i of the target transitions, shape (t,)
