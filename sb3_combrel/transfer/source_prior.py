@@ -368,7 +368,9 @@ class SourcePrior:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
         choice, names = self.choice, self.task.action_names
         moves = [[] if choice is None else moved(choice, a) for a in range(self.task.n_actions)]
-        return "; ".join(f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True))
+        return "; ".join(
+            f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True)
+        )
 
     def describe_action(self, choice: Choice, action: int) -> str:
         """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""

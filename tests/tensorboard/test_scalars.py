@@ -105,7 +105,9 @@ def test_entropy_and_number_of_mappings_are_those_of_the_choices(transfers, tmp_
     witness = Witness(entropy)
     walker(tmp_path, transfers["COMBREL"]).learn(200, [witness, DashboardCallback(scalar_share=1.0)])
     found = events(run_folder(tmp_path))
-    assert scalars(found, "transfer/choice_entropy", witness.seen) == pytest.approx({s: e for s, (e, _) in witness.seen.items()}, abs=1e-6)
+    assert scalars(found, "transfer/choice_entropy", witness.seen) == pytest.approx(
+        {s: e for s, (e, _) in witness.seen.items()}, abs=1e-6
+    )
     assert scalars(found, "transfer/distinct_mappings", witness.seen) == {s: n for s, (_, n) in witness.seen.items()}
 
 
@@ -132,7 +134,9 @@ def test_between_logs_there_are_points_of_all_that_a_log_has(method, transfers, 
     """With few and long episodes, too."""
     env = NamedWalk(limit=10**6)
     env.reset = functools.partial(_at_the_far_end, env)
-    walker(tmp_path, transfers[method], env, max_value=0.0).learn(1000, DashboardCallback(scalar_share=1.0), log_interval=10**6)
+    walker(tmp_path, transfers[method], env, max_value=0.0).learn(
+        1000, DashboardCallback(scalar_share=1.0), log_interval=10**6
+    )
     found = events(run_folder(tmp_path))
     steps = {tag: [event.step for event in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
     assert not any(tag.startswith("rollout/") for tag in steps)
