@@ -42,9 +42,7 @@ def prose(text):
 
 def links(text):
     """Targets of links and pictures that lead to no other site. Code in the text of a link stays."""
-    return [
-        target for target in re.findall(r"\]\(\s*([^()\s]+)\s*\)", prose(text)) if not re.match(r"[a-z]+:", target)
-    ]
+    return [target for target in re.findall(r"\]\(\s*([^()\s]+)\s*\)", prose(text)) if not re.match(r"[a-z]+:", target)]
 
 
 def anchors(text):
