@@ -146,7 +146,8 @@ def test_links_lead_to_files_and_headings(page):
 
 
 def test_links_and_anchors_are_found():
-    text = "# A title: `code`, and more\n\n[one](a.md) ![two](b.png)\n[three](c.md#d) [site](https://e.org)\n\n## Notes\n\n## Notes\n"
+    text = "# A title: `code`, and more\n\n[one](a.md) ![two](b.png)\n[three](c.md#d) [site](https://e.org)\n"
+    text += "\n## Notes\n\n## Notes\n"
     code = "```sh\n# no heading\n[no](link)\n```\n"
     assert links(text + code) == ["a.md", "b.png", "c.md#d"]
     assert anchors(text + code) == {"a-title-code-and-more", "notes", "notes-1"}
