@@ -26,16 +26,21 @@ OTHER_PROGRAMS = {"pip", "ray", "dask", "tensorboard"}
 
 
 def shortened(code):
-    """Code of a page with fewer steps, seeds and instances, so that it takes seconds."""
-    code = re.sub(r"steps=([\d_]+)", lambda found: f"steps={min(int(found[1]), 1_100)}", code)
-    return re.sub(r"seeds=\d+", "seeds=2", code)
+    """Code of a page with fewer steps and seeds, so that it takes seconds; a source keeps enough for 1000 instances."""
+
+    def fewer(found):
+        n = int(found[2])
+        return f"{found[1]}{min(n, 1_100 if n >= 10_000 else 300)}"
+
+    return re.sub(r"seeds=\d+", "seeds=2", re.sub(r"(steps\"?[=:] ?)([\d_]+)", fewer, code))
 
 
 @pytest.mark.parametrize(
     ("code", "short"),
     [
-        ("model.learn(total_timesteps=5_000)", "model.learn(total_timesteps=1100)"),
-        ("learn(400)", "learn(400)"),
+        ("model.learn(total_timesteps=5_000)", "model.learn(total_timesteps=300)"),
+        ("from_q_learning(env, total_timesteps=30_000)", "from_q_learning(env, total_timesteps=1100)"),
+        ('{"env": "A-v0", "total_timesteps": 30_000}', '{"env": "A-v0", "total_timesteps": 1100}'),
         ("compare(env, methods, seeds=10, steps=200)", "compare(env, methods, seeds=2, steps=200)"),
     ],
 )
@@ -45,7 +50,6 @@ def test_long_runs_are_shortened(code, short):
 
 @pytest.mark.integration
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
-@pytest.mark.filterwarnings("ignore:.*does not explain:UserWarning")
 def test_python_runs_from_the_top_of_a_page_to_its_end(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SB3_COMBREL_CACHE", str(tmp_path / "cache"))
@@ -142,7 +146,8 @@ def test_links_lead_to_files_and_headings(page):
 
 
 def test_links_and_anchors_are_found():
-    text = "# A title: `code`, and more\n\n[one](a.md) ![two](b.png)\n[three](c.md#d) [site](https://e.org)\n\n## Notes\n\n## Notes\n"
+    text = "# A title: `code`, and more\n\n[one](a.md) ![two](b.png)\n[three](c.md#d) [site](https://e.org)\n"
+    text += "\n## Notes\n\n## Notes\n"
     code = "```sh\n# no heading\n[no](link)\n```\n"
     assert links(text + code) == ["a.md", "b.png", "c.md#d"]
     assert anchors(text + code) == {"a-title-code-and-more", "notes", "notes-1"}
