@@ -11,6 +11,7 @@
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make suite   the learner on all tasks, as in docs/results/learner.md (hours); SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
 # make tutorials   execute all cells of tutorials/, and renew the outputs and figures in them
+# make doc     the documentation as HTML, in docs/_build; any warning is an error
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
 # Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
@@ -37,7 +38,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build smoke gl clean
+.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -141,8 +142,13 @@ smoke: build
 	$(VENV)-smoke/bin/python -m pip --disable-pip-version-check install -q -c $(CONSTRAINTS) "$$(echo dist/*.whl)[all]"
 	cd "$$(mktemp -d)" && $(abspath $(VENV)-smoke)/bin/python $(abspath tests/helpers/smoke.py)
 
+# The source folder is that of the repository: see docs/conf.py.
+doc: $(VENV)/.installed-all
+	$(BIN)/python -m sphinx -W --keep-going -q -c docs -b html . docs/_build
+	@echo "docs/_build/docs/index.html"
+
 clean:
-	rm -rf $(VENV) $(VENV)-oldest* $(VENV)-smoke build dist *.egg-info
+	rm -rf $(VENV) $(VENV)-oldest* $(VENV)-smoke build dist docs/_build *.egg-info
 
 # An installation that was interrupted leaves no stamp and is done again; a changed pin or dependency renews it.
 $(VENV)/.installed-demo: pyproject.toml sb3_combrel/version.txt $(CONSTRAINTS)

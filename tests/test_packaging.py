@@ -140,7 +140,7 @@ def test_the_command_is_installed():
 
 def test_the_extras_are_those_of_the_documentation():
     assert set(PROJECT["project"]["optional-dependencies"]) == {
-        *("envs", "icub", "minari", "zoo", "experiments", "tutorials", "ray", "dask", "dev", "all"),
+        *("envs", "icub", "minari", "zoo", "experiments", "tutorials", "ray", "dask", "docs", "dev", "all"),
     }
 
 

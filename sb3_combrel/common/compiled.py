@@ -9,30 +9,36 @@ machine only.
 """
 
 import gc
+import hashlib
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import config, njit
 from numba.core import event
 
 # The packages with compiled functions.
 ROOMS = ("common", "planning", "models", "transfer")
 
 
-def remove_outdated(folders: Sequence[Path]) -> None:
+def remove_outdated(folders: Sequence[Path], cache: str = "") -> None:
     """
     Remove compiled code that is older than any source file in some folders.
 
     Numba compiles a function again when its own file has changed, not when a file has changed whose functions it calls.
 
-    :param folders: they and those within them, with the cache beside each source file; another cache (``NUMBA_CACHE_DIR``)
-        is left alone
+    :param folders: absolute; they and those within them, with the cache beside each source file
+    :param cache: where Numba keeps the compiled code of each folder in place of that, as ``NUMBA_CACHE_DIR`` says; "" for none
     """
     newest = max((file.stat().st_mtime for folder in folders for file in folder.rglob("*.py")), default=0.0)
-    for index in (file for folder in folders for file in folder.rglob("__pycache__/*.nbi")):
+    indices = [file for folder in folders for file in folder.rglob("__pycache__/*.nbi")]
+    if cache:
+        # The names that Numba gives there.
+        names = [f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}" for folder in folders]
+        indices += [file for name in names for file in (Path(cache) / name).glob("*.nbi")]
+    for index in indices:
         try:
             if index.stat().st_mtime < newest:
                 index.unlink()
@@ -41,7 +47,7 @@ def remove_outdated(folders: Sequence[Path]) -> None:
             continue
 
 
-remove_outdated([Path(__file__).parent.parent / room for room in ROOMS])
+remove_outdated([Path(__file__).absolute().parent.parent / room for room in ROOMS], str(getattr(config, "CACHE_DIR", "")))
 
 _njit: Any = njit
 # Three options that are not in Numba's documentation, here alone and worth it; what they give up is noted with each.

@@ -33,6 +33,7 @@ LEARNER: dict[str, Any] = {"degree": 0, **icub_arm.LEARNER}
 LEARNT = {SOURCE_ID: 27, TARGET_ID: 32}
 #: Median of so many episodes must not exceed that.
 WINDOW = 5
+TITLE = "Both tasks of the iCub at several kernel breadths, with and without noise"
 
 
 class Outcome(NamedTuple):
@@ -93,7 +94,7 @@ def run_experiment(
     carry_out_all(runs, workers, console)
     write_summary(runs, output / "summary.csv")
     table = table_of(runs)
-    (output / "tables.md").write_text(table.as_markdown())
+    (output / "tables.md").write_text(f"# {TITLE}\n\n{table.as_markdown()}")
     console.print(table.for_terminal())
 
 

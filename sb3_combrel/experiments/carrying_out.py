@@ -88,7 +88,11 @@ def carry_out_missing(
 
 @contextmanager
 def progress_of(
-    jobs: Sequence[AnyJob[R]], missing: Sequence[AnyJob[R]], console: Console, bar_of: Callable[[Any], str]
+    jobs: Sequence[AnyJob[R]],
+    missing: Sequence[AnyJob[R]],
+    console: Console,
+    bar_of: Callable[[Any], str],
+    describe: Callable[[R], str] = lambda result: "",
 ) -> Iterator[Callable[[AnyJob[R], R], None]]:
     """
     Show bars of progress; where no bars can be drawn, as in a log file, a line for each run.
@@ -97,6 +101,7 @@ def progress_of(
     :param missing: those that have no result yet
     :param console: where to show it
     :param bar_of: names the bar that a job belongs to
+    :param describe: says of a result what its line has in place of steps and seconds; "" for these
     :return: a function of a job and its result, to be called when that has arrived
     """
     columns = (
@@ -113,6 +118,7 @@ def progress_of(
         def advance(job: AnyJob[R], result: R) -> None:
             progress.advance(bars[bar_of(job)])
             if not console.is_terminal:
-                console.print(f"  {job.title}: {sum(result.steps):,} steps, {result.seconds[0]:.0f} s")
+                said = describe(result) or f"{sum(result.steps):,} steps, {result.seconds[0]:.0f} s"
+                console.print(f"  {job.title}: {said}", markup=False, soft_wrap=True)
 
         yield advance

@@ -285,7 +285,7 @@ class FittedRMax(PersistentAlgorithm):
         total_timesteps: int = DEFAULT_TIMESTEPS,
         callback: MaybeCallback = None,
         log_interval: int | None = 4,
-        tb_log_name: str = "FittedRMax",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfFittedRMax:
@@ -295,21 +295,21 @@ class FittedRMax(PersistentAlgorithm):
         :param total_timesteps: environment steps, of all environments together
         :param callback: callback(s) called at every step
         :param log_interval: episodes between two logs; None for none
-        :param tb_log_name: the name of the run for TensorBoard logging
+        :param tb_log_name: the name of the run for TensorBoard logging, which Stable-Baselines3 numbers. None: with the transfer
+            method and the seed, so that runs can be told apart, such as ``FittedRMax_COMBREL_seed3``
         :param reset_num_timesteps: whether to count steps from 0 again (what was learned is kept in any case)
         :param progress_bar: display a progress bar using tqdm and rich
         :raises ValueError: if an argument is out of its range, or the environment returns something that is not finite
         """
         total_timesteps = check_total_timesteps(total_timesteps)
         check_count("log_interval", log_interval, none_allowed=True)
-        check_type("tb_log_name", tb_log_name, (str,), "text")
+        check_type("tb_log_name", tb_log_name, (str, type(None)), "text or None")
         for name, value in {"reset_num_timesteps": reset_num_timesteps, "progress_bar": progress_bar}.items():
             check_type(name, value, (bool, np.bool_), "True or False")
         if self.env is None:
             raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        run_name = self._run_name() if tb_log_name is None else tb_log_name
+        total_timesteps, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, run_name, progress_bar)
         callback.on_training_start(locals(), globals())
         callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]
@@ -325,6 +325,12 @@ class FittedRMax(PersistentAlgorithm):
             self.agent.complete()
             callback.on_training_end()
         return self
+
+    def _run_name(self) -> str:
+        transfer = self.agent.transfer
+        parts = ["FittedRMax", "" if transfer is None else type(transfer).__name__]
+        parts.append("" if self.seed is None else f"seed{self.seed}")
+        return "_".join(filter(None, parts))
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Make one step of every environment; return False if a callback stops the learning."""

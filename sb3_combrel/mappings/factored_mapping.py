@@ -110,6 +110,19 @@ def describe_copy(copy: InterTaskMapping) -> str:
     return f"({', '.join(('-' if signs[v] < 0 else '') + copy.names.target_variables[v] for _, v in order)})"
 
 
+def describe_both_sides(copy: InterTaskMapping) -> str:
+    """
+    Name the target variables of a copy and, where these have other names, the source variables: "(x, vx) as (x, v)".
+
+    :param copy: with names
+    """
+    assert copy.names is not None
+    order = sorted((k, v) for v, k in enumerate(copy.state) if k is not None)
+    target = [copy.names.target_variables[v] for _, v in order]
+    source = [copy.names.source_variables[k] for k, _ in order]
+    return describe_copy(copy) + (f" as ({', '.join(source)})" if source != target else "")
+
+
 def describe_actions(target_actions: Sequence[str], moves: Sequence[tuple[str, Sequence[str]]]) -> str:
     """
     Say what each target action does to each copy: "East: Right on (x, vx), Neutral on (y, vy); West: ...".

@@ -17,6 +17,9 @@ from sb3_combrel.tensorboard.plane import Plane, VariablePair, numbered, plane_t
 from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.report import TransferReport
 
+#: Larger than in TensorBoard's cards.
+FILE_DPI = 220
+
 
 def explain(
     model: FittedRMax | str | os.PathLike[str],
@@ -92,9 +95,9 @@ def save_pictures(
     drawn: dict[str, np.ndarray] = {}
     for plane in planes:
         over = "_".join(re.sub(r"\W+", "-", name) for name in plane.names if name)
-        drawn[f"value_and_policy_{over}"] = pictures.value_and_policy(agent, plane)
+        drawn[f"value_and_policy_{over}"] = pictures.value_and_policy(agent, plane, FILE_DPI)
         if isinstance(transfer, MappingTransfer) and transfer.makes_choices:
-            drawn[f"source_action_{over}"] = pictures.source_actions(agent, transfer, plane)
+            drawn[f"source_action_{over}"] = pictures.source_actions(agent, transfer, plane, FILE_DPI)
     files = [Path(folder) / f"{name}.png" for name in drawn]
     for file, picture in zip(files, drawn.values(), strict=True):
         imsave(file, picture)

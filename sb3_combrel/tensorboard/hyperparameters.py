@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
 from typing import Any
 
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.transfer.base import Transfer
 
 Plain = bool | int | float | str
 
@@ -14,6 +16,8 @@ LEFT_OUT = ("self", "policy", "env", "transfer", "stats_window_size", "tensorboa
 MAX_TEXT_LENGTH = 80
 
 METRICS = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "model/known")
+USUALLY_DIFFER = ("algorithm", "model_breadth", "seed", "transfer.breadth", "transfer.use")
+"""The tab shows five settings until the user chooses: these."""
 
 
 def hyperparameters(model: FittedRMax) -> dict[str, Plain]:
@@ -26,7 +30,6 @@ def hyperparameters(model: FittedRMax) -> dict[str, Plain]:
     transfer = model.agent.transfer
     method = "none" if transfer is None else type(transfer).__name__
     found: dict[str, Plain] = {}
-    # The tab shows the first few in the order of the alphabet until the user chooses: this one must be among them.
     found["algorithm"] = type(model).__name__ if transfer is None else f"{type(model).__name__} + {method}"
     found.update(_given(model))
     found["model_breadth"] = model.agent.model_settings.model_breadth
@@ -41,10 +44,41 @@ def hyperparameters(model: FittedRMax) -> dict[str, Plain]:
     return found
 
 
+def all_settings(model: FittedRMax) -> dict[str, Plain | None]:
+    """
+    Collect the settings of all runs that may stand beside this one: those of every transfer method that is loaded.
+
+    TensorBoard takes its columns from one of the runs, which may be one without transfer.
+
+    :param model: the algorithm, set up
+    :return: values by name, of other methods the defaults; None where there is none
+    """
+    found: dict[str, Plain | None] = {}
+    for method in _subclasses(Transfer):
+        found.update({f"transfer.{name}": default for name, default in _arguments(method).items()})
+    return {**_arguments(type(model)), **found, **hyperparameters(model)}
+
+
+def _subclasses(kind: type) -> Iterator[type]:
+    for each in kind.__subclasses__():
+        yield each
+        yield from _subclasses(each)
+
+
+def _arguments(kind: type) -> dict[str, Plain | None]:
+    """Return the constructor's arguments and their defaults, None for one that has no default."""
+    parameters = inspect.signature(kind.__init__).parameters.values()  # type: ignore[misc]
+    named = [each for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
+    return {
+        each.name: None if each.default in (each.empty, None) else _plain(each.default)
+        for each in named
+        if each.name not in LEFT_OUT and each.name[0] != "_"
+    }
+
+
 def _given(thing: object) -> dict[str, Plain]:
     """Return the attributes that have the names of constructor arguments, but for those that are None."""
-    names = [name for name in inspect.signature(type(thing).__init__).parameters if name not in LEFT_OUT and name[0] != "_"]
-    return {name: _plain(getattr(thing, name)) for name in names if getattr(thing, name, None) is not None}
+    return {name: _plain(getattr(thing, name)) for name in _arguments(type(thing)) if getattr(thing, name, None) is not None}
 
 
 def _plain(value: Any) -> Plain:

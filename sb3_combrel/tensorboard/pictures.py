@@ -1,7 +1,12 @@
-"""Pictures for TensorBoard's images tab, drawn without a display. Importing this imports matplotlib."""
+"""
+Pictures for TensorBoard's images tab, drawn without a display. Importing this imports matplotlib.
+
+They are as wide as the tab's cards, which would leave out pixels of wider ones; ``dpi`` makes them larger for files.
+"""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,34 +26,42 @@ from sb3_combrel.transfer.mapping_transfer import MappingTransfer
 #: Okabe and Ito's colours, which the colour-blind can distinguish too; they are repeated where there are more actions.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#555555")
 NONE_COLOUR = "#EEEEEE"
+AN_OPTIMISTIC_ACTION = "one has no model"
 
-PANELS_PER_ROW = 3
 MAX_ROWS = 14
-DPI = 90
+WIDTH = 3.5  # inches
+DPI = 100
+FONT_SIZE = 7
+LINE = 0.14  # inches, of a line of text of that size
+CHARACTERS = 62
+"""About as many fit into the width."""
 
 
-def value_and_policy(agent: FittedRMaxAgent, plane: Plane) -> np.ndarray:
+def value_and_policy(agent: FittedRMaxAgent, plane: Plane, dpi: int = DPI) -> np.ndarray:
     """
     Draw V at the grid points of a plane, and the greedy action of the model there.
 
     :param agent: the agent to show
     :param plane: where
+    :param dpi: pixels an inch; the picture is 3.5 inches wide
     :return: RGB, uint8, shape (height, width, 3)
     """
-    figure = Figure(figsize=(8.6, 3.4), dpi=DPI)
-    left, right = figure.subplots(1, 2)
-    figure.subplots_adjust(left=0.08, right=0.79, bottom=0.14, top=0.84, wspace=0.3)
+    names = agent.task.action_names
+    title = f"at {plane.held}" if plane.held else ""
+    figure, (left, right) = _figure(1, 2, 1.5, title, _legend_lines(names, AN_OPTIMISTIC_ACTION), dpi)
     values = agent.planner.values[plane.points]
     # V between grid points is interpolated, so the picture is too.
     image = left.imshow(values, origin="lower", extent=plane.extent, aspect="auto", interpolation="bilinear")
     _few_ticks(left)
-    figure.colorbar(image, ax=left, ticks=MaxNLocator(4)).ax.tick_params(labelsize=8)
+    figure.subplots_adjust(wspace=0.26)
+    bar = figure.colorbar(image, ax=left, ticks=MaxNLocator(3), fraction=0.09, pad=0.05)
+    bar.ax.tick_params(labelsize=FONT_SIZE - 1, pad=1)
     _label(left, plane, "value V")
     _show_numbers(right, greedy_actions(agent, plane.points), plane, agent.task.n_actions)
     _label(right, plane, "greedy action")
-    _legend(figure, agent.task.action_names, "an action without\na model", "target action")
-    if plane.held:
-        figure.suptitle(f"at {plane.held}", fontsize=9)
+    right.set_ylabel("")
+    right.set_yticklabels([])
+    _legend(figure, names, AN_OPTIMISTIC_ACTION, "target action")
     return _pixels(figure)
 
 
@@ -64,7 +77,7 @@ def greedy_actions(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(q).any(axis=0), -1, np.nan_to_num(q, nan=-np.inf).argmax(axis=0))
 
 
-def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Plane) -> np.ndarray:
+def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Plane, dpi: int = DPI) -> np.ndarray:
     """
     Draw the source action that each target action is mapped to, over a plane (Figure 4 of the COMBREL paper).
 
@@ -73,33 +86,30 @@ def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Pla
     :param agent: the agent to show
     :param transfer: its transfer method
     :param plane: where
+    :param dpi: pixels an inch; the picture is 3.5 inches wide
     :return: RGB, uint8, shape (height, width, 3)
     """
     names, numbers = chosen_source_actions(transfer, plane.points, agent.task.n_actions)
-    n_columns = min(agent.task.n_actions, PANELS_PER_ROW)
+    action_names = agent.task.action_names
+    n_columns = min(agent.task.n_actions, 3 if max(map(len, action_names)) <= 14 else 2)
     n_rows = -(-agent.task.n_actions // n_columns)
-    figure = Figure(figsize=(2.05 * n_columns + 1.9, 2.1 * n_rows + 0.75), dpi=DPI)
-    axes = figure.subplots(n_rows, n_columns, sharex=True, sharey=True, squeeze=False)
-    height, width = figure.get_figheight(), figure.get_figwidth()
-    figure.subplots_adjust(
-        left=0.6 / width, right=1 - 1.45 / width, bottom=0.5 / height, top=1 - 0.6 / height, wspace=0.1, hspace=0.3
-    )
-    for action, panel in enumerate(axes.flat):
+    where = f", at {plane.held}" if plane.held else ""
+    title = f"source action for each target action{where}; dots: own data suffice"
+    figure, panels = _figure(n_rows, n_columns, 1.05, title, _legend_lines(names, "none"), dpi)
+    for action, panel in enumerate(panels):
         if action >= agent.task.n_actions:
             panel.set_visible(False)
             continue
         _show_numbers(panel, numbers[action], plane, len(names))
         _mark_known(panel, agent, plane, action)
-        panel.set_title(agent.task.action_names[action], fontsize=9)
-    for panel in axes[-1]:
-        panel.set_xlabel(plane.names[0], fontsize=8)
-    for panel in axes[:, 0]:
-        panel.set_ylabel(plane.names[1], fontsize=8)
-    for panel in axes.flat:
-        panel.tick_params(labelsize=7)
+        _label(panel, plane, action_names[action])
+        if action % n_columns:
+            panel.set_ylabel("")
+            panel.set_yticklabels([])
+        if action + n_columns < agent.task.n_actions:
+            panel.set_xlabel("")
+            panel.set_xticklabels([])
     _legend(figure, names, "none", "source action")
-    where = f", at {plane.held}" if plane.held else ""
-    figure.suptitle(f"source action for each target action{where}; dots: own data suffice", fontsize=9)
     return _pixels(figure)
 
 
@@ -120,30 +130,35 @@ def chosen_source_actions(transfer: MappingTransfer, points: np.ndarray, n_actio
     return names, found
 
 
-def state_mappings(history: ChoiceHistory, transfer: MappingTransfer) -> np.ndarray:
+def state_mappings(history: ChoiceHistory, transfer: MappingTransfer, dpi: int = DPI) -> np.ndarray:
     """
     Draw the share of the choices that each state mapping had, over the run.
 
     :param history: the choices so far, at one time at least
     :param transfer: the transfer method that made them
+    :param dpi: pixels an inch; the picture is 3.5 inches wide
     :return: RGB, uint8, shape (height, width, 3)
     """
     names, shares = state_mapping_shares(history, transfer)
     steps = np.array(history.steps, dtype=np.float64)
     # A column begins where the one before was noted, and ends at its own time.
     edges = np.concatenate([[0.0 if len(steps) < 2 else max(0.0, 2 * steps[0] - steps[1])], steps])
-    figure = Figure(figsize=(8.0, 1.2 + 0.24 * max(len(names), 6)), dpi=DPI)
+    labels = [textwrap.fill(name, CHARACTERS // 2, break_long_words=True) for name in names]
+    n_lines = sum(label.count("\n") + 1 for label in labels)
+    height = 0.85 + 1.15 * LINE * max(n_lines + 0.4 * len(labels), 6)
+    figure = Figure(figsize=(WIDTH, height), dpi=dpi)
     axes = figure.subplots()
-    height = figure.get_figheight()
-    figure.subplots_adjust(left=0.24, right=0.98, bottom=0.5 / height, top=1 - 0.4 / height)
+    longest = max((len(line) for label in labels for line in label.split("\n")), default=0)
+    left = min(0.6, 0.06 + longest / CHARACTERS)
+    figure.subplots_adjust(left=left, right=0.91, bottom=0.4 / height, top=1 - 0.38 / height)
     mesh = axes.pcolormesh(edges, np.arange(len(names) + 1), shares, vmin=0.0, cmap="Blues")
-    axes.set_yticks(np.arange(len(names)) + 0.5, names, fontsize=8)
+    axes.set_yticks(np.arange(len(names)) + 0.5, labels, fontsize=FONT_SIZE)
     axes.invert_yaxis()
-    axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    axes.set_xlabel("environment steps", fontsize=8)
-    axes.tick_params(axis="x", labelsize=8)
-    axes.set_title("state mappings: share of the state-action pairs that chose each", fontsize=9)
-    figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.02, ticks=MaxNLocator(4)).ax.tick_params(labelsize=8)
+    axes.xaxis.set_major_locator(MaxNLocator(3, integer=True))
+    axes.set_xlabel("environment steps", fontsize=FONT_SIZE)
+    axes.tick_params(axis="x", labelsize=FONT_SIZE)
+    figure.suptitle("state mappings: share of the state-action\npairs that chose each", fontsize=FONT_SIZE + 1)
+    figure.colorbar(mesh, ax=axes, fraction=0.07, pad=0.03, ticks=MaxNLocator(3)).ax.tick_params(labelsize=FONT_SIZE - 1)
     return _pixels(figure)
 
 
@@ -173,6 +188,33 @@ def state_mapping_shares(history: ChoiceHistory, transfer: MappingTransfer) -> t
 # -------------------------------------------------------------------- drawing
 
 
+def _figure(
+    n_rows: int, n_columns: int, row_height: float, title: str, n_legend_lines: int, dpi: int
+) -> tuple[Figure, list[Axes]]:
+    """Make a figure of panels, with room for a title of any length above and for a legend of so many lines below."""
+    lines = textwrap.wrap(title, CHARACTERS)
+    above, below = LINE * len(lines) + 0.24, LINE * n_legend_lines + 0.4
+    height = above + below + row_height * n_rows + 0.2 * (n_rows - 1)
+    figure = Figure(figsize=(WIDTH, height), dpi=dpi)
+    axes = figure.subplots(n_rows, n_columns, squeeze=False)
+    figure.subplots_adjust(
+        left=0.14, right=0.97, bottom=below / height, top=1 - above / height, wspace=0.12, hspace=0.24 / row_height
+    )
+    if lines:
+        figure.text(0.5, 1 - 0.04 / height, "\n".join(lines), ha="center", va="top", fontsize=FONT_SIZE)
+    return figure, list(axes.flat)
+
+
+def _legend_columns(names: Sequence[str], for_none: str) -> int:
+    longest = max(len(name) for name in (*names, for_none))
+    return max(1, min(len(names) + 1, CHARACTERS // (longest + 5)))
+
+
+def _legend_lines(names: Sequence[str], for_none: str) -> int:
+    """Return how many lines a legend has, its title among them."""
+    return 1 + -(-(len(names) + 1) // _legend_columns(names, for_none))
+
+
 def _show_numbers(axes: Axes, numbers: np.ndarray, plane: Plane, n_colours: int) -> None:
     """Draw a colour for each number, and light grey for -1."""
     palette = np.array([*(to_rgb(COLOURS[k % len(COLOURS)]) for k in range(n_colours)), to_rgb(NONE_COLOUR)])
@@ -199,14 +241,26 @@ def _mark_known(axes: Axes, agent: FittedRMaxAgent, plane: Plane, action: int) -
 def _legend(figure: Figure, names: Sequence[str], for_none: str, title: str) -> None:
     colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
     patches = [Patch(color=c, label=name) for c, name in zip((*colours, NONE_COLOUR), (*names, for_none), strict=True)]
-    figure.legend(handles=patches, loc="center right", frameon=False, fontsize=8, title=title, title_fontsize=8)
+    figure.legend(
+        handles=patches,
+        loc="lower center",
+        ncols=_legend_columns(names, for_none),
+        frameon=False,
+        fontsize=FONT_SIZE,
+        title=title,
+        title_fontsize=FONT_SIZE,
+        borderpad=0.1,
+        labelspacing=0.25,
+        columnspacing=1.0,
+        handlelength=1.2,
+    )
 
 
 def _label(axes: Axes, plane: Plane, title: str) -> None:
-    axes.set_title(title, fontsize=9)
-    axes.set_xlabel(plane.names[0], fontsize=8)
-    axes.set_ylabel(plane.names[1], fontsize=8)
-    axes.tick_params(labelsize=8)
+    axes.set_title(title, fontsize=FONT_SIZE, pad=3)
+    axes.set_xlabel(plane.names[0], fontsize=FONT_SIZE, labelpad=1)
+    axes.set_ylabel(plane.names[1], fontsize=FONT_SIZE, labelpad=1)
+    axes.tick_params(labelsize=FONT_SIZE - 1, pad=2)
 
 
 def _pixels(figure: Figure) -> np.ndarray:

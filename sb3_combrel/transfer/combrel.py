@@ -73,7 +73,7 @@ class COMBREL(MappingTransfer):
         :func:`~sb3_combrel.sources.recipes.find_source`
     :param mappings: None: "factored" with ``use="prior"``, "injective" with "instances"; or a set. "injective" (each source
         variable is mapped to by one target variable, the other target variables are left unmapped), "surjective", "all",
-        "balanced", these with "signed_" before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
+        "balanced", these with ``signed_`` before them (variables may be mirrored as well), "paper_mountain_car", "paper_icub";
         "factored" and "signed_factored" (with ``use="prior"`` only): the target's variables are divided among copies of the
         source, or of some of its variables, each moved by a source action of its own, and variables that stay; a
         ``FactoredMapping``; a list of mappings or a ``MappingSet``. Where every target variable is mapped, as in
@@ -115,7 +115,9 @@ class COMBREL(MappingTransfer):
         alone do not suffice as evidence: with the right dynamics and a wrong goal all episodes then reached the limit.
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The paper does not
         say. Where this is wrong the target's own transitions correct it; without it no path leads to an end at first.
-    :param relevance: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful.
+    :param relevance: True: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful: it favours
+        instances that are far from the target's transitions. "near": by a relevance that does not, times the weight; see
+        ``equations.near_relevances``
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of compliance, delta_sa, delta_s' and delta_r of Eq. 2; None:
         from the data, that of starts in proportion to how many variables a mapping compares. The paper names none.
@@ -144,7 +146,7 @@ class COMBREL(MappingTransfer):
         breadth: float = DEFAULT_BREADTH,
         breadth_decay: float = DEFAULT_BREADTH_DECAY,
         transfer_terminals: bool = True,
-        relevance: bool = False,
+        relevance: bool | str = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
         use: str | None = None,

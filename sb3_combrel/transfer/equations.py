@@ -156,7 +156,7 @@ def transition_compliances(weights: Floats, effects: Floats, virtual: VirtualSou
 
 
 def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource, delta: float) -> Floats:
-    """Compute lambda^R_ij = w_ij phi(|r_i - r_j|), the formula below Eq. 2.
+    """Compute ``lambda^R_ij = w_ij phi(|r_i - r_j|)``, the formula below Eq. 2.
 
     :param weights: w_ij, shape (t, m)
     :param rewards: r_i of the target transitions, shape (t,)
@@ -250,6 +250,42 @@ def relevance(with_target: float, distance: float) -> float:
     return math.exp(-(off / distance) * (off / distance))
 
 
+def near_relevances(with_target: Floats, evidence: Floats) -> Floats:
+    """Compute a relevance that does not favour distant instances (no equation; the paper names it as future work).
+
+    rho_j = (e_j lambda_j + mean) / (e_j + 1), where mean = sum_j e_j lambda_j / sum_j e_j.
+
+    Eq. 7 tends to 1 with the distance d_j whatever the compliance is: an instance far from all transitions, even one that the
+    nearest of them contradict, comes before one that near transitions bear out but for a little. Here distance is lack of
+    evidence and nothing else: the relevance of an instance is its compliance, estimated from evidence e_j together with what
+    is known of all instances, which counts as one transition at the same place. So one without near transitions is as
+    relevant as the instances are on average: it comes after those that are borne out and before those that are contradicted.
+
+    :param with_target: lambda_{T,sigma_j}, shape (m,)
+    :param evidence: e_j = sum_i phi(d_ij) with delta_sa, the weights w_ji before they are normalised, same shape
+    :return: values in [0, 1], same shape; 1 for all where there is no evidence at all
+    """
+    total = evidence.sum()
+    mean = (evidence * with_target).sum() / total if total > 0.0 else 1.0
+    return (evidence * with_target + mean) / (evidence + 1.0)
+
+
+def source_near_relevances(
+    source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths
+) -> Floats:
+    """Compute :func:`near_relevances` of the source instances of one target action.
+
+    Parameters and order: see :func:`source_relevances`.
+    """
+    states, _, effects, rewards, _ = transitions.with_action(action)
+    virtual = virtual_source(source, mapping, action, states)
+    distances = start_distances(states, virtual)
+    weights = normalized_weights(distances, bandwidths.start, axis=0)
+    of_transitions = transition_compliances(weights, effects, virtual, bandwidths.outcome)
+    of_rewards = reward_compliances(weights, rewards, virtual, bandwidths.reward)
+    return near_relevances(compliance(of_transitions, of_rewards, axis=0), phi(distances, bandwidths.start).sum(axis=0))
+
+
 def source_relevances(
     source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths, mu: float
 ) -> Floats:
@@ -308,7 +344,12 @@ def best_mapping(compliances: Floats, baseline: float = 0.0) -> int | None:
 
 
 def transferred_instances(
-    state: Floats, own_weight: float, virtual: VirtualSource, rules: TransferRules, relevances: Sequence[float] | None = None
+    state: Floats,
+    own_weight: float,
+    virtual: VirtualSource,
+    rules: TransferRules,
+    relevances: Sequence[float] | None = None,
+    times_weight: bool = False,
 ) -> tuple[Ints, Floats]:
     """Choose the translated instances that complete the model at a state and action (lines 16, 18, 21 and 22).
 
@@ -322,10 +363,13 @@ def transferred_instances(
         joined (the pool of TIMBREL)
     :param relevances: shape (m,), or None for the order of distance. ``min_fraction`` applies to that order only: the
         most relevant instance may be a light one, and heavier ones come after it
+    :param times_weight: in the order of relevance times weight, so that instances which are equally relevant come in the order
+        of distance: with :func:`near_relevances`, where all of them are equal as long as there is no evidence
     :return: numbers of the instances, in the order in which they are added, int64, and their weights, same shape
     """
     [weights] = phi(start_distances(state[None, :], virtual), rules.breadth**2)
-    order = np.argsort(-(weights if relevances is None else np.asarray(relevances)), kind="stable")
+    ranks = weights if relevances is None else np.asarray(relevances) * (weights if times_weight else 1.0)
+    order = np.argsort(-ranks, kind="stable")
     chosen: list[int] = []
     total = own_weight
     for j in order[weights[order] >= rules.min_weight]:

@@ -250,17 +250,29 @@ class MappingExperts(Transfer):
         arms, means = [arm for arm, *_ in self._episodes], self.mean_returns().tolist()
         return [(name, mean, arms.count(k)) for k, (name, mean) in enumerate(zip(names, means, strict=True))]
 
-    def statistics(self) -> dict[str, float]:
+    def _best(self) -> int:
+        """Who has had the highest mean return."""
         means = self.mean_returns()
-        best = AGENT if np.isnan(means).all() else int(np.nanargmax(means))
-        acted = [(arm, acted) for arm, *_, acted in self._episodes]
-        acted += [(playing.arm, playing.acted) for playing in self._playing.values()]
+        return AGENT if np.isnan(means).all() else int(np.nanargmax(means))
+
+    def _acted(self) -> list[tuple[int, int]]:
+        """Who acted in each episode, those that go on too, and in how many steps an expert did."""
+        ended = [(arm, acted) for arm, *_, acted in self._episodes]
+        return ended + [(playing.arm, playing.acted) for playing in self._playing.values()]
+
+    def mapping_steps(self) -> int:
+        """Return how many steps of the target experts have taken that are not the best of all who may act."""
+        best = self._best()
+        return sum(steps for arm, steps in self._acted() if arm != best)
+
+    def statistics(self) -> dict[str, float]:
+        means, best = self.mean_returns(), self._best()
         episodes_of_experts = sum(arm != AGENT for arm, *_ in self._episodes)
         return {
             "transfer/experts": len(self.experts),
             "transfer/best_expert": best,
-            "transfer/expert_steps": sum(steps for _, steps in acted),
-            "transfer/steps_to_find_mapping": sum(steps for arm, steps in acted if arm != best),
+            "transfer/expert_steps": sum(steps for _, steps in self._acted()),
+            "transfer/steps_to_find_mapping": self.mapping_steps(),
             "transfer/expert_episodes": episodes_of_experts,
             "transfer/agent_return": float(means[AGENT]),
             "transfer/best_return": float(means[best]),

@@ -19,6 +19,7 @@ from sb3_combrel.transfer.timbrel import TIMBREL
 
 # With fewer samples there is nothing to learn a mapping from.
 MIN_SAMPLES = 10
+DEFAULT_SAMPLE_STEPS = 200
 
 
 class Triplets(NamedTuple):
@@ -90,7 +91,7 @@ class LearnedTranslation(Transfer):
         self,
         source: SourceLike,
         *,
-        n_random_steps: int = 200,
+        n_random_steps: int = DEFAULT_SAMPLE_STEPS,
         n_source_samples: int = 300,
         breadth: float = DEFAULT_BREADTH,
         breadth_decay: float = DEFAULT_BREADTH_DECAY,
@@ -141,6 +142,10 @@ class LearnedTranslation(Transfer):
     def n_samples(self) -> int:
         """Transitions of the target that have been sampled for the mapping."""
         return len(self._samples)
+
+    def mapping_steps(self) -> int:
+        """Return how many steps of the target have been taken for the mapping."""
+        return self.n_samples
 
     @property
     def translated(self) -> SourceInstances | None:
@@ -233,7 +238,7 @@ class LearnedTranslation(Transfer):
 
     def statistics(self) -> dict[str, float]:
         figures = {
-            "transfer/steps_to_find_mapping": self.n_samples,
+            "transfer/steps_to_find_mapping": self.mapping_steps(),
             "transfer/mapping_found": float(self._timbrel is not None),
             "transfer/mapping_seconds": self._seconds,
             "transfer/translated_spread": self._spread(),

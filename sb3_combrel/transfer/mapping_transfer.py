@@ -34,7 +34,7 @@ from sb3_combrel.transfer.instances_check import InstancesCheck
 from sb3_combrel.transfer.placed_errors import PlacedErrors
 from sb3_combrel.transfer.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-from sb3_combrel.transfer.relevance import renew_relevance
+from sb3_combrel.transfer.relevance import renew_near_relevance, renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
 from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.selectors import Ranges, Selector
@@ -47,6 +47,8 @@ DEFAULT_BREADTH_DECAY = 0.8
 # Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
 RELEVANCE_GROWTH = 1.2
 MIN_TRANSITIONS_FOR_RELEVANCE = 50
+#: The relevance that does not favour distant instances, ``equations.near_relevances``.
+NEAR = "near"
 
 #: Arguments of TIMBREL and COMBREL by their former names.
 RENAMED_ARGUMENTS = {
@@ -67,7 +69,8 @@ class MappingTransfer(Transfer):
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after the target's own transitions
         have contradicted what was transferred (see :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`)
     :param transfer_terminals: whether a source instance that ended its episode ends the target's
-    :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance
+    :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance; "near": of the
+        relevance that does not favour distant instances, times their weight
     :param relevance_fraction: mu of Eq. 4
     :param bandwidths: (start, outcome, reward) of compliance and relevance; None: from the data
     :param use: "instances" or "prior": translated instances, or the source's own model seen through the mappings
@@ -84,7 +87,7 @@ class MappingTransfer(Transfer):
         breadth: float,
         breadth_decay: float,
         transfer_terminals: bool,
-        relevance: bool,
+        relevance: bool | str,
         relevance_fraction: float,
         bandwidths: tuple[float, float, float] | None,
         use: str = "instances",
@@ -108,13 +111,13 @@ class MappingTransfer(Transfer):
             for value in bandwidths:
                 check_positive("bandwidths", value)
         check_boolean("transfer_terminals", transfer_terminals)
-        check_boolean("relevance", relevance)
+        check_relevance(relevance)
         self.source = source
         self.mappings = mappings
         self.breadth = breadth
         self.breadth_decay = breadth_decay
         self.transfer_terminals = bool(transfer_terminals)
-        self.relevance = bool(relevance)
+        self.relevance = relevance if isinstance(relevance, str) else bool(relevance)
         self.relevance_fraction = relevance_fraction
         self.bandwidths = bandwidths
         self.use = use
@@ -149,7 +152,8 @@ class MappingTransfer(Transfer):
             task,
             breadth=float(self.breadth),
             transfer_terminals=self.transfer_terminals,
-            by_relevance=self.relevance,
+            by_relevance=bool(self.relevance),
+            times_weight=self.relevance == NEAR,
         )
         self._selector = self._make_selector(task)
         self._last_selected: Ranges = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -279,7 +283,11 @@ class MappingTransfer(Transfer):
     def _renew_relevance(self, n_used: int) -> None:
         mu, values = float(self.relevance_fraction), self._translator.relevance
         bandwidths = self._bandwidths, self._starts
-        renew_relevance(self.candidates, self._transitions, n_used, bandwidths, self._periodic, mu, values)
+        given = self.candidates, self._transitions, n_used, bandwidths, self._periodic
+        if self.relevance == NEAR:
+            renew_near_relevance(*given, values)
+        else:
+            renew_relevance(*given, mu, values)
         self._n_of_relevance = n_used
 
     # --------------------------------------------------------------- describing
@@ -294,7 +302,9 @@ class MappingTransfer(Transfer):
 
     def describe_prior(self) -> str:
         """
-        Say what the source is taken for: "East: Right on (x, vx), Neutral on (y, vy); West: ..."; with ``use="prior"``.
+        Say what the source is taken for, with ``use="prior"``: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
+
+        Target variables are named first, then the source variables that they are taken for, where these have other names.
 
         :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
         """
@@ -438,6 +448,14 @@ class MappingTransfer(Transfer):
         self._errors.sums.ravel()[:] = state["errors"][1:]
         if self.relevance and self._selector.n_used():
             self._renew_relevance(self._selector.n_used())
+
+
+def check_relevance(value: object) -> None:
+    """
+    :raises ValueError: unless ``value`` is True, False or "near"
+    """
+    if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value == NEAR):
+        raise ValueError(f'relevance must be True, False or "{NEAR}", got {value!r}')
 
 
 def check_boolean(name: str, value: object) -> None:

@@ -135,6 +135,10 @@ class MASTER(MappingTransfer):
         assert self.task is not None
         return int(self.rng.integers(self.task.n_actions))
 
+    def mapping_steps(self) -> int:
+        """Return how many random steps of the target have been taken to find the mapping."""
+        return self._n_seen
+
     @property
     def chosen(self) -> InterTaskMapping | None:
         """The mapping that was chosen, with names; None before."""
@@ -148,6 +152,6 @@ class MASTER(MappingTransfer):
     def statistics(self) -> dict[str, float]:
         return {
             **super().statistics(),
-            "transfer/steps_to_find_mapping": self._n_seen,
+            "transfer/steps_to_find_mapping": self.mapping_steps(),
             "transfer/mapping_found": float(self.chosen is not None),
         }

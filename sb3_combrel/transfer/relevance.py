@@ -1,4 +1,7 @@
-"""Relevance: which source instances are to be transferred first (Eqs. 4 and 7)."""
+"""Relevance: which source instances are to be transferred first (Eqs. 4 and 7, and one of this package)."""
+
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +22,7 @@ def renew_relevance(
     values: np.ndarray,
 ) -> None:
     """
-    Compute the relevance of all source instances, through every candidate, to recorded target transitions.
+    Compute the relevance of all source instances, through every candidate, to recorded target transitions (Eq. 7).
 
     :param candidates: the candidates of every target action
     :param transitions: the target transitions, of which the first ``n_used`` count
@@ -28,15 +31,47 @@ def renew_relevance(
     :param mu: fraction of the weight of Eq. 4
     :param values: receives the relevances, shape (n_candidates, most instances of an action)
     """
+    weight = np.empty(n_used)
+    for c, problem in enumerate(_problems(candidates, transitions, n_used, bandwidths, periodic)):
+        _relevance.call(*problem, mu, weight, values[c])
+
+
+def renew_near_relevance(
+    candidates: Candidates,
+    transitions: RecordedTransitions,
+    n_used: int,
+    bandwidths: tuple[Bandwidths, np.ndarray],
+    periodic: np.ndarray,
+    values: np.ndarray,
+) -> None:
+    """
+    Compute the relevance that does not favour distant instances, of all source instances through every candidate.
+
+    Parameters: see :func:`renew_relevance`.
+    """
+    weight, evidence = np.empty(n_used), np.empty(values.shape[1])
+    for c, problem in enumerate(_problems(candidates, transitions, n_used, bandwidths, periodic)):
+        _near_relevance.call(*problem, weight, evidence, values[c])
+
+
+def _problems(
+    candidates: Candidates,
+    transitions: RecordedTransitions,
+    n_used: int,
+    bandwidths: tuple[Bandwidths, np.ndarray],
+    periodic: np.ndarray,
+) -> Iterator[tuple[Any, ...]]:
+    """What compiled code is told of each candidate: target, source, action, mapping, bandwidths."""
     of_all, starts = bandwidths
+    of_actions = {}
+    for a in range(len(candidates.arrays.first) - 1):
+        rows = np.flatnonzero(transitions.actions[:n_used] == a)
+        of_actions[a] = transitions.states[rows], transitions.effects[rows], transitions.rewards[rows]
     for c, origin in enumerate(candidates.origins):
-        rows = np.flatnonzero(transitions.actions[:n_used] == origin.target_action)
         row = candidates.arrays.row[c]
-        target = transitions.states[rows], transitions.effects[rows], transitions.rewards[rows]
         mapping = candidates.table.variable[row], candidates.table.sign[row], periodic
         of_row = of_all._replace(start=float(starts[row]))
-        action, weight = candidates.arrays.action[c], np.empty(len(rows))
-        _relevance.call(target, candidates.instances, action, mapping, of_row, mu, weight, values[c])
+        yield of_actions[origin.target_action], candidates.instances, candidates.arrays.action[c], mapping, of_row
 
 
 @compiled
@@ -55,40 +90,74 @@ def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
     :param mapping: (source variable of each target variable, -1 for none; sign, -1 where mirrored; whether the target
         variable is periodic)
     :param bandwidths: of Eq. 2; ``mu``: fraction of the weight of Eq. 4
-    :param weight: float64 scratch, shape (n,)
+    :param weight: float64 scratch, at least shape (n,)
     :param values: receives the relevances, at least as many as ``source.size[action]``
+    """
+    n = len(target[2])
+    for j in range(source.size[action]):
+        total, compliance = _compliance(j, target, source, action, mapping, bandwidths, weight)
+        if total < 1e-300:
+            values[j] = 1.0
+            continue
+        distance = _mean_distance(weight[:n], total, mu, bandwidths.start)
+        off = compliance - 1.0
+        values[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
+
+
+@compiled
+def near_relevance(target, source, action, mapping, bandwidths, weight, evidence, values):
+    """
+    Compute the relevance that does not favour distant instances (``equations.near_relevances``).
+
+    Parameters: see :func:`relevance`, and
+
+    :param evidence: float64 scratch, at least as many as ``source.size[action]``
+    """
+    n = source.size[action]
+    total = 0.0
+    borne_out = 0.0
+    for j in range(n):
+        evidence[j], values[j] = _compliance(j, target, source, action, mapping, bandwidths, weight)
+        total += evidence[j]
+        borne_out += evidence[j] * values[j]
+    mean = borne_out / total if total > 0.0 else 1.0
+    for j in range(n):
+        values[j] = (evidence[j] * values[j] + mean) / (evidence[j] + 1.0)
+
+
+@inner
+def _compliance(j, target, source, action, mapping, bandwidths, weight):
+    """
+    Return the evidence on instance ``j``, which is the sum of the weights of all transitions, and its compliance with them.
+
+    :param weight: receives the weights
     """
     states, effects, rewards = target
     index, sign, periodic = mapping
     n, d = states.shape
-    for j in range(source.size[action]):
-        total = 0.0
-        transition = 0.0
-        rewarded = 0.0
-        for i in range(n):
-            apart = 0.0
-            missed = 0.0
-            for v in range(d):
-                moved = 0.0
-                if index[v] >= 0:
-                    here = source.state[action, j, index[v]]
-                    moved = sign[v] * source.effect[action, j, index[v]]
-                    along = difference(states[i, v], 1.0 - here if sign[v] < 0.0 else here, periodic[v])
-                    apart += along * along
-                missed += difference(effects[i, v], moved, periodic[v]) ** 2
-            w = np.exp(-apart / bandwidths.start)
-            weight[i] = w
-            total += w
-            transition += w * np.exp(-missed / bandwidths.outcome)
-            off = rewards[i] - source.reward[action, j]
-            rewarded += w * np.exp(-off * off / bandwidths.reward)
-        if total < 1e-300:
-            values[j] = 1.0
-            continue
-        compliance = (transition / total) * (rewarded / total)
-        distance = _mean_distance(weight, total, mu, bandwidths.start)
-        off = compliance - 1.0
-        values[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
+    total = 0.0
+    transition = 0.0
+    rewarded = 0.0
+    for i in range(n):
+        apart = 0.0
+        missed = 0.0
+        for v in range(d):
+            moved = 0.0
+            if index[v] >= 0:
+                here = source.state[action, j, index[v]]
+                moved = sign[v] * source.effect[action, j, index[v]]
+                along = difference(states[i, v], 1.0 - here if sign[v] < 0.0 else here, periodic[v])
+                apart += along * along
+            missed += difference(effects[i, v], moved, periodic[v]) ** 2
+        w = np.exp(-apart / bandwidths.start)
+        weight[i] = w
+        total += w
+        transition += w * np.exp(-missed / bandwidths.outcome)
+        off = rewards[i] - source.reward[action, j]
+        rewarded += w * np.exp(-off * off / bandwidths.reward)
+    if total < 1e-300:
+        return 0.0, 0.0
+    return total, (transition / total) * (rewarded / total)
 
 
 @inner
@@ -117,4 +186,4 @@ def _mean_distance(weight, total, mu, bandwidth):
     return distance / max(n_taken, 1)
 
 
-_relevance = EntryPoint(relevance)
+_relevance, _near_relevance = EntryPoint(relevance), EntryPoint(near_relevance)

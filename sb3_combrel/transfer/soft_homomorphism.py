@@ -291,6 +291,10 @@ class SoftHomomorphism(Transfer):
         """The most probable mapping of states of each copy, in any order of the copies; none before the first fit."""
         return [] if self._logits is None else sorted(probabilities(self._logits, self._readings)[0].argmax(axis=1).tolist())
 
+    def mapping_steps(self) -> int:
+        """Return how many steps of the target had been taken when the mapping was first fitted; all if it never was."""
+        return FIRST_RENEWAL if self._n_fits else self._n_observed
+
     def mixture(self) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the stochastic mapping.

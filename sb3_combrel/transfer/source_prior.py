@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.mappings.factored_mapping import describe_copy
+from sb3_combrel.mappings.factored_mapping import describe_both_sides, describe_copy
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import GOES_ON, TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
@@ -364,14 +365,17 @@ class SourcePrior:
         return self.copies.mapping(copy, self.task, action or (0,) * self.task.n_actions)
 
     def describe(self) -> str:
-        """Say what each target action is made of: "East: Right on (x, vx), Neutral on (y, vy); West: ..."."""
-        choice, names = self.choice, enumerate(self.task.action_names)
-        return "; ".join(f"{name}: {'nothing' if choice is None else self.describe_action(choice, a)}" for a, name in names)
+        """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
+        choice, names = self.choice, self.task.action_names
+        moves = [[] if choice is None else moved(choice, a) for a in range(self.task.n_actions)]
+        return "; ".join(f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True))
 
     def describe_action(self, choice: Choice, action: int) -> str:
         """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
-        moves = moved(choice, action)
-        words = (f"{self._action_name(copy, used)} on {describe_copy(self.copy_mapping(copy))}" for copy, used in moves)
+        return self._describe_moves(moved(choice, action), describe_copy)
+
+    def _describe_moves(self, moves: Sequence[tuple[int, int]], variables_of: Callable[[InterTaskMapping], str]) -> str:
+        words = (f"{self._action_name(copy, used)} on {variables_of(self.copy_mapping(copy))}" for copy, used in moves)
         return ", ".join(words) if moves else "nothing"
 
     def _action_name(self, copy: int, used: int) -> str:

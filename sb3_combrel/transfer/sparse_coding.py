@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.transfer.candidates import SourceLike
-from sb3_combrel.transfer.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
 from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
 
 N_ITERATIONS = 30
@@ -132,7 +132,7 @@ class SparseCodingMapping(LearnedTranslation):
         self,
         source: SourceLike,
         *,
-        n_random_steps: int = 200,
+        n_random_steps: int = DEFAULT_SAMPLE_STEPS,
         n_source_samples: int = 300,
         n_atoms: int | None = None,
         sparsity: float = 0.1,

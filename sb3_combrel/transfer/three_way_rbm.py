@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.transfer.candidates import SourceLike
-from sb3_combrel.transfer.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
 from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
 from sb3_combrel.transfer.three_way_machine import reconstruct, train
 
@@ -48,7 +48,7 @@ class ThreeWayRBM(LearnedTranslation):
         self,
         source: SourceLike,
         *,
-        n_random_steps: int = 200,
+        n_random_steps: int = DEFAULT_SAMPLE_STEPS,
         n_source_samples: int = 1000,
         n_hidden: int = 30,
         n_factors: int = 30,

@@ -66,8 +66,9 @@ class TIMBREL(MappingTransfer):
         seldom reach the limit, the three are alike (265 to 291).
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The paper does not
         say. Where this is wrong the target's own transitions correct it; without it no path leads to an end at first.
-    :param relevance: order the instances by relevance (Eq. 7) to the target's transitions, not by distance. The paper
-        finds it harmful.
+    :param relevance: True: order the instances by relevance (Eq. 7) to the target's transitions, not by distance. The paper
+        finds it harmful: it favours instances that are far from these. "near": by a relevance that does not, times the
+        weight; see ``equations.near_relevances``
     :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
     :param bandwidths: (start, outcome, reward) bandwidths of relevance; None: from the data
     :param use: "instances": translated instances fill what the target's own lack; or "prior", see above. ``breadth``,
@@ -86,7 +87,7 @@ class TIMBREL(MappingTransfer):
         breadth: float = DEFAULT_BREADTH,
         breadth_decay: float = DEFAULT_BREADTH_DECAY,
         transfer_terminals: bool = True,
-        relevance: bool = False,
+        relevance: bool | str = False,
         relevance_fraction: float = 0.5,
         bandwidths: tuple[float, float, float] | None = None,
         use: str = "instances",

@@ -71,6 +71,7 @@ class TranslationRules(NamedTuple):
     :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
     :param transfer_terminals: whether an instance that ended a source episode ends the target's
     :param by_relevance: whether instances come in the order of their relevance, not of their distance
+    :param times_weight: of their relevance times their weight
     """
 
     threshold: float
@@ -79,6 +80,7 @@ class TranslationRules(NamedTuple):
     min_fraction: float
     transfer_terminals: bool
     by_relevance: bool
+    times_weight: bool = False
 
 
 class TranslationScratch(NamedTuple):
@@ -235,9 +237,14 @@ def gather(state, own, candidate, arrays, kept):
             if apart <= nearest:
                 weight = np.exp(apart * scale)
                 rank = arrays.relevance[candidate, j] if rules.by_relevance else weight
+                if rules.times_weight:
+                    rank *= weight
                 kept, enters = consider(j, candidate, weight, rank, own, kept, rules, scratch)
                 if enters > rules.min_weight and not rules.by_relevance:
                     nearest = np.log(enters) / scale * (1 + 1e-12)
+                elif rules.times_weight and scratch.enters[0] > rules.min_weight:
+                    # No relevance exceeds 1: what is lighter than the least rank that is needed has a lower one.
+                    nearest = np.log(scratch.enters[0]) / scale * (1 + 1e-12)
     return kept
 
 
@@ -326,11 +333,18 @@ class Translator:
     :param candidates: the candidates of every target action
     :param task: the target task
     :param breadth: kernel breadth of transferred instances, unit coordinates
-    :param transfer_terminals: see ``TranslationRules``; ``by_relevance``: the same
+    :param transfer_terminals: see ``TranslationRules``; ``by_relevance`` and ``times_weight``: the same
     """
 
     def __init__(
-        self, candidates: Candidates, task: TargetTask, *, breadth: float, transfer_terminals: bool, by_relevance: bool
+        self,
+        candidates: Candidates,
+        task: TargetTask,
+        *,
+        breadth: float,
+        transfer_terminals: bool,
+        by_relevance: bool,
+        times_weight: bool = False,
     ):
         largest = int(candidates.instances.size.max())
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
@@ -347,6 +361,7 @@ class Translator:
                     min_fraction=float(task.min_fraction),
                     transfer_terminals=transfer_terminals,
                     by_relevance=by_relevance,
+                    times_weight=times_weight,
                 ),
                 relevance=np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0)),
                 scratch=self._make_scratch(),

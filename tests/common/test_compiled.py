@@ -175,3 +175,33 @@ def test_compiled_code_older_than_any_source_file_is_removed(tmp_path):
         os.utime(tmp_path / name, (2_000_000_000 - age,) * 2)
     remove_outdated([tmp_path])
     assert sorted(file.name for file in cache.iterdir()) == ["a.cpython-311.pyc", "new.f-1.nbi", "old.f-1.1.nbc"]
+
+
+CALLER, CALLED = (
+    "from numba import njit\nfrom called import plus\n\n@njit(cache=True)\ndef call(x):\n    return plus(x)\n",
+    """
+from numba import njit
+
+@njit(cache=True)
+def plus(x):
+    return x + {}
+""",
+)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("removes", [False, True])
+def test_a_function_is_compiled_again_in_numba_cache_dir_when_what_it_calls_has_changed(tmp_path, removes):
+    """Numba alone does not notice; that it does not is shown too, so that this is looked at again when it does."""
+    room, cache = tmp_path / "room", tmp_path / "cache"
+    room.mkdir()
+    (room / "caller.py").write_text(CALLER)
+    remove = f"from pathlib import Path; remove_outdated([Path({str(room)!r})], {str(cache)!r});" if removes else ""
+    code = f"from sb3_combrel.common.compiled import remove_outdated; import sys; sys.path.insert(0, {str(room)!r});"
+    code += f"{remove} from caller import call; print(call(1))"
+    printed = []
+    for added in (1, 2):
+        (room / "called.py").write_text(CALLED.format(added))
+        printed.append(run(code, cache)[0])
+        assert list(cache.glob("room_*/caller.call-*.nbi"))
+    assert printed == ["2\n", "3\n" if removes else "2\n"]

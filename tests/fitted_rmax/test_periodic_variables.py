@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers.agents import assert_same_state, make_agent
-from helpers.dashboard import events
+from helpers.dashboard import events, run_folder
 from helpers.ring import PERIODIC, Ring, ring_transitions, shifted
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -195,7 +195,7 @@ def test_the_dashboard_shows_periodic_variables(transfers, tmp_path):
     transfer = COMBREL(source) if transfers else None
     arguments = dict(seed=0, resolution=4, model_breadth=0.12, transfer=transfer, tensorboard_log=str(tmp_path))
     FittedRMax(TellingRing(), **arguments).learn(300, DashboardCallback(picture_freq=150), log_interval=1)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     assert len(found.Images("value_and_policy/angle_speed")) == 2
     assert ("source_action/angle_speed" in found.Tags()["images"]) == transfers
 

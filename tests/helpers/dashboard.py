@@ -35,10 +35,11 @@ class NamedWalk(gym.Env):
 
 
 class Still(gym.Env):
-    """One action, and nothing happens."""
+    """Nothing happens, whatever the action."""
 
-    def __init__(self, low, high):
-        self.observation_space, self.action_space = spaces.Box(low, high), spaces.Discrete(1)
+    def __init__(self, low, high, action_names=("wait",)):
+        self.observation_space, self.action_space = spaces.Box(low, high), spaces.Discrete(len(action_names))
+        self.action_names = tuple(action_names)
 
     def reset(self, *, seed=None, options=None):
         return self.observation_space.low, {}
@@ -55,15 +56,21 @@ def walker(log=None, transfer=None, env=None, **kwargs):
     )
 
 
+def run_folder(log):
+    """The folder of the only run in a log."""
+    (folder,) = log.iterdir()
+    return folder
+
+
 def events(folder):
     """All that the event files of a folder have."""
     found = EventAccumulator(str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0})
     return found.Reload()
 
 
-def scalars(found, tag):
-    """The values of a scalar by step."""
-    return {event.step: event.value for event in found.Scalars(tag)}
+def scalars(found, tag, at=None):
+    """The values of a scalar by step; at some steps only, if they are given."""
+    return {event.step: event.value for event in found.Scalars(tag) if at is None or event.step in at}
 
 
 class Witness(BaseCallback):

@@ -163,11 +163,33 @@ def relevance(source, j, mapping, action, transitions, bandwidths, mu):
     return 1.0 if off == 0.0 else 0.0 if d == 0.0 else math.exp(-((off / d) ** 2))
 
 
-def transferred(state, own, drawn_from, task, breadth, relevance=None):
+def near_relevances(source, mapping, action, transitions, bandwidths):
+    """The relevance that does not favour distant instances, of all instances translated for a target action, by number."""
+    evidence, complied = {}, {}
+    for j in np.flatnonzero(source.actions == mapping.action[action]).tolist():
+        weights, of_transitions, of_rewards = [], [], []
+        for s, a, r, s_next in transitions:
+            if a == action:
+                [one] = [o for o in translated(source, mapping, action, s) if o.number == j]
+                weights.append(phi(distance(s, one.start), bandwidths.start))
+                of_transitions.append(phi(distance(s_next, s + (one.end - one.start)), bandwidths.outcome))
+                of_rewards.append(phi(abs(r - one.reward), bandwidths.reward))
+        evidence[j] = sum(weights)
+        complied[j] = 0.0
+        if evidence[j] > 0.0:
+            mean = [sum(w * x for w, x in zip(weights, of, strict=True)) for of in (of_transitions, of_rewards)]
+            complied[j] = mean[0] / evidence[j] * mean[1] / evidence[j]
+    everything = sum(evidence.values())
+    typical = sum(evidence[j] * complied[j] for j in evidence) / everything if everything > 0.0 else 1.0
+    return {j: (evidence[j] * complied[j] + typical) / (evidence[j] + 1.0) for j in evidence}
+
+
+def transferred(state, own, drawn_from, task, breadth, relevance=None, times_weight=False):
     """What is transferred to a pair: (weight, effect, reward, terminal flag) of each instance, best first; or nothing.
 
     :param drawn_from: (source, mapping, target action) of each translation that may be drawn from
     :param relevance: function of (place in ``drawn_from``, number of the instance); None: nearest first
+    :param times_weight: whether they come in the order of relevance times weight
     """
     gathered = []
     for place, (source, mapping, action) in enumerate(drawn_from):
@@ -175,6 +197,7 @@ def transferred(state, own, drawn_from, task, breadth, relevance=None):
             weight = math.exp(-(distance(state, one.start) ** 2) / breadth**2)
             if weight >= task.min_weight:
                 rank = weight if relevance is None else relevance(place, one.number)
+                rank *= weight if times_weight else 1.0
                 gathered.append((rank, weight, one.end - one.start, one.reward, one.terminated))
     chosen, total = [], own
     for _, weight, *what in sorted(gathered, key=lambda entry: -entry[0]):

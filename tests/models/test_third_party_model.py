@@ -5,6 +5,7 @@ import inspect
 import numpy as np
 import pytest
 import torch as th
+from helpers.dashboard import run_folder
 from helpers.walk import GOAL, STRIDE, Walk, small, walk_source
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -103,7 +104,7 @@ def test_a_third_party_model_is_shown_on_the_dashboard(transfer, tmp_path):
     pytest.importorskip("matplotlib")
     dashboard = DashboardCallback(picture_freq=100, scalar_share=1.0)
     model = third_party(transfer, tensorboard_log=str(tmp_path)).learn(200, callback=dashboard)
-    found = EventAccumulator(str(tmp_path / "FittedRMax_1"), size_guidance={"images": 0, "scalars": 0}).Reload()
+    found = EventAccumulator(str(run_folder(tmp_path)), size_guidance={"images": 0, "scalars": 0}).Reload()
     assert {"model/known", "model/instances", "planner/residual", "planner/backups"} <= set(found.Tags()["scalars"])
     known = found.Scalars("model/known")
     assert 0.0 < known[-1].value <= 1.0 and known[-1].step <= 200

@@ -47,9 +47,14 @@ def test_without_a_log_interval_nothing_is_logged(make, tmp_path):
     assert (tmp_path / "progress.csv").read_text() == ""
 
 
-def test_tensorboard_logs_are_named_after_the_algorithm(make, tmp_path):
+def test_tensorboard_logs_are_named_after_algorithm_transfer_method_and_seed(make, method, tmp_path):
     model = make(tensorboard_log=str(tmp_path)).learn(60, log_interval=1)
-    assert len(list((tmp_path / "FittedRMax_1").glob("events.*"))) == 1
+    name = "_".join(["FittedRMax", *([type(model.agent.transfer).__name__] if method != "none" else []), f"seed{model.seed}"])
+    model.learn(30, reset_num_timesteps=False)
+    assert [folder.name for folder in tmp_path.iterdir()] == [f"{name}_1"]
+    assert len(list((tmp_path / f"{name}_1").glob("events.*"))) == 2
+    model.learn(30)
+    assert {folder.name for folder in tmp_path.iterdir()} == {f"{name}_1", f"{name}_2"}
     model.learn(60, tb_log_name="again")
     assert (tmp_path / "again_1").is_dir()
 

@@ -19,7 +19,6 @@ def test_learn_takes_what_every_algorithm_takes():
     ours, theirs = inspect.signature(FittedRMax.learn).parameters, inspect.signature(BaseAlgorithm.learn).parameters
     assert list(ours) == list(theirs)
     assert all(ours[name].default is not inspect.Parameter.empty for name in ours if name != "self")
-    assert ours["tb_log_name"].default == "FittedRMax"
 
 
 @pytest.mark.parametrize("name", ["save", "load", "set_env"])

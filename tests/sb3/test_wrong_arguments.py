@@ -71,7 +71,6 @@ def test_a_whole_number_of_steps_may_be_of_any_type(steps):
         ("log_interval", True),
         ("log_interval", 2.5),
         ("tb_log_name", 3),
-        ("tb_log_name", None),
         ("reset_num_timesteps", "False"),
         ("reset_num_timesteps", None),
         ("progress_bar", "no"),

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch as th
-from helpers.dashboard import METHODS, NamedWalk, Witness, events, walker
+from helpers.dashboard import METHODS, NamedWalk, Witness, events, run_folder, walker
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -71,14 +71,14 @@ def test_the_dashboard_stands_beside_other_callbacks(given, tmp_path):
         "nested": CallbackList([EveryNTimesteps(10, Witness(len)), witness]),
     }[given]
     walker(tmp_path).learn(150, callback)
-    assert calls and "planner/residual" in events(tmp_path / "FittedRMax_1").Tags()["scalars"]
+    assert calls and "planner/residual" in events(run_folder(tmp_path)).Tags()["scalars"]
 
 
 @pytest.mark.parametrize("wrap", [list, CallbackList])
 def test_a_dashboard_that_is_given_is_the_only_one(wrap, tmp_path):
     given = DashboardCallback(picture_freq=50, variables=[("height", "place")])
     walker(tmp_path).learn(100, wrap([given]))
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     assert found.Tags()["images"] == ["value_and_policy/height_place"]
     assert [image.step for image in found.Images("value_and_policy/height_place")] == [50, 100]
 
@@ -89,7 +89,7 @@ def test_a_model_is_saved_without_the_dashboard(transfers, tmp_path):
     loaded = FittedRMax.load(tmp_path / "model", env=NamedWalk())
     assert "ashboard" not in str(model.__dict__)
     loaded.learn(50, DashboardCallback(), reset_num_timesteps=False)
-    assert events(tmp_path / "log" / "FittedRMax_1").Images("value_and_policy/place_height")[-1].step == 200
+    assert events(run_folder(tmp_path / "log")).Images("value_and_policy/place_height")[-1].step == 200
 
 
 @pytest.mark.integration
@@ -106,7 +106,7 @@ def test_learning_goes_on_in_the_same_log_after_an_interrupt(transfers, tmp_path
     assert not model.agent.timed
     model.save(tmp_path / "model")
     model.learn(100, DashboardCallback(picture_freq=100), reset_num_timesteps=False)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     assert [image.step for image in found.Images("value_and_policy/place_height")] == [100, 130, 200, 230]
 
 
@@ -115,7 +115,7 @@ def test_the_dashboard_shows_environments_in_other_processes(transfers, tmp_path
     env = make_vec_env(NamedWalk, 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=dict(start_method="fork"))
     walker(tmp_path, transfers["COMBREL"], env).learn(200, DashboardCallback(picture_freq=75))
     env.close()
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     assert [image.step for image in found.Images("value_and_policy/place_height")] == [76, 150, 200]
     assert "transfer/compliance" in found.Tags()["scalars"]
 

@@ -11,6 +11,7 @@ from matplotlib.image import imread
 
 from sb3_combrel import FittedRMax, cli, explain
 from sb3_combrel.tensorboard import pictures
+from sb3_combrel.tensorboard.explain import FILE_DPI
 from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.tensorboard.plane import plane_through
 
@@ -54,8 +55,8 @@ def test_the_files_are_the_dashboards_pictures(saved, tmp_path):
     agent = model.agent
     plane = plane_through(agent.grid, agent.task.scaling, agent.task.state_names, (1, 0), [0.5, 1.5])
     drawn = {
-        "value_and_policy_height_place.png": pictures.value_and_policy(agent, plane),
-        "source_action_height_place.png": pictures.source_actions(agent, model.transfer, plane),
+        "value_and_policy_height_place.png": pictures.value_and_policy(agent, plane, FILE_DPI),
+        "source_action_height_place.png": pictures.source_actions(agent, model.transfer, plane, FILE_DPI),
     }
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*drawn, *TEXTS])
     for name, pixels in drawn.items():

@@ -6,9 +6,10 @@ import time
 
 import numpy as np
 import pytest
-from helpers.dashboard import METHODS, Still, events, slow_q, walker
+from helpers.dashboard import METHODS, Still, events, run_folder, slow_q, walker
 
-from sb3_combrel import FittedRMax
+from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+from sb3_combrel.tensorboard import pictures
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.tensorboard.history import MAX_COLUMNS, ChoiceHistory
 from sb3_combrel.tensorboard.pictures import chosen_source_actions, greedy_actions, state_mapping_shares
@@ -18,7 +19,7 @@ from sb3_combrel.tensorboard.readings import action_values
 
 def test_pictures_come_at_the_asked_steps_and_at_the_end(transfers, tmp_path):
     walker(tmp_path, transfers["COMBREL"]).learn(250, DashboardCallback(picture_freq=100), log_interval=1)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     for tag in ("value_and_policy/place_height", "source_action/place_height", "state_mappings/chosen"):
         assert [image.step for image in found.Images(tag)] == [100, 200, 250]
     assert [text.step for text in found.Tensors("transfer/most_chosen_mappings/text_summary")] == [100, 200, 250]
@@ -28,14 +29,14 @@ def test_pictures_come_at_the_asked_steps_and_at_the_end(transfers, tmp_path):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_its_pictures(method, transfers, tmp_path):
     walker(tmp_path, transfers[method]).learn(120, DashboardCallback(), log_interval=1)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     of_choice = ["source_action/place_height", "state_mappings/chosen"] if method in ("TIMBREL", "COMBREL") else []
     assert sorted(found.Tags()["images"]) == sorted(["value_and_policy/place_height", *of_choice])
     assert ("transfer/most_chosen_mappings/text_summary" in found.Tags()["tensors"]) == (method != "none")
 
 
 def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(transfers, tmp_path, monkeypatch):
-    def slowly(self):
+    def slowly(self, step):
         shown.append(time.perf_counter() - began)
         time.sleep(0.05)
 
@@ -46,14 +47,49 @@ def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(tran
     began = time.perf_counter()
     walker(tmp_path, transfers["COMBREL"]).learn(3000)
     took = time.perf_counter() - began
-    # The first set was expected to take 0.01 seconds, so it came after 0.2 seconds at the earliest.
-    assert 1 <= len(shown) <= 2 + 0.05 * took / 0.05 and shown[0] > 0.15
+    # The first set was expected to take 0.01 seconds, so it came after 0.2 seconds at the earliest. The last always comes.
+    assert 2 <= len(shown) <= 3 + 0.05 * took / 0.05 and shown[0] > 0.15
 
 
-def test_a_short_run_has_no_pictures_unless_they_are_asked_for(tmp_path):
+def test_a_short_run_has_one_set_of_pictures_at_its_end(tmp_path):
     walker(tmp_path).learn(120)
-    found = events(tmp_path / "FittedRMax_1")
-    assert not found.Tags()["images"] and "model/known" in found.Tags()["scalars"]
+    found = events(run_folder(tmp_path))
+    assert [image.step for image in found.Images("value_and_policy/place_height")] == [120]
+    assert "model/known" in found.Tags()["scalars"]
+
+
+def test_the_last_set_comes_at_a_step_where_another_was_left_out_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.DEFAULT_PICTURE_FREQ", 60)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.FIRST_PICTURES_SECONDS", 1e6)
+    walker(tmp_path).learn(120)
+    assert [image.step for image in events(run_folder(tmp_path)).Images("value_and_policy/place_height")] == [120]
+
+
+def ink_at_the_edges(picture):
+    """Whether anything is drawn in the outermost pixels."""
+    return any((edge < 200).any() for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]))
+
+
+@pytest.mark.parametrize("words", [("a", "b"), ("shoulder_pitch_up", "shoulder_pitch_down")])
+@pytest.mark.parametrize("n_actions", [2, 5, 9])
+def test_pictures_are_as_wide_as_a_card_and_nothing_is_cut_off(words, n_actions):
+    names = [f"{words[k % 2]}{k}" for k in range(n_actions)]
+    env = Still(np.zeros(4, dtype=np.float32), np.ones(4, dtype=np.float32), names)
+    source = SourceInstances.record(None, env, n_instances=60, seed=0)
+    agent = FittedRMax(env, transfer=COMBREL(source, use="instances"), seed=0, model_breadth=0.4, resolution=2).agent
+    plane = plane_through(agent.grid, agent.task.scaling, [f"joint_velocity_{k}" for k in range(4)], (0, 1))
+    history = ChoiceHistory()
+    history.note(50, np.arange(0, len(agent.transfer.choices()), 97) % 40)
+    drawn = [
+        pictures.value_and_policy(agent, plane),
+        pictures.source_actions(agent, agent.transfer, plane),
+        pictures.state_mappings(history, agent.transfer),
+    ]
+    for picture in drawn:
+        assert picture.shape[1] == 350 and not ink_at_the_edges(picture)
+    # Every action has its colour in the legend.
+    colours = {tuple(pixel) for pixel in drawn[1].reshape(-1, 3)}
+    assert {tuple(int(c[k : k + 2], 16) for k in (1, 3, 5)) for c in pictures.COLOURS[:n_actions]} <= colours
 
 
 @pytest.mark.integration
@@ -65,13 +101,13 @@ def test_no_pictures_without_a_frequency(tmp_path):
     )
     result = subprocess.run([sys.executable, "-c", command, str(tmp_path)], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["False"]
-    assert not events(tmp_path / "FittedRMax_1").Tags()["images"]
+    assert not events(run_folder(tmp_path)).Tags()["images"]
 
 
 def test_without_matplotlib_there_are_no_pictures_but_all_else(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_combrel.tensorboard.callback.find_spec", lambda name: None)
     walker(tmp_path).learn(150)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     assert not found.Tags()["images"] and "model/known" in found.Tags()["scalars"]
     with pytest.raises(ModuleNotFoundError, match="matplotlib"):
         walker(tmp_path).learn(10, DashboardCallback())
@@ -79,7 +115,7 @@ def test_without_matplotlib_there_are_no_pictures_but_all_else(tmp_path, monkeyp
 
 def test_without_logs_of_the_algorithm_there_are_pictures_all_the_same(tmp_path):
     walker(tmp_path).learn(100, DashboardCallback(), log_interval=None)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     assert not found.Tags()["scalars"] and found.Tags()["images"]
 
 
@@ -118,7 +154,7 @@ def test_other_variables_are_held_at_the_nearest_grid_points():
 
 def test_a_task_with_one_variable_has_pictures_too(tmp_path):
     FittedRMax(Still(np.float32([0]), np.float32([1])), seed=0, tensorboard_log=str(tmp_path)).learn(50, DashboardCallback())
-    assert events(tmp_path / "FittedRMax_1").Tags()["images"] == ["value_and_policy/s0"]
+    assert events(run_folder(tmp_path)).Tags()["images"] == ["value_and_policy/s0"]
 
 
 def test_the_first_two_variables_are_drawn_by_default():

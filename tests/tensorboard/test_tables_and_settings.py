@@ -1,10 +1,12 @@
 """Text and settings of the dashboard: the table of mappings, HPARAMS, custom scalars."""
 
 import pytest
-from helpers.dashboard import events, walker
+from helpers.dashboard import events, run_folder, walker
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
+from tensorboard.plugins.hparams.api_pb2 import DATA_TYPE_BOOL, DATA_TYPE_FLOAT64, DATA_TYPE_STRING
 
+from sb3_combrel.tensorboard.hyperparameters import METRICS, hyperparameters
 from sb3_combrel.tensorboard.layout import LAYOUT
 from sb3_combrel.tensorboard.mapping_table import mapping_table
 
@@ -33,7 +35,7 @@ def test_the_table_of_a_method_that_transferred_nothing_is_a_sentence(transfers)
 
 def test_settings_are_in_the_hparams_tab(transfers, tmp_path):
     walker(tmp_path, transfers["COMBREL"], max_value=1.5).learn(150)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     content = found.PluginTagToContent("hparams")["_hparams_/session_start_info"]
     settings = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info.hparams
     assert settings["algorithm"].string_value == "FittedRMax + COMBREL"
@@ -43,9 +45,26 @@ def test_settings_are_in_the_hparams_tab(transfers, tmp_path):
     assert settings["transfer.mappings"].string_value == "injective"
 
 
+def test_columns_of_the_hparams_tab_are_those_of_all_runs(transfers, tmp_path):
+    """TensorBoard takes them from the first run that it finds."""
+    model = walker(tmp_path, transfers["none"]).learn(50)
+    content = events(run_folder(tmp_path)).PluginTagToContent("hparams")["_hparams_/experiment"]
+    experiment = plugin_data_pb2.HParamsPluginData.FromString(content).experiment
+    columns = {info.name: info for info in experiment.hparam_infos}
+    with_transfer = [hyperparameters(walker(transfer=transfer)) for transfer in transfers.values()]
+    assert set().union(*with_transfer) <= set(columns)
+    assert columns["transfer.breadth"].type == columns["model_breadth"].type == DATA_TYPE_FLOAT64
+    assert columns["algorithm"].type == DATA_TYPE_STRING and columns["transfer.relevance"].type == DATA_TYPE_BOOL
+    # The first five, in the order of the alphabet, are shown.
+    first = sorted(name for name, info in columns.items() if info.differs)
+    assert first == ["algorithm", "model_breadth", "seed", "transfer.breadth", "transfer.use"]
+    assert {metric.name.tag for metric in experiment.metric_infos} == set(METRICS)
+    assert hyperparameters(model)["model_breadth"] == 0.15
+
+
 def test_the_page_of_custom_scalars_shows_tags_that_exist(transfers, tmp_path):
     walker(tmp_path, transfers["COMBREL"]).learn(200)
-    found = events(tmp_path / "FittedRMax_1")
+    found = events(run_folder(tmp_path))
     written = layout_pb2.Layout.FromString(found.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
     assert [category.title for category in written.category] == list(LAYOUT)
     shown = {tag.strip("^$") for category in written.category for chart in category.chart for tag in chart.multiline.tag}

@@ -71,8 +71,9 @@ def test_whole_action_mappings_differ_only_when_neighbours_of_other_actions_coun
         TransferRules, st.floats(0.05, 0.6), st.floats(0.3, 4.0), st.sampled_from([0.001, 0.3]), st.sampled_from([0.01, 0.5])
     ),
     st.booleans(),
+    st.booleans(),
 )
-def test_transferred_instances_are_those_of_plain_loops(seed, sizes, rules, by_relevance):
+def test_transferred_instances_are_those_of_plain_loops(seed, sizes, rules, by_relevance, times_weight):
     source, mapping, _ = problem(seed, sizes, n_instances=40, spread=1.0)
     rng = np.random.default_rng(seed)
     state, own = rng.random(sizes[1]), float(rng.choice([0.0, rng.uniform(0.0, 1.2 * rules.threshold)]))
@@ -80,11 +81,11 @@ def test_transferred_instances_are_those_of_plain_loops(seed, sizes, rules, by_r
     of_action = source.actions == mapping.action[0]
     virtual = equations.virtual_source(as_transitions(source), mapping, 0, state[None, :])
     numbers, weights = equations.transferred_instances(
-        state, own, virtual, rules, relevances[of_action] if by_relevance else None
+        state, own, virtual, rules, relevances[of_action] if by_relevance else None, times_weight
     )
     task = naive.target_task(state[None, :], 1, rules.threshold, rules.min_weight, rules.min_fraction)
     merit = (lambda _, j: relevances[j]) if by_relevance else None
-    expected = naive.transferred(state, own, [(source, mapping, 0)], task, rules.breadth, merit)
+    expected = naive.transferred(state, own, [(source, mapping, 0)], task, rules.breadth, merit, times_weight)
     assert len(numbers) == len(expected)
     for j, weight, (naive_weight, effect, reward, terminated) in zip(numbers, weights, expected, strict=True):
         assert weight == pytest.approx(naive_weight, rel=1e-9)
@@ -192,12 +193,15 @@ def test_combrel_transfers_the_instances_of_the_equations(seed, breadth):
 
 
 @settings(max_examples=40, deadline=None)
-@given(seeds, st.floats(0.05, 0.6), st.floats(0.3, 3.0), st.booleans())
-def test_the_translator_transfers_the_instances_of_the_equations(seed, breadth, threshold, by_relevance):
+@given(seeds, st.floats(0.05, 0.6), st.floats(0.3, 3.0), st.sampled_from([(False, False), (True, False), (True, True)]))
+def test_the_translator_transfers_the_instances_of_the_equations(seed, breadth, threshold, order):
+    by_relevance, times_weight = order
     rng = np.random.default_rng(seed)
     source, task = naive.random_source(rng, 60, 2, 2), naive.target_task(rng.random((1, 3)), 2, threshold)
     candidates = Candidates(source, MAPPINGS, task)
-    translator = Translator(candidates, task, breadth=breadth, transfer_terminals=True, by_relevance=by_relevance)
+    translator = Translator(
+        candidates, task, breadth=breadth, transfer_terminals=True, by_relevance=by_relevance, times_weight=times_weight
+    )
     if by_relevance:
         translator.relevance[:] = rng.random(translator.relevance.shape)
     states, own = rng.random((20, 3)), rng.uniform(0.0, 1.2 * threshold, 20)
@@ -211,7 +215,7 @@ def test_the_translator_transfers_the_instances_of_the_equations(seed, breadth, 
         mapping = InterTaskMapping(of_row, [source_action] * 2, MAPPINGS.state_signs[state_index])
         virtual = equations.virtual_source(instances, mapping, action, states[row : row + 1])
         relevances = translator.relevance[candidate, places[source.actions == source_action]] if by_relevance else None
-        numbers, weights = equations.transferred_instances(states[row], own[row], virtual, rules, relevances)
+        numbers, weights = equations.transferred_instances(states[row], own[row], virtual, rules, relevances, times_weight)
         n = found.length[row]
         assert n == len(numbers)
         np.testing.assert_allclose(found.weight[row, :n], weights, rtol=1e-9)

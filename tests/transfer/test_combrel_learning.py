@@ -194,6 +194,7 @@ IDENTITY = {"state": [0, 1], "action": [0, 1, 2]}
         {"n_neighbors": 10, "max_transitions": 50},
         {"relevance": True, "relevance_fraction": 0.3},
         {"relevance": True, "measured": "first_episode"},
+        {"relevance": "near"},
         {"transfer_terminals": False, "breadth": 0.2, "breadth_decay": 1.0, "bandwidths": (0.02, 0.0002, 1.0)},
     ],
     ids=str,
@@ -229,7 +230,7 @@ def test_with_relevance_the_instances_that_the_target_contradicts_come_last():
     target = mountain_car(300, 1)
     task = naive.target_task(np.random.default_rng(0).uniform(0.1, 0.9, (100, 2)), 3)
     stillness = {}
-    for by_relevance in (False, True):
+    for by_relevance in (False, True, "near"):
         method = bound(COMBREL(still, IDENTITY, relevance=by_relevance), task)
         starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
         for i in range(len(target)):
@@ -239,3 +240,4 @@ def test_with_relevance_the_instances_that_the_target_contradicts_come_last():
         stillness[by_relevance] = np.mean(np.abs(effects).max(axis=1) == 0.0)
     assert stillness[False] > 0.4
     assert stillness[True] < 0.1
+    assert stillness["near"] < 0.1

@@ -61,6 +61,17 @@ def compiled_relevances(sample, source, mapping, action, bandwidths, mu):
     return found[naive.places_of(source, instances)[source.actions == source_action]]
 
 
+def compiled_near_relevances(sample, source, mapping, action, bandwidths):
+    """Compiled relevance that does not favour distant instances, as :func:`compiled_relevances`."""
+    instances, source_action = stacked_instances([source]), mapping.action[action]
+    of_action = sample.with_action(action)
+    found, evidence = np.full((2, int(instances.size.max())), np.nan)
+    target, scratch = (of_action.state, of_action.effect, of_action.reward), np.empty(len(of_action.reward))
+    of_mapping = mapping.state_index, mapping.state_sign, np.zeros(len(mapping.state_index), dtype=bool)
+    compiled_relevance.near_relevance(target, instances, source_action, of_mapping, bandwidths, scratch, evidence, found)
+    return found[naive.places_of(source, instances)[source.actions == source_action]]
+
+
 GUARD = naive.LEAST_EVIDENCE
 """The evidence guard of the naive version, and COMBREL's by default."""
 
@@ -232,6 +243,41 @@ def test_relevance_is_that_of_loops_and_of_compiled_code(seed, sizes, bandwidths
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
         compiled = compiled_relevances(sample, source, mapping, action, bandwidths, mu)
         np.testing.assert_allclose(found, compiled, rtol=1e-7, atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, sizes, some_bandwidths, st.integers(0, 20))
+def test_near_relevance_is_that_of_loops_and_of_compiled_code(seed, sizes, bandwidths, n_transitions):
+    source, mapping, transitions = problem(seed, sizes, n_transitions=n_transitions)
+    sample = as_sample(transitions, sizes[1])
+    for action in range(sizes[3]):
+        found = equations.source_near_relevances(as_transitions(source), mapping, action, sample, bandwidths)
+        expected = list(naive.near_relevances(source, mapping, action, transitions, bandwidths).values())
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
+        compiled = compiled_near_relevances(sample, source, mapping, action, bandwidths)
+        np.testing.assert_allclose(found, compiled, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("apart", [0.02, 0.1, 0.3, 1.0, 10.0])
+def test_far_away_a_contradicted_instance_is_never_before_one_that_is_nearly_borne_out(apart):
+    """By Eq. 7 it is, from some distance on: the case for another relevance."""
+    of_far = 5.0 * math.exp(-(apart**2) / 0.01)
+    near, _, far = equations.near_relevances(np.array([0.9, 0.2, 0.1]), np.array([5.0, 5.0, of_far]))
+    assert near > far
+    assert (equations.relevance(0.9, 0.02) > equations.relevance(0.1, apart)) == (apart < 0.15)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.integers(1, 8))
+def test_near_relevance_lies_between_an_instances_own_compliance_and_the_mean(seed, m):
+    rng = np.random.default_rng(seed)
+    complied, evidence = rng.random(m), rng.exponential(size=m) * (rng.random(m) < 0.7)
+    found = equations.near_relevances(complied, evidence)
+    mean = np.average(complied, weights=evidence) if evidence.any() else 1.0
+    own = np.where(evidence > 0.0, complied, mean)
+    assert (np.minimum(own, mean) - 1e-12 <= found).all() and (found <= np.maximum(own, mean) + 1e-12).all()
+    np.testing.assert_allclose(found[evidence == 0.0], mean)
+    np.testing.assert_allclose(equations.near_relevances(complied, evidence + 1e9), complied, atol=1e-6)
 
 
 @settings(max_examples=40, deadline=None)

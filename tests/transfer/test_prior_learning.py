@@ -14,10 +14,11 @@ from sb3_combrel.transfer.base import TargetTask
 
 LOW, HIGH = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
 ACTIONS_4D = ("Neutral", "West", "East", "South", "North")
+# The source's variables are x and v.
+X, Y = "(x, vx) as (x, v)", "(y, vy) as (x, v)"
 FOUND = (
-    "Neutral: Neutral on (x, vx), Neutral on (y, vy); West: Left on (x, vx), Neutral on (y, vy); "
-    "East: Right on (x, vx), Neutral on (y, vy); South: Neutral on (x, vx), Left on (y, vy); "
-    "North: Neutral on (x, vx), Right on (y, vy)"
+    f"Neutral: Neutral on {X}, Neutral on {Y}; West: Left on {X}, Neutral on {Y}; East: Right on {X}, Neutral on {Y}; "
+    f"South: Neutral on {X}, Left on {Y}; North: Neutral on {X}, Right on {Y}"
 )
 
 

@@ -167,15 +167,15 @@ def carry_out_all(jobs: Sequence[BenchmarkJob], files: RunFiles[Outcome], engine
     missing = [job for job in jobs if not files.is_complete(job)]
     if len(missing) < len(jobs):
         console.print(f"{len(jobs) - len(missing)} of {len(jobs)} runs were complete already.")
-    with progress_of(jobs, missing, console, _bar_of) as advance:
+    with progress_of(jobs, missing, console, _bar_of, _why_not) as advance:
 
         def take(job: BenchmarkJob, outcome: Outcome) -> None:
             files.write(outcome)
             advance(job, outcome)
             done.add(job.name)
-            if not outcome.succeeded:
-                what = f"does not fit: {outcome.misfit}" if outcome.misfit else f"failed: {outcome.error}"
-                console.print(f"  {job.title} {what}", markup=False, soft_wrap=True)
+            # Below bars there are no lines of runs.
+            if console.is_terminal and _why_not(outcome):
+                console.print(f"  {job.title}: {_why_not(outcome)}", markup=False, soft_wrap=True)
 
         while missing:
             done: set[str] = set()
@@ -193,6 +193,13 @@ def carry_out_all(jobs: Sequence[BenchmarkJob], files: RunFiles[Outcome], engine
 
 def _bar_of(job: BenchmarkJob) -> str:
     return job.pair.name
+
+
+def _why_not(outcome: Outcome) -> str:
+    """Say why there are no results of a run, "" if there are."""
+    if outcome.misfit:
+        return f"does not fit: {outcome.misfit}"
+    return f"failed: {outcome.error}" if outcome.error else ""
 
 
 def _without_source(

@@ -7,11 +7,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, SourceInstances
+from sb3_combrel import (
+    COMBREL,
+    MASTER,
+    TIMBREL,
+    FactoredMapping,
+    MappingExperts,
+    SoftHomomorphism,
+    SourceInstances,
+    SparseCodingMapping,
+    ThreeWayRBM,
+)
 from sb3_combrel.experiments.benchmark.oracle import KnownCopies
 from sb3_combrel.experiments.benchmark.pair import Pair, check_name
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.learned_translation import DEFAULT_SAMPLE_STEPS
+from sb3_combrel.transfer.master import DEFAULT_RANDOM_STEPS
 
 #: Instances of a pair's source, or a list of those of several.
 Sources = SourceInstances | list[SourceInstances]
@@ -19,6 +31,8 @@ Make = Callable[[Sources, Pair], Transfer | None]
 
 #: What all others are compared with.
 NONE = "none"
+#: Steps after which what most methods need is compiled, or loaded from the cache.
+COMPILED_STEPS = 60
 
 
 class DoesNotFit(ValueError):
@@ -35,6 +49,7 @@ class Method:
     :param make: makes the transfer method, not bound, of a pair's source or sources and the pair; None: no transfer. May raise
         :class:`DoesNotFit`
     :param finds_mapping: whether it finds a mapping by itself, so that it takes target steps until it has one
+    :param compiled_steps: steps of a run after which all that it needs is compiled and imported
     :param same_as: of a pair: name of another method that makes the same there, or None; it is then run once
     :param digest: of the file in which a third party defines it; "" for the package's own
     :raises ValueError: if the name has other characters than letters, digits, "-", "_" and "."
@@ -44,6 +59,7 @@ class Method:
     description: str
     make: Make
     finds_mapping: bool = False
+    compiled_steps: int = COMPILED_STEPS
     same_as: Callable[[Pair], str | None] | None = None
     digest: str = ""
 
@@ -83,6 +99,11 @@ def _timbrel(sources: Sources, pair: Pair) -> Transfer:
     return TIMBREL(the_one(sources, "TIMBREL"), pair.known_by_action)
 
 
+def _learned(method: Callable[[SourceInstances], Transfer]) -> Make:
+    """Make a method that learns its mapping from samples of one source and of the target."""
+    return lambda sources, pair: method(the_one(sources, method.__name__))
+
+
 def _same_as_factored(pair: Pair) -> str | None:
     """COMBREL by default is COMBREL with factored mappings, unless the pair needs mirrored variables."""
     return FACTORED if pair.mappings == "factored" else None
@@ -90,6 +111,14 @@ def _same_as_factored(pair: Pair) -> str | None:
 
 FACTORED = "COMBREL-factored"
 _FACHANTIDIS = 'Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection", 2015'
+_MASTER = 'Taylor, Kuhlmann & Stone, "Autonomous transfer for reinforcement learning", AAMAS 2008'
+_TALVITIE = 'Talvitie & Singh, "An experts algorithm for transfer learning", IJCAI 2007'
+_SORG = 'Sorg & Singh, "Transfer via soft homomorphisms", AAMAS 2009'
+_CODING = 'Ammar, Tuyls, Taylor, Driessens & Weiss, "Reinforcement learning transfer via sparse coding", AAMAS 2012'
+_RBM = (
+    'Ammar, Mocanu, Taylor, Driessens, Tuyls & Weiss, "Automatically mapped transfer between reinforcement learning tasks via '
+    'three-way restricted Boltzmann machines", ECML 2013'
+)
 _TAYLOR = 'Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning", ECML 2008'
 
 #: In the order of tables. Another method of this package is another line.
@@ -131,6 +160,41 @@ _METHODS: Sequence[Method] = (
         "COMBREL with factored mappings as a prior, mirrored ones too where the pair has such.",
         lambda sources, pair: COMBREL(sources, pair.mappings, use="prior"),
         finds_mapping=True,
+    ),
+    Method(
+        "MASTER",
+        f"The one mapping that predicts 100 random transitions best, as a prior ({_MASTER}).",
+        lambda sources, pair: MASTER(sources, pair.instance_mappings),
+        finds_mapping=True,
+        compiled_steps=DEFAULT_RANDOM_STEPS + COMPILED_STEPS,
+    ),
+    Method(
+        "experts",
+        f"The source's policy seen through mappings, ten at most, and the agent: a bandit chooses who acts ({_TALVITIE}).",
+        lambda sources, pair: MappingExperts(sources, pair.instance_mappings),
+        finds_mapping=True,
+    ),
+    Method(
+        "soft-homomorphism",
+        f"The source as a prior through a mixture of mappings that is fitted to the target ({_SORG}).",
+        lambda sources, pair: SoftHomomorphism(
+            the_one(sources, "SoftHomomorphism"), mirrored=pair.mappings.startswith("signed_")
+        ),
+        finds_mapping=True,
+    ),
+    Method(
+        "sparse-coding",
+        f"All source data through a mapping by sparse coding of 200 random transitions ({_CODING}).",
+        _learned(SparseCodingMapping),
+        finds_mapping=True,
+        compiled_steps=DEFAULT_SAMPLE_STEPS + COMPILED_STEPS,
+    ),
+    Method(
+        "three-way-RBM",
+        f"All source data through a three-way restricted Boltzmann machine of 200 random transitions ({_RBM}).",
+        _learned(ThreeWayRBM),
+        finds_mapping=True,
+        compiled_steps=DEFAULT_SAMPLE_STEPS + COMPILED_STEPS,
     ),
 )
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}

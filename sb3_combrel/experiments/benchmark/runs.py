@@ -22,8 +22,8 @@ from sb3_combrel.experiments.suite_runs import UNLIMITED, EpisodeRecorder
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.transfer.base import Transfer
 
-#: Steps after which what a run needs is compiled, or loaded from the cache.
-COMPILED_STEPS = 60
+# Limit of the episodes of a run that is made for compiling: some must end.
+COMPILED_EPISODE = 30
 # Pairs and methods that this process has learnt before.
 _COMPILED: set[tuple[str, str]] = set()
 
@@ -168,8 +168,8 @@ def _compile(job: BenchmarkJob) -> None:
     if key in _COMPILED:
         return
     with closing(job.pair.make_target()) as env:
-        model = job.make_model(gym.wrappers.TimeLimit(env, COMPILED_STEPS // 2), job.make_transfer())
-        model.learn(COMPILED_STEPS, log_interval=None)
+        model = job.make_model(gym.wrappers.TimeLimit(env, COMPILED_EPISODE), job.make_transfer())
+        model.learn(job.method.compiled_steps, log_interval=None)
     _COMPILED.add(key)
 
 

@@ -221,14 +221,14 @@ class TestFailures:
         row = {row["method"]: row for row in rows_of(folder / "two-walks.csv")}["picky"]
         assert row.pop("note") == "does not fit: it takes two to walk"
         assert set(row.values()) == {"picky", ""}
-        assert "two-walks, picky, seed 7000 does not fit: it takes two to walk" in printed
+        assert "two-walks, picky, seed 7000: does not fit: it takes two to walk" in printed
 
     def test_a_run_that_fails_has_its_error_in_the_table_and_the_others_go_on(self, failed):
         folder, printed, _ = failed
         rows = {row["method"]: row for row in rows_of(folder / "two-walks.csv")}
         assert rows["Sulking"]["note"] == "failed (seed 7000): RuntimeError: no \\| more"
         assert rows["TIMBREL"]["runs"] == rows["none"]["runs"] == "1"
-        assert "Sulking, seed 7000 failed: RuntimeError: no | more" in printed
+        assert "Sulking, seed 7000: failed: RuntimeError: no | more" in printed
         overview = rows_of(folder / "overview_2.csv")
         assert [row["two-walks"].split(" ")[0] for row in overview][1:3] == ["failed", ""]
         kept = json.loads((folder / RESULTS / "two-walks_sulking_seed7000.json").read_text())
