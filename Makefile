@@ -1,6 +1,7 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
 # make test    all tests, the slow ones too    make test-fast    unit tests, in a minute
 # make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
+# make build   wheel and source distribution in dist/   make smoke   install the wheel into an empty environment, and try it
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
 # make reproduce   the figures and tables of the COMBREL paper, with controls, in reproduction/; REPRODUCE_ARGS="fig2 --runs 2"
 # make results   takes what was reproduced, and the results of the benchmark, into README.md and docs/
@@ -37,7 +38,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build gl clean
+.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -131,7 +132,15 @@ check-codestyle: $(VENV)/.installed-all
 commit-checks: format type lint
 
 build: $(VENV)/.installed-all
+	rm -rf build dist
 	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*
+
+# Away from the clone, so that only what the wheel has installed can be imported.
+smoke: build
+	$(PYTHON) -m venv --clear $(VENV)-smoke
+	$(VENV)-smoke/bin/python -m pip --disable-pip-version-check install -q -c $(CONSTRAINTS) "$$(echo dist/*.whl)[all]"
+	cd "$$(mktemp -d)" && $(abspath $(VENV)-smoke)/bin/python $(abspath tests/helpers/smoke.py)
 
 # The source folder is that of the repository: see docs/conf.py.
 doc: $(VENV)/.installed-all
@@ -139,15 +148,15 @@ doc: $(VENV)/.installed-all
 	@echo "docs/_build/docs/index.html"
 
 clean:
-	rm -rf $(VENV) $(VENV)-oldest* build dist docs/_build *.egg-info
+	rm -rf $(VENV) $(VENV)-oldest* $(VENV)-smoke build dist docs/_build *.egg-info
 
 # An installation that was interrupted leaves no stamp and is done again; a changed pin or dependency renews it.
-$(VENV)/.installed-demo: pyproject.toml $(CONSTRAINTS)
+$(VENV)/.installed-demo: pyproject.toml sb3_combrel/version.txt $(CONSTRAINTS)
 	$(call make_venv)
 	$(call install,experiments)
 	@touch $@
 
-$(VENV)/.installed-all: pyproject.toml $(CONSTRAINTS)
+$(VENV)/.installed-all: pyproject.toml sb3_combrel/version.txt $(CONSTRAINTS)
 	$(call make_venv)
 	$(call install,all$(comma)dev)
 	@touch $(VENV)/.installed-demo $@

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import inspect
+import itertools
 import re
 import subprocess
 import sys
@@ -15,13 +16,18 @@ from helpers.pages import DOCS, ROOT, anchors, blocks, commands, links, name_of,
 from sb3_combrel import cli
 
 PAGES = pages()
-WITH_PYTHON = [page for page in PAGES if page.parent == DOCS and blocks(page.read_text(), "python")]
+# Run by tests/test_readme.py, and by tests/zoo/test_hub.py against a folder in place of the hub.
+RUN_ELSEWHERE = {"usage", "hub"}
+WITH_PYTHON = [
+    page for page in PAGES if page.parent == DOCS and page.stem not in RUN_ELSEWHERE and blocks(page.read_text(), "python")
+]
 WITH_COMMANDS = [page for page in PAGES if DOCS in page.parents and commands(page.read_text())]
 MAKEFILE = (ROOT / "Makefile").read_text()
 MODULES = {
     *(f"sb3_combrel.experiments.{name}" for name in ("suite", "breadths", "icub", "tutorials")),
     *("sb3_combrel.zoo", "sphinx"),
 }
+LOOPS = {"for", "done"}
 OTHER_PROGRAMS = {"pip", "ray", "dask", "tensorboard"}
 
 
@@ -87,6 +93,10 @@ def cli_without_work(monkeypatch):
 def test_commands_exist(page, cli_without_work):
     n_calls = 0
     for words in commands(page.read_text()):
+        while re.match(r"[A-Z_]+=", words[0]):
+            words = words[1:]
+        if words[0] in LOOPS:
+            continue
         if words[0] == "sb3-combrel":
             assert cli.main(words[1:]) == 0, words
             n_calls += 1
@@ -117,9 +127,14 @@ def check_module_call(module, words):
         assert options <= set(re.findall(r'"(--[\w-]+)"', source)), (module, words)
     if module == "sb3_combrel.zoo":
         from sb3_combrel.zoo import ALGORITHMS
+        from sb3_combrel.zoo.commands import FUNCTIONS, SCRIPTS
 
-        assert words[words.index("--algo") + 1] in ALGORITHMS, words
-        assert (ROOT / words[words.index("--conf-file") + 1]).is_file(), words
+        words = [word.replace("$algo", "combrel") for word in words]
+        assert words[0] in FUNCTIONS | SCRIPTS, words
+        algorithms = [name for option, name in itertools.pairwise(words) if option == "--algo"]
+        assert set(algorithms) <= set(ALGORITHMS) and len(algorithms) == ("-a" not in words), words
+        files = [name for option, name in itertools.pairwise(words) if option == "--conf-file"]
+        assert all((ROOT / name).is_file() for name in files) and len(files) == (words[0] == "train"), words
 
 
 def test_the_environments_exist():

@@ -1,8 +1,10 @@
 """What a user installs: the wheel's contents, its metadata, and what importing the package costs."""
 
+import os
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from importlib import metadata
@@ -15,6 +17,7 @@ import sb3_combrel
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 WHERE = {"sb3_combrel": ROOT / "sb3_combrel", "combrel_envs": ROOT / "envs" / "combrel_envs"}
+BESIDE = ["CHANGELOG.md", "CITATION.cff", "MANIFEST.in", "constraints.txt"]
 DATA = {"py.typed", "version.txt", "*.xml", "*.yml", "*.png", "*.LICENSE.md"}
 
 
@@ -27,6 +30,12 @@ def files_on_disk(package):
     }
 
 
+def metadata_of(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+        return archive.read(name).decode()
+
+
 def run_python(code, *options):
     done = subprocess.run([sys.executable, *options, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -34,20 +43,27 @@ def run_python(code, *options):
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
+def dist(tmp_path_factory):
+    """A folder with the source distribution, and the wheel that is built from it."""
     # Built from a copy: setuptools would leave its build folder in the repository.
     copy = tmp_path_factory.mktemp("source")
-    listed = ["pyproject.toml", "README.md", "LICENSE", *sorted(set().union(*map(files_on_disk, WHERE)))]
+    listed = [*BESIDE, "LICENSE", "README.md", "pyproject.toml", *sorted(set().union(*map(files_on_disk, WHERE)))]
     for name in listed:
         package, _, rest = name.partition("/")
         original = WHERE[package] / rest if rest else ROOT / name
         target = copy / original.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(original.read_bytes())
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", copy / "dist", copy]
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", copy / "dist", copy]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    (built,) = (copy / "dist").glob("*.whl")
+    assert "absent from the `packages` configuration" not in done.stderr
+    return copy / "dist"
+
+
+@pytest.fixture(scope="module")
+def wheel(dist):
+    (built,) = dist.glob("*.whl")
     return built
 
 
@@ -77,28 +93,44 @@ def test_the_wheel_contains_both_packages_with_their_data(wheel):
 
 
 @pytest.mark.integration
-def test_the_wheel_works_where_it_is_unpacked(wheel, tmp_path):
-    zipfile.ZipFile(wheel).extractall(tmp_path)
-    code = f"""
-        import sys; sys.path.insert(0, {str(tmp_path)!r})
-        import sb3_combrel, combrel_envs, gymnasium
-        assert sb3_combrel.__file__.startswith({str(tmp_path)!r}), sb3_combrel.__file__
-        assert combrel_envs.__file__.startswith({str(tmp_path)!r}), combrel_envs.__file__
-        gymnasium.make("combrel/MountainCar4D-v0").reset(seed=0)
-        combrel_envs.load("mountain_car", "climb_4d").reset()
-        combrel_envs.load("icub", "arm_strike").reset()
-        print(sb3_combrel.__version__)
-    """
-    assert run_python("\n".join(line.strip() for line in code.splitlines())).strip() == sb3_combrel.__version__
+def test_the_source_distribution_has_what_belongs_to_it_and_no_half_of_the_tests(dist):
+    (built,) = dist.glob("*.tar.gz")
+    with tarfile.open(built) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {*BESIDE, "LICENSE", "README.md", "pyproject.toml", "envs/combrel_envs/assets/icub_upper.xml"} <= names
+    assert not [name for name in names if name.startswith("tests")]
+
+
+@pytest.mark.integration
+def test_the_metadata_are_fit_for_an_index(dist):
+    pytest.importorskip("twine")
+    command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, dist.iterdir())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout.count("PASSED") == 2, done.stdout + done.stderr
+
+
+@pytest.mark.integration
+def test_the_wheel_works_where_it_is_installed(wheel, tmp_path):
+    """With the requirements of this environment; `make smoke` does the same in an empty one."""
+    site, away = tmp_path / "site", tmp_path / "away"
+    away.mkdir()
+    install = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--target", site, wheel]
+    done = subprocess.run(install, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    environment = {**os.environ, "PYTHONPATH": str(site), "MPLBACKEND": "Agg"}
+    command = [sys.executable, "-P", ROOT / "tests/helpers/smoke.py", site]
+    done = subprocess.run(command, cwd=away, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"sb3_combrel {sb3_combrel.__version__} works" in done.stdout
 
 
 @pytest.mark.integration
 def test_versions_agree(wheel):
     assert re.fullmatch(r"\d+\.\d+\.\d+\w*", sb3_combrel.__version__)
     assert f"-{sb3_combrel.__version__}-" in wheel.name
-    assert metadata.version("sb3-combrel") == sb3_combrel.__version__
+    assert f"\nVersion: {sb3_combrel.__version__}\n" in metadata_of(wheel)
     assert f"version: {sb3_combrel.__version__}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f"## Release {sb3_combrel.__version__} " in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\n## [{sb3_combrel.__version__}] - 20" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_the_command_is_installed():
@@ -110,6 +142,13 @@ def test_the_extras_are_those_of_the_documentation():
     assert set(PROJECT["project"]["optional-dependencies"]) == {
         *("envs", "icub", "minari", "zoo", "experiments", "tutorials", "ray", "dask", "docs", "dev", "all"),
     }
+
+
+def test_all_contains_every_extra_but_those_of_developers():
+    extras = PROJECT["project"]["optional-dependencies"]
+    (line,) = extras["all"]
+    named = set(re.fullmatch(r"sb3-combrel\[(.+)\]", line)[1].split(","))
+    assert named == set(extras) - {"all", "dev", "docs"}
 
 
 def test_constraints_pin_all_that_is_required():

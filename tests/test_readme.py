@@ -7,9 +7,12 @@ from pathlib import Path
 import gymnasium
 import pytest
 
+import combrel_envs
+
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 PAGES = [README, *(ROOT / "docs" / f"{name}.md" for name in ("installation", "usage", "rl_zoo", "hub", "limitations"))]
+SHORT_CAR = "ShortMountainCar4D-v0"
 RULES = "\n".join(re.findall(r"^([\w -]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)).split()
 
 
@@ -24,15 +27,17 @@ def python_of(page):
 def shortened(example):
     """The example with so few steps and seeds that it takes a moment."""
     short = re.sub(r"\b((?:total_time)?steps=|learn\()[\d_]{4,}", r"\g<1>100", example)
-    return short.replace("seeds=10", "seeds=2")
+    return short.replace("seeds=10", "seeds=2").replace('compare("combrel/MountainCar4D-v0"', f'compare("{SHORT_CAR}"')
 
 
 @pytest.fixture
-def empty_folder(tmp_path, monkeypatch):
+def folder_and_short_task(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SB3_COMBREL_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    return tmp_path
+    gymnasium.register(SHORT_CAR, gymnasium.spec("combrel/MountainCar4D-v0").entry_point, max_episode_steps=20)
+    yield tmp_path
+    del gymnasium.registry[SHORT_CAR]
 
 
 def run_examples(page):
@@ -44,16 +49,16 @@ def run_examples(page):
 
 
 @pytest.mark.integration
-def test_the_examples_of_the_readme_run(empty_folder, capsys):
+def test_the_examples_of_the_readme_run(folder_and_short_task, capsys):
     run_examples(README)
-    assert {"source.npz", "car.zip", "curves.png"} <= {path.name for path in empty_folder.iterdir()}
+    assert {"source.npz", "car.zip", "curves.png"} <= {path.name for path in folder_and_short_task.iterdir()}
     assert "Right on (x, vx)" in capsys.readouterr().out, "the mapping found is not shown by name"
 
 
 @pytest.mark.integration
-def test_the_examples_of_the_page_on_usage_run(empty_folder, capsys):
+def test_the_examples_of_the_page_on_usage_run(folder_and_short_task, capsys):
     run_examples(ROOT / "docs/usage.md")
-    assert {"source.npz", "car.zip", "logs"} <= {path.name for path in empty_folder.iterdir()}
+    assert {"source.npz", "car.zip", "logs"} <= {path.name for path in folder_and_short_task.iterdir()}
     assert "East: Right on (x, vx), Neutral on (y, vy)" in capsys.readouterr().out, "the mapping is not as the comment says"
 
 
@@ -113,8 +118,6 @@ def test_all_commands_are_in_the_table_of_commands():
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_the_environments_exist(page):
-    import combrel_envs
-
     for env_id in set(re.findall(r"combrel/\w+-v\d", page.read_text())):
         gymnasium.make(env_id).close()
     for domain, task in re.findall(r'combrel_envs\.load\("(\w+)", "(\w+)"\)', page.read_text()):

@@ -1,4 +1,4 @@
-"""RL-Zoo's commands for the Hugging Face hub, made to work with the versions that RL-Zoo itself installs, and with these algorithms."""
+"""RL-Zoo's commands for the Hugging Face hub, mended for the versions that it installs, and with cards of these algorithms."""
 
 from __future__ import annotations
 

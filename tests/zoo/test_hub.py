@@ -88,7 +88,11 @@ class TestByRLZoo:
     @pytest.fixture
     def trained(self, hub, tmp_path, source):
         source.save("source.npz")
-        entry = {"n_timesteps": 100, "transfer": {"sb3_combrel.COMBREL": {"source": "source.npz"}}}
+        entry = {
+            "policy": "FittedRMaxPolicy",
+            "n_timesteps": 100,
+            "transfer": {"sb3_combrel.COMBREL": {"source": "source.npz"}},
+        }
         Path("settings.yml").write_text(yaml.dump({BIG_CAR: entry}))
         arguments = ("--algo", "combrel", "--env", BIG_CAR, "--conf-file", "settings.yml", "--gym-packages", "combrel_envs")
         assert (
@@ -102,7 +106,7 @@ class TestByRLZoo:
         assert call("push_to_hub", *of_run, "-f", "logs", "-orga", "someone", "--no-render") == 0
         assert call("load_from_hub", *of_run, "-f", "downloaded", "-orga", "someone") == 0
         sent, received = (
-            FittedRMax.load(f"{folder}/combrel/combrel-MountainCar4D-v0_1/combrel-MountainCar4D-v0")
+            FittedRMax.load(f"{folder}/combrel/combrel-MountainCar4D-v0_1/combrel-MountainCar4D-v0.zip")
             for folder in ("logs", "downloaded")
         )
         same_parameters(sent, received)
