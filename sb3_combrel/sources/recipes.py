@@ -140,10 +140,10 @@ def _reason(file: Path) -> str:
 
 def fingerprint(env_id: str) -> str:
     """
-    Return a text that changes with an environment: its specification, the source files of its class, versions of packages.
+    Return a text that changes with an environment: with its specification and the source files of its class.
 
-    Of the class all base classes count, but for Gymnasium's own; and of the package that has it all modules that the modules of
-    these classes import by name, such as one of the dynamics.
+    All base classes count, but for Gymnasium's own, and all modules of the same package that these use, such as one of the
+    dynamics.
 
     :param env_id: id of an environment
     """

@@ -42,7 +42,9 @@ def with_evaluations(args: Sequence[str]) -> list[str]:
 
 
 def _evaluations(folders: Sequence[str], algo: str, env: str) -> list[Path]:
-    return [file for folder in folders for file in Path(folder, algo.lower()).glob("*/evaluations.npz") if env in file.parent.name]
+    return [
+        file for folder in folders for file in Path(folder, algo.lower()).glob("*/evaluations.npz") if env in file.parent.name
+    ]
 
 
 def check_window(args: Sequence[str]) -> list[str]:
