@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import inspect
 import json
 import os
 import re
+import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from sb3_combrel.sources.source_instances import SourceInstances
 
 CACHE_VARIABLE = "SB3_COMBREL_CACHE"
+RENEW_VARIABLE = "SB3_COMBREL_RENEW"
+RENEW = "renew"
 FITTED_RMAX = "fitted_rmax"
 LEARNERS = ("q_learning", FITTED_RMAX)
 DEFAULT_RECIPE: Mapping[str, Any] = {"n_instances": 1000, "total_timesteps": 30_000, "seed": 0}
+# Files that this process has learned or named: a study of a hundred trials says so once, and learns once.
+_SEEN: set[Path] = set()
 
 
 def check_source(source: Any) -> None:
@@ -78,26 +85,107 @@ def learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     """
     Learn a task by Q-learning or Fitted R-Max and return instances of it; read them from a file if that was done before.
 
+    A file is of a recipe and of what the environment was: with another class or other arguments, the task is learned again.
+    So it is with ``renew: true`` in the recipe, or SB3_COMBREL_RENEW=1 among the environment variables, once in a process.
+    What is used, and from when, is printed.
+
     Processes that start at the same time each learn the task, with the same seed and so with the same result; files are
     written completely or not at all.
 
     :param recipe: see :func:`find_source`
-    :raises ValueError: if the task cannot be learnt so
+    :raises ValueError: if the task cannot be learnt so, or ``renew`` is neither True nor False
     """
-    file = cache_file(recipe)
-    if file.is_file():
-        return SourceInstances.load(file)
     arguments = dict(recipe)
+    renew = arguments.pop(RENEW, False)
+    if not isinstance(renew, bool):
+        raise ValueError(f"{RENEW} must be true or false, got {renew!r}")
+    file = cache_file(recipe)
+    wanted_anew = (renew or os.environ.get(RENEW_VARIABLE, "0") not in ("", "0")) and file not in _SEEN
     env_id = arguments.pop("env")
     learner = arguments.pop("learner", "q_learning")
-    print(f"Learning the source task {env_id} by {learner}; kept in {file}")
+    if file.is_file() and not wanted_anew:
+        source = SourceInstances.load(file)
+        if file not in _SEEN:
+            _SEEN.add(file)
+            print(
+                f"Source task {env_id}: {len(source):,} instances learned by {learner} on {_time_of(file)}, from {file} "
+                f"({RENEW}: true in the recipe, or {RENEW_VARIABLE}=1, learns them again)"
+            )
+        return source
+    print(f"Learning the source task {env_id} by {learner}{_reason(file)}; kept in {file}")
     try:
         by_model = learner == FITTED_RMAX
         source = (SourceInstances.from_fitted_rmax if by_model else SourceInstances.from_q_learning)(env_id, **arguments)
     except (TypeError, gym.error.Error) as error:
         raise ValueError(f"the source task cannot be learnt by the recipe {dict(recipe)}: {error}") from error
     source.save(file)
+    _SEEN.add(file)
     return source
+
+
+def _time_of(file: Path) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(file.stat().st_mtime))
+
+
+def _reason(file: Path) -> str:
+    """Say why a task is learned although it was learned before; "" if it was not."""
+    if file.is_file():
+        return f" again, in place of what was learned on {_time_of(file)}"
+    recipe = file.stem.rpartition("-")[0]
+    before = sorted(file.parent.glob(f"{recipe}-*.npz"), key=lambda each: each.stat().st_mtime)
+    if not before:
+        return ""
+    return f" again: its class or its arguments have changed since {_time_of(before[-1])}"
+
+
+def fingerprint(env_id: str) -> str:
+    """
+    Return a text that changes with an environment: with its specification and the source files of its class.
+
+    All base classes count, but for Gymnasium's own, and all modules of the same package that these use, such as one of the
+    dynamics.
+
+    :param env_id: id of an environment
+    """
+    spec = task_spec(env_id)
+    if spec is None:
+        return ""
+    parts = [f"{spec.entry_point}", repr(sorted(spec.kwargs.items(), key=str)), f"{spec.max_episode_steps}"]
+    parts.append(repr(spec.additional_wrappers))
+    try:
+        made = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    except (ImportError, AttributeError):
+        return _digest(parts)
+    classes = inspect.getmro(made) if inspect.isclass(made) else (made,)
+    modules = {each.__module__ for each in classes} - {"builtins", "typing", "abc", "gymnasium.core"}
+    package = str(getattr(made, "__module__", "")).partition(".")[0]
+    parts += [_text_of(name) for name in sorted(modules | _imported(modules, package))]
+    return _digest(parts)
+
+
+def _imported(modules: set[str], package: str) -> set[str]:
+    """Modules of the same package that the given ones use, directly or not."""
+    found, open_ = set(), {name for name in modules if name.partition(".")[0] == package and package != "gymnasium"}
+    while open_:
+        module = sys.modules.get(open_.pop())
+        for value in list(vars(module).values()) if module is not None else []:
+            name = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None)
+            if isinstance(name, str) and name.partition(".")[0] == package and name not in found | modules:
+                found.add(name)
+                open_.add(name)
+    return found
+
+
+def _text_of(module: str) -> str:
+    file = getattr(sys.modules.get(module), "__file__", None)
+    try:
+        return Path(file).read_text() if file else module
+    except (OSError, UnicodeDecodeError):
+        return module
+
+
+def _digest(parts: Sequence[str]) -> str:
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
 
 
 def cache_file(recipe: Mapping[str, Any]) -> Path:
@@ -107,9 +195,9 @@ def cache_file(recipe: Mapping[str, Any]) -> Path:
     :param recipe: see :func:`learn_or_read`
     """
     folder = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "sb3_combrel")
-    text = json.dumps(dict(recipe), sort_keys=True, default=str)
+    text = json.dumps({key: value for key, value in recipe.items() if key != RENEW}, sort_keys=True, default=str)
     name = re.sub(r"\W+", "-", str(recipe["env"]))
-    return folder / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
+    return folder / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}-{fingerprint(str(recipe['env']))}.npz"
 
 
 def _check_recipe(recipe: Mapping[str, Any]) -> None:

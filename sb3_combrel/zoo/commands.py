@@ -11,7 +11,11 @@ from collections.abc import Sequence
 from typing import Any
 from unittest import mock
 
+from sb3_combrel.zoo.plot_checks import check_window, with_evaluations
+
 PROGRAM = "python -m sb3_combrel.zoo"
+NO_NETWORK = "the Hugging Face hub cannot be reached{advice}: {error}"
+ENVIRONMENT_MISSING = "{error}\nIf a package of yours registers it, name that: --gym-packages my_package"
 NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[zoo]'"
 OF_EXTRA = (
     *("rl_zoo3", "sb3_contrib", "optuna", "seaborn", "pytablewriter", "pandas", "matplotlib", "yaml"),
@@ -33,6 +37,8 @@ SCRIPTS = {
     "load_from_hub": "rl_zoo3.load_from_hub",
 }
 """Commands that are scripts and do their work as ``__main__`` only; they know no ``--gym-packages``."""
+CHECKS = {"all_plots": with_evaluations, "plot_train": check_window}
+"""What is checked before a command, which would draw nothing, or zeros, and say nothing."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -49,9 +55,11 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"usage: {PROGRAM} {{{','.join(FUNCTIONS | SCRIPTS)}}} ...   (each has --help)")
         return 0 if command in ("-h", "--help") else 2
     try:
+        if command in CHECKS:
+            rest = CHECKS[command](rest)
         return _run(command, rest)
-    except _what_users_cause() as error:
-        if _is_verbose(rest):
+    except Exception as error:
+        if _is_verbose(rest) or not (is_of_network(error) or isinstance(error, _what_users_cause())):
             raise
         print(f"sb3_combrel.zoo: {_message_of(error)}", file=sys.stderr)
         return 1
@@ -123,7 +131,25 @@ def _what_users_cause() -> tuple[type[Exception], ...]:
     return (*usual, YAMLError)
 
 
+def is_of_network(error: BaseException) -> bool:
+    """Return whether an error, or one that caused it, says that another machine cannot be reached."""
+    seen: BaseException | None = error
+    while seen is not None:
+        package = type(seen).__module__.partition(".")[0]
+        if isinstance(seen, ConnectionError) or package in ("requests", "httpx", "httpcore", "urllib3"):
+            return True
+        seen = seen.__cause__ or seen.__context__
+    return False
+
+
 def _message_of(error: Exception) -> str:
+    from gymnasium.error import NameNotFound, NamespaceNotFound
+
+    if is_of_network(error):
+        advice = " (benchmark does without it by --no-hub)"
+        return NO_NETWORK.format(advice=advice, error=" ".join(str(error).split()) or type(error).__name__)
+    if isinstance(error, NameNotFound | NamespaceNotFound):
+        return ENVIRONMENT_MISSING.format(error=error)
     if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in OF_EXTRA:
         return NEEDS_EXTRA.format(missing=error.name)
     return str(error) or type(error).__name__

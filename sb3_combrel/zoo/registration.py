@@ -14,6 +14,9 @@ ALGORITHMS = {
     "fitted_rmax": sample_fitted_rmax_params,
     "timbrel": sample_timbrel_params,
     "combrel": sample_combrel_params,
+    "master": sample_fitted_rmax_params,
+    "mapping_experts": sample_fitted_rmax_params,
+    "soft_homomorphism": sample_fitted_rmax_params,
 }
 """
 Names for ``--algo``, and the function that draws hyperparameters for each.

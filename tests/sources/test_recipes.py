@@ -1,5 +1,8 @@
 """Sources by name: files, ids of environments, recipes; and transfer methods that take them."""
 
+import os
+import time
+
 import gymnasium
 import numpy as np
 import pytest
@@ -20,6 +23,8 @@ def walk_task(monkeypatch, tmp_path):
     gymnasium.register(WALK, Walk)
     monkeypatch.setenv(recipes.CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(recipes, "DEFAULT_RECIPE", SHORT)
+    monkeypatch.setattr(recipes, "_SEEN", set())
+    monkeypatch.delenv(recipes.RENEW_VARIABLE, raising=False)
     yield
     del gymnasium.registry[WALK]
 
@@ -35,6 +40,83 @@ def test_a_task_is_learned_when_the_model_is_made_and_read_the_next_time(method,
     second = small(transfer=method(source))
     assert not capsys.readouterr().out
     assert_same(first.transfer.source, second.transfer.source)
+
+
+class OtherWalk(Walk):
+    """Another class with the same dynamics."""
+
+
+def in_another_process(monkeypatch):
+    monkeypatch.setattr(recipes, "_SEEN", set())
+
+
+def test_what_is_read_is_named_once_with_its_date(monkeypatch, tmp_path, capsys):
+    find_source(WALK)
+    (file,) = (tmp_path / "cache").iterdir()
+    os.utime(file, (0.0, time.mktime((2021, 3, 4, 5, 6, 0, 0, 0, -1))))
+    in_another_process(monkeypatch)
+    capsys.readouterr()
+    find_source(WALK)
+    printed = capsys.readouterr().out
+    assert f"{WALK}: 40 instances learned by q_learning on 2021-03-04 05:06, from {file}" in printed and "renew" in printed
+    find_source(WALK)
+    assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize("by", ["recipe", "variable"])
+def test_a_source_is_renewed_once_in_a_process(by, monkeypatch, tmp_path, capsys):
+    find_source(WALK)
+    (file,) = (tmp_path / "cache").iterdir()
+    some_source().save(file)
+    in_another_process(monkeypatch)
+    assert_same(find_source(WALK), some_source())
+    in_another_process(monkeypatch)
+    capsys.readouterr()
+    if by == "variable":
+        monkeypatch.setenv(recipes.RENEW_VARIABLE, "1")
+    source = {"env": WALK, "renew": True} if by == "recipe" else WALK
+    assert_same(find_source(source), SourceInstances.from_q_learning(WALK, **SHORT))
+    assert "again, in place of what was learned on" in capsys.readouterr().out
+    some_source().save(file)
+    assert_same(find_source(source), some_source())
+    assert [file] == list((tmp_path / "cache").iterdir())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [dict(entry_point=OtherWalk), dict(entry_point=Walk, kwargs={"limit": 7}), dict(entry_point=Walk, max_episode_steps=9)],
+    ids=["class", "arguments", "limit"],
+)
+def test_another_class_or_other_arguments_are_noticed(change, capsys):
+    before = recipes.cache_file({"env": WALK})
+    find_source(WALK)
+    capsys.readouterr()
+    del gymnasium.registry[WALK]
+    gymnasium.register(WALK, **change)
+    assert recipes.cache_file({"env": WALK}) != before
+    if "kwargs" not in change:
+        find_source(WALK)
+        assert "again: its class or its arguments have changed since 20" in capsys.readouterr().out
+
+
+def test_a_changed_module_of_the_dynamics_is_noticed(tmp_path, monkeypatch):
+    package = tmp_path / "own_walks"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "dynamics.py").write_text("STRIDE = 1\n")
+    (package / "walk.py").write_text("from own_walks import dynamics\nclass OwnWalk:\n    stride = dynamics.STRIDE\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    del gymnasium.registry[WALK]
+    gymnasium.register(WALK, "own_walks.walk:OwnWalk")
+    before = recipes.fingerprint(WALK)
+    assert recipes.fingerprint(WALK) == before
+    (package / "dynamics.py").write_text("STRIDE = 2\n")
+    assert recipes.fingerprint(WALK) != before
+
+
+def test_renew_is_yes_or_no():
+    with pytest.raises(ValueError, match="renew must be true or false, got 'often'"):
+        find_source({"env": WALK, "renew": "often"})
 
 
 def test_files_tasks_and_instances_may_be_listed_together(tmp_path):

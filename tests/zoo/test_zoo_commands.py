@@ -152,6 +152,17 @@ class TestTransfer:
         (model_file,) = tmp_path.glob(f"{algo}/*/*.zip")
         assert len(FittedRMax.load(model_file).policy.transfer.source) == 50
 
+    @pytest.mark.parametrize("algo", ["master", "mapping_experts", "soft_homomorphism"])
+    def test_the_configurations_of_the_other_methods_run(self, tmp_path, algo):
+        conf = tmp_path / "short.yml"
+        entry = yaml.safe_load((CONFIGS / f"{algo}.yml").read_text())[BIG_CAR]
+        ((method, arguments),) = entry["transfer"].items()
+        entry["transfer"] = {method: {**arguments, "source": RECIPE}}
+        conf.write_text(yaml.dump({BIG_CAR: entry}))
+        assert call("train", *train_args(tmp_path, "--eval-freq", -1, algo=algo, env=BIG_CAR, conf=conf, n=60)) == 0
+        (model_file,) = tmp_path.glob(f"{algo}/*/*.zip")
+        assert type(FittedRMax.load(model_file).policy.transfer).__name__ == method.rpartition(".")[2]
+
     def test_a_source_task_is_learnt_once_and_then_read(self, capsys):
         from sb3_combrel.zoo.sources import find_source
 
@@ -252,6 +263,33 @@ class TestTablesAndPictures:
         assert call("all_plots", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs, *options) == 0
         assert "FITTED_RMAX" in capsys.readouterr().out
         assert (tmp_path / "all.pkl").exists()
+
+    def test_a_method_that_was_not_trained_is_named_and_left_out(self, logs, capsys):
+        options = ("-e", "combrel-MountainCar2D-v0", "-f", logs, "--no-display")
+        assert call("all_plots", "-a", "fitted_rmax", "timbrel", *options) == 0
+        printed = capsys.readouterr()
+        assert "timbrel has no evaluations of combrel-MountainCar2D-v0" in printed.err
+        assert "FITTED_RMAX" in printed.out and "TIMBREL" not in printed.out
+        assert call("all_plots", "-a", "timbrel", *options) == 1
+        assert "nothing to plot" in capsys.readouterr().err
+
+    def test_runs_shorter_than_the_window_are_named(self, logs, capsys):
+        assert call("plot_train", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs, "-w", 10**6) == 1
+        written = capsys.readouterr().err
+        assert "fewer than the window of 1000000" in written and "nothing to plot" in written
+
+    @pytest.mark.parametrize("command", ["benchmark", "load_from_hub"])
+    def test_a_hub_that_cannot_be_reached_is_a_sentence(self, tmp_path, capsys, monkeypatch, command):
+        def refuse(*args, **kwargs):
+            raise RuntimeError("no answer") from ConnectionError("refused")
+
+        monkeypatch.setattr("rl_zoo3.utils.get_hf_trained_models", refuse)
+        monkeypatch.setattr("huggingface_sb3.load_from_hub", refuse)
+        options = {"benchmark": ("--log-dir", tmp_path, "--benchmark-dir", tmp_path)}
+        options["load_from_hub"] = ("--algo", "combrel", "--env", CAR, "-f", tmp_path, "-orga", "nobody")
+        assert call(command, *options[command]) == 1
+        written = capsys.readouterr().err
+        assert written.startswith("sb3_combrel.zoo: the Hugging Face hub cannot be reached") and "Traceback" not in written
 
     @pytest.mark.slow
     @pytest.mark.parametrize("mode", [("--test-mode",), ("--verbose", 2)])
