@@ -94,7 +94,9 @@ class SampleTransfer(MappingTransfer):
         if max_transitions < min_transitions:
             raise ValueError(f"max_transitions must be at least min_transitions={min_transitions}, got {max_transitions}")
         if is_factored(mappings):
-            raise ValueError(f"mappings must be a set whose members are tasks to draw from, no factored ones, got {mappings!r}")
+            raise ValueError(
+                f"mappings must be a set whose members are tasks to draw from, no factored ones, got {mappings!r}"
+            )
         super().__init__(
             source,
             mappings,
@@ -162,7 +164,9 @@ class SampleTransfer(MappingTransfer):
         assert self.task is not None
         self.drawn = drawn
         breadth = self._translator.rules.breadth
-        self._translator = self._make_translator(self.candidates.with_own(instances_of_each(self.candidates, drawn)), self.task)
+        self._translator = self._make_translator(
+            self.candidates.with_own(instances_of_each(self.candidates, drawn)), self.task
+        )
         self._translator.set_breadth(breadth)
 
     # --------------------------------------------------------------- describing

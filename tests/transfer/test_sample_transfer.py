@@ -71,9 +71,7 @@ def eq_6(transitions, source, mapping, starts):
     """The compliance of one virtual source task by the equations; ``starts``: bandwidth by number of mapped variables."""
     bandwidths = Bandwidths(starts(mapping), *BANDWIDTHS[1:])
     return equations.task_compliance(
-        equations.sample_compliance(
-            as_sample(transitions), as_transitions(source), mapping, bandwidths, DEFAULT_MIN_EVIDENCE
-        )
+        equations.sample_compliance(as_sample(transitions), as_transitions(source), mapping, bandwidths, DEFAULT_MIN_EVIDENCE)
     )
 
 
@@ -241,7 +239,9 @@ def test_nothing_is_transferred_before_the_first_draw_and_draws_follow_growth():
 
 def test_more_of_what_is_drawn_stays_than_with_other_random_numbers():
     method = observed(
-        SampleTransfer(source_of(n=200), n_instances=100, min_transitions=100), transitions_of(100), naive.target_task(POINTS, 2)
+        SampleTransfer(source_of(n=200), n_instances=100, min_transitions=100),
+        transitions_of(100),
+        naive.target_task(POINTS, 2),
     )
     before = {tuple(row) for row in method.drawn.tolist()}
     for transition in transitions_of(20, seed=9):
