@@ -47,7 +47,7 @@ class SampleTransfer(MappingTransfer):
       ``min_transitions`` and ``max_transitions`` equal they are drawn once.
     - As in COMBREL, a transition complies with no task whose instances are all far from it.
 
-    What to expect: where tasks differ in one action or in one pair of variables, as mappings do, their mean compliances over all
+    What to expect: where tasks differ in one action or one pair of variables, as mappings do, their mean compliances over all
     transitions differ little, and many instances come through wrong mappings. COMBREL chooses by state and action instead.
     The number of instances does not depend on whether any task complies well: sources of no use are transferred too.
 
