@@ -13,6 +13,7 @@ from sb3_combrel.tensorboard.explain import explain
 from sb3_combrel.transfer.combrel import COMBREL
 from sb3_combrel.transfer.experts import MappingExperts
 from sb3_combrel.transfer.master import MASTER
+from sb3_combrel.transfer.sample_transfer import SampleTransfer
 from sb3_combrel.transfer.soft_homomorphism import SoftHomomorphism
 from sb3_combrel.transfer.sparse_coding import SparseCodingMapping
 from sb3_combrel.transfer.three_way_rbm import ThreeWayRBM
@@ -35,6 +36,7 @@ __all__ = [
     "InterTaskMapping",
     "MappingExperts",
     "MappingSet",
+    "SampleTransfer",
     "SoftHomomorphism",
     "SourceInstances",
     "SparseCodingMapping",

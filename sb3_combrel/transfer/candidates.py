@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -176,6 +177,17 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.origins)
+
+    def with_own(self, instances: Instances) -> Candidates:
+        """
+        Return the same candidates, each with instances of its own to translate, in place of those of its source action.
+
+        :param instances: those of "action" c are candidate c's, in coordinates of its source
+        """
+        made = copy.copy(self)
+        made.instances = instances
+        made.arrays = self.arrays._replace(action=np.arange(len(self), dtype=np.int64))
+        return made
 
     def find(self, action: int, mapping: InterTaskMapping) -> int:
         """Return the candidate that a mapping to the first source amounts to for one target action."""

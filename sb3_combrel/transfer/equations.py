@@ -261,6 +261,10 @@ def near_relevances(with_target: Floats, evidence: Floats) -> Floats:
     is known of all instances, which counts as one transition at the same place. So one without near transitions is as
     relevant as the instances are on average: it comes after those that are borne out and before those that are contradicted.
 
+    Measured with COMBREL on MountainCar4D (instances through "injective", ``degree=0``, breadth 0.1, 12 episodes, 3 seeds): in
+    the order of distance 3,209, 3,444 and 3,201 steps; of Eq. 7 11,357, 8,259 and 5,918; of this one times the weight 3,224,
+    3,084 and 3,257.
+
     :param with_target: lambda_{T,sigma_j}, shape (m,)
     :param evidence: e_j = sum_i phi(d_ij) with delta_sa, the weights w_ji before they are normalised, same shape
     :return: values in [0, 1], same shape; 1 for all where there is no evidence at all

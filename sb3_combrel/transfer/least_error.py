@@ -64,18 +64,18 @@ def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float,
         row = int(of_row.argmin())
         return float(of_row[row]), row, errors[row].argmin(axis=1)
     if pairs is not None:
-        actions = _action_table(mappings.actions, pairs[:, 1].tolist())
+        actions = action_table(mappings.actions, pairs[:, 1].tolist())
         of_member = errors[pairs[:, :1], each_action, actions].sum(axis=1)
         best = int(of_member.argmin())
         return float(of_member[best]), int(pairs[best, 0]), actions[best]
-    actions = _action_table(mappings.actions, range(mappings.n_action_mappings))
+    actions = action_table(mappings.actions, range(mappings.n_action_mappings))
     totals = np.array([of_row[each_action, actions].sum(axis=1) for of_row in errors])
     row, number = divmod(int(totals.argmin()), totals.shape[1])
     return float(totals[row, number]), row, actions[number]
 
 
-def _action_table(actions: ActionMappings, numbers: Sequence[int]) -> np.ndarray:
-    """Some action mappings, one a row: source action of each target action."""
+def action_table(actions: ActionMappings, numbers: Sequence[int]) -> np.ndarray:
+    """Return some action mappings, one a row: source action of each target action, int64, shape (n, n_target_actions)."""
     return np.array([actions[number] for number in numbers], dtype=np.int64)
 
 

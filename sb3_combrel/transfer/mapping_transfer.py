@@ -6,7 +6,7 @@ import warnings
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -79,6 +79,9 @@ class MappingTransfer(Transfer):
 
     renamed_arguments = RENAMED_ARGUMENTS
 
+    #: Whether relevance, where it is asked for, is the order in which instances are added.
+    ranks_by_relevance: ClassVar[bool] = True
+
     def __init__(
         self,
         source: SourceLike,
@@ -147,14 +150,8 @@ class MappingTransfer(Transfer):
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         self._choose_bandwidths()
         self._transitions = RecordedTransitions(task.n_variables)
-        self._translator = Translator(
-            self.candidates,
-            task,
-            breadth=float(self.breadth),
-            transfer_terminals=self.transfer_terminals,
-            by_relevance=bool(self.relevance),
-            times_weight=self.relevance == NEAR,
-        )
+        self._by_relevance = bool(self.relevance) and self.ranks_by_relevance
+        self._translator = self._make_translator(self.candidates, task)
         self._selector = self._make_selector(task)
         self._last_selected: Ranges = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         self._last_state = np.empty(0)
@@ -187,6 +184,17 @@ class MappingTransfer(Transfer):
         else:
             self._bandwidths = Bandwidths(*self.bandwidths)
             self._starts = np.full(len(self.candidates.table.variable), self._bandwidths.start)
+
+    def _make_translator(self, candidates: Candidates, task: TargetTask) -> Translator:
+        """Make the translator of the instances of some candidates."""
+        return Translator(
+            candidates,
+            task,
+            breadth=float(self.breadth),
+            transfer_terminals=self.transfer_terminals,
+            by_relevance=self._by_relevance,
+            times_weight=self._by_relevance and self.relevance == NEAR,
+        )
 
     @abstractmethod
     def _make_selector(self, task: TargetTask) -> Selector:
@@ -247,10 +255,10 @@ class MappingTransfer(Transfer):
             self._errors.note(state, action, effect, predicted)
         selector = self._selector
         selector.before_transition()
-        if (self.relevance or selector.needs_transitions) and selector.takes_transitions():
+        if (self._by_relevance or selector.needs_transitions) and selector.takes_transitions():
             selector.add_transition(self._transitions.add(state, action, reward, effect))
             n_used = selector.n_used()
-            if self.relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
+            if self._by_relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
                 self._renew_relevance(n_used)
 
     def end_episode(self, truncated: bool) -> None:
@@ -267,7 +275,7 @@ class MappingTransfer(Transfer):
         if self._check.end_episode(truncated) and self.breadth_decay < 1.0:
             self._translator.set_breadth(self._translator.rules.breadth * self.breadth_decay)
             self._all_changed = True
-        if self._selector.end_episode() and self.relevance:
+        if self._selector.end_episode() and self._by_relevance:
             self._renew_relevance(self._selector.n_used())
 
     def note_use(self, transferred: TransferredInstances) -> None:
@@ -281,14 +289,17 @@ class MappingTransfer(Transfer):
             self._instances_used += n
 
     def _renew_relevance(self, n_used: int) -> None:
-        mu, values = float(self.relevance_fraction), self._translator.relevance
+        self._measure_relevance(n_used, self._translator.relevance)
+        self._n_of_relevance = n_used
+
+    def _measure_relevance(self, n_used: int, values: np.ndarray) -> None:
+        """Write to ``values`` the relevance of each candidate's instances to the first ``n_used`` recorded transitions."""
         bandwidths = self._bandwidths, self._starts
         given = self.candidates, self._transitions, n_used, bandwidths, self._periodic
         if self.relevance == NEAR:
             renew_near_relevance(*given, values)
         else:
-            renew_relevance(*given, mu, values)
-        self._n_of_relevance = n_used
+            renew_relevance(*given, float(self.relevance_fraction), values)
 
     # --------------------------------------------------------------- describing
 
@@ -446,7 +457,7 @@ class MappingTransfer(Transfer):
         self._check.set_state(state["check"])
         self._n_steps = int(state["errors"][0])
         self._errors.sums.ravel()[:] = state["errors"][1:]
-        if self.relevance and self._selector.n_used():
+        if self._by_relevance and self._selector.n_used():
             self._renew_relevance(self._selector.n_used())
 
 

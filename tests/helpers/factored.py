@@ -119,7 +119,7 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     weights = np.exp(-(squared - squared[0]) * scale)
     x, e = states[near], effects[near]
     mean_x, mean_e = np.average(x, axis=0, weights=weights), np.average(e, axis=0, weights=weights)
-    ridge = 0.01 / scale
+    ridge = RIDGE / scale
     root = np.sqrt(weights)[:, None]
     design = np.vstack([root * (x - mean_x), np.sqrt(ridge) * np.eye(len(at))])
     wanted = np.vstack([root * (e - mean_e), np.zeros((len(at), e.shape[1]))])

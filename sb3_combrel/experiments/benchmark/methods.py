@@ -13,6 +13,7 @@ from sb3_combrel import (
     TIMBREL,
     FactoredMapping,
     MappingExperts,
+    SampleTransfer,
     SoftHomomorphism,
     SourceInstances,
     SparseCodingMapping,
@@ -113,6 +114,7 @@ FACTORED = "COMBREL-factored"
 _FACHANTIDIS = 'Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection", 2015'
 _MASTER = 'Taylor, Kuhlmann & Stone, "Autonomous transfer for reinforcement learning", AAMAS 2008'
 _TALVITIE = 'Talvitie & Singh, "An experts algorithm for transfer learning", IJCAI 2007'
+_LAZARIC = 'Lazaric, Restelli & Bonarini, "Transfer of samples in batch reinforcement learning", ICML 2008'
 _SORG = 'Sorg & Singh, "Transfer via soft homomorphisms", AAMAS 2009'
 _CODING = 'Ammar, Tuyls, Taylor, Driessens & Weiss, "Reinforcement learning transfer via sparse coding", AAMAS 2012'
 _RBM = (
@@ -173,6 +175,20 @@ _METHODS: Sequence[Method] = (
         f"The source's policy seen through mappings, ten at most, and the agent: a bandit chooses who acts ({_TALVITIE}).",
         lambda sources, pair: MappingExperts(sources, pair.instance_mappings),
         finds_mapping=True,
+    ),
+    Method(
+        "sample-transfer",
+        f"1000 instances of all sources through all mappings, drawn by the compliance of tasks and by relevance ({_LAZARIC}).",
+        lambda sources, pair: SampleTransfer(sources, pair.instance_mappings),
+        finds_mapping=True,
+        compiled_steps=2 * COMPILED_STEPS,
+    ),
+    Method(
+        "sample-transfer-near",
+        "The same with a relevance that does not favour instances far from the target's transitions.",
+        lambda sources, pair: SampleTransfer(sources, pair.instance_mappings, relevance="near"),
+        finds_mapping=True,
+        compiled_steps=2 * COMPILED_STEPS,
     ),
     Method(
         "soft-homomorphism",

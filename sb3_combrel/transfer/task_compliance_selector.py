@@ -1,0 +1,82 @@
+"""The selector of transfer of samples: all drawn instances, and the compliance of every virtual source task meanwhile."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.compliance import ComplianceScratch, transition_compliance_plain
+from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.selectors import PooledSelector
+
+_transition_compliance = EntryPoint(transition_compliance_plain)
+
+
+class TaskComplianceSelector(PooledSelector):
+    """
+    Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
+
+    Parameters: see :class:`~sb3_combrel.transfer.selectors.Selector`, and
+
+    :param bandwidths: of compliance
+    :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
+    :param max_transitions: how many are recorded
+    """
+
+    needs_transitions = True
+
+    def __init__(
+        self,
+        candidates: Candidates,
+        task: TargetTask,
+        transitions: RecordedTransitions,
+        rng: np.random.Generator,
+        bandwidths: Bandwidths,
+        starts: np.ndarray,
+        max_transitions: int,
+    ):
+        super().__init__(candidates, task, transitions, rng)
+        self.max_transitions = max_transitions
+        n_rows, n_source_actions = len(candidates.table.variable), len(candidates.instances.size)
+        #: Compliances of transitions added up, by state mapping, target action and source action, of all sources.
+        self.sums = np.zeros((n_rows, task.n_actions, n_source_actions))
+        self._table = np.empty((n_rows, n_source_actions))
+        scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances, starts, periodic=task.periodic)
+        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
+        source, mappings = tuple(candidates.instances), tuple(candidates.table)
+        self._measuring = source, mappings, tuple(bandwidths), tuple(scratch), self._table
+
+    def takes_transitions(self) -> bool:
+        return self.transitions.n < self.max_transitions
+
+    def add_transition(self, i: int) -> None:
+        seen = self.transitions
+        _transition_compliance.call(seen.states[i], seen.effects[i], float(seen.rewards[i]), *self._measuring)
+        self.sums[:, int(seen.actions[i])] += self._table
+
+    def task_compliance(self, source: int, mapping: InterTaskMapping) -> float:
+        """
+        Return the compliance of a virtual source task, Lambda_X of Eq. 6; 0 before the first transition.
+
+        :param source: number of the source
+        :param mapping: from the target to it
+        :raises ValueError: if the set has no such state mapping
+        """
+        sets, sources = self.candidates.sets, self.candidates.sources
+        mappings = sets[source]
+        same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
+        rows = np.flatnonzero(same.all(axis=1))
+        if len(rows) == 0:
+            raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
+        row = int(rows[0]) + sum(each.n_state_mappings for each in sets[:source])
+        actions = np.array(mapping.action) + sum(each.n_actions for each in sources[:source])
+        of_actions = self.sums[row, np.arange(len(actions)), actions]
+        return float(of_actions.sum() / max(self.transitions.n, 1))
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        for i in range(self.transitions.n):
+            self.add_transition(i)
