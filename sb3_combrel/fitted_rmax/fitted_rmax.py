@@ -295,8 +295,8 @@ class FittedRMax(PersistentAlgorithm):
         :param total_timesteps: environment steps, of all environments together
         :param callback: callback(s) called at every step
         :param log_interval: episodes between two logs; None for none
-        :param tb_log_name: the name of the run for TensorBoard logging, which Stable-Baselines3 numbers. None: with the transfer
-            method and the seed, so that runs can be told apart, such as ``FittedRMax_COMBREL_seed3``
+        :param tb_log_name: the name of the run for TensorBoard logging, which Stable-Baselines3 numbers. None: with the
+            transfer method and the seed, so that runs can be told apart, such as ``FittedRMax_COMBREL_seed3``
         :param reset_num_timesteps: whether to count steps from 0 again (what was learned is kept in any case)
         :param progress_bar: display a progress bar using tqdm and rich
         :raises ValueError: if an argument is out of its range, or the environment returns something that is not finite

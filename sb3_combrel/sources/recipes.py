@@ -165,7 +165,8 @@ def fingerprint(env_id: str) -> str:
 
 def _imported(modules: set[str], package: str) -> set[str]:
     """Modules of the same package that the given ones use, directly or not."""
-    found, open_ = set(), {name for name in modules if name.partition(".")[0] == package and package != "gymnasium"}
+    found: set[str] = set()
+    open_ = {name for name in modules if name.partition(".")[0] == package and package != "gymnasium"}
     while open_:
         module = sys.modules.get(open_.pop())
         for value in list(vars(module).values()) if module is not None else []:

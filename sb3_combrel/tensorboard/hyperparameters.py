@@ -60,6 +60,7 @@ def all_settings(model: FittedRMax) -> dict[str, Plain | None]:
 
 
 def _subclasses(kind: type) -> Iterator[type]:
+    each: type
     for each in kind.__subclasses__():
         yield each
         yield from _subclasses(each)

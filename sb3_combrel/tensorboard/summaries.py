@@ -1,4 +1,4 @@
-"""Records of TensorBoard's event files: several scalars in one, and the settings of a run. Importing this imports TensorBoard."""
+"""Records of TensorBoard's event files: several scalars in one, and the settings of a run. This imports TensorBoard."""
 
 from __future__ import annotations
 

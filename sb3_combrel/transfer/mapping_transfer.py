@@ -313,7 +313,7 @@ class MappingTransfer(Transfer):
 
     def describe_prior(self) -> str:
         """
-        Say what the source is taken for, with ``use="prior"``: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
+        Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
 
         Target variables are named first, then the source variables that they are taken for, where these have other names.
 

@@ -112,5 +112,6 @@ def instances_of_each(candidates: Candidates, drawn: np.ndarray) -> Instances:
     """
     source, (candidate, number) = candidates.instances, drawn.T
     action = candidates.arrays.action[candidate]
-    columns = (column[action, number] for column in (source.state, source.effect, source.reward, source.terminated))
-    return Instances.of_rows(len(candidates), candidate, *columns, source.periodic)
+    at = action, number
+    columns = source.state[at], source.effect[at], source.reward[at], source.terminated[at]
+    return Instances.of_rows(len(candidates), candidate, *columns, periodic=source.periodic)

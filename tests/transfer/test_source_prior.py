@@ -319,7 +319,9 @@ def test_angles_go_around():
     transfer.bind(task, rng)
     for state, action, after in zip(turned, actions.tolist(), next_states, strict=True):
         transfer.observe(state, action, -1.0, after, False)
-    assert transfer.describe_prior() == "a0: Wait on (s0, s1); a1: Down on (s0, s1); a2: Up on (s0, s1)"
+    assert transfer.describe_prior() == (
+        "a0: Wait on (s0, s1) as (x, v); a1: Down on (s0, s1) as (x, v); a2: Up on (s0, s1) as (x, v)"
+    )
     inner, actions = inside(100, 2, 3)
     for turns in (0.0, 1.0, -1.0):
         found = transfer.prior(np.column_stack([(inner[:, 0] + 0.5) % 1.0 + turns, inner[:, 1]]), actions)
@@ -365,8 +367,8 @@ def test_it_says_which_copies_each_action_moves():
     assert (transfer.choices() == -1).all() and transfer.mapping_counts() == []
     show(transfer, f.walk(TWO, 300))
     assert transfer.describe_prior() == (
-        "a0: Wait on (s0, s2), Wait on (s1, s3); a1: Down on (s0, s2), Wait on (s1, s3); "
-        "a2: Up on (s0, s2), Wait on (s1, s3); a3: Wait on (s0, s2), Down on (s1, s3); a4: Wait on (s0, s2), Up on (s1, s3)"
+        "a0: Wait on (s0, s2) as (x, v), Wait on (s1, s3) as (x, v); a1: Down on (s0, s2) as (x, v), Wait on (s1, s3) as (x, v); "
+        "a2: Up on (s0, s2) as (x, v), Wait on (s1, s3) as (x, v); a3: Wait on (s0, s2) as (x, v), Down on (s1, s3) as (x, v); a4: Wait on (s0, s2) as (x, v), Up on (s1, s3) as (x, v)"
     )
     [first, *_] = transfer.choices().reshape(5, -1)[3]
     assert transfer.candidate(first) == (3, "Wait + Down", "(s0, s2) + (s1, s3)", ())
