@@ -366,9 +366,10 @@ def test_it_says_which_copies_each_action_moves():
     assert transfer.describe_prior().startswith("a0: nothing; a1: nothing")
     assert (transfer.choices() == -1).all() and transfer.mapping_counts() == []
     show(transfer, f.walk(TWO, 300))
+    first, second = "on (s0, s2) as (x, v)", "on (s1, s3) as (x, v)"
     assert transfer.describe_prior() == (
-        "a0: Wait on (s0, s2) as (x, v), Wait on (s1, s3) as (x, v); a1: Down on (s0, s2) as (x, v), Wait on (s1, s3) as (x, v); "
-        "a2: Up on (s0, s2) as (x, v), Wait on (s1, s3) as (x, v); a3: Wait on (s0, s2) as (x, v), Down on (s1, s3) as (x, v); a4: Wait on (s0, s2) as (x, v), Up on (s1, s3) as (x, v)"
+        f"a0: Wait {first}, Wait {second}; a1: Down {first}, Wait {second}; a2: Up {first}, Wait {second}; "
+        f"a3: Wait {first}, Down {second}; a4: Wait {first}, Up {second}"
     )
     [first, *_] = transfer.choices().reshape(5, -1)[3]
     assert transfer.candidate(first) == (3, "Wait + Down", "(s0, s2) + (s1, s3)", ())
