@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from helpers.naive_local_linear import RIDGE
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.mappings.state_mappings import copies_of_source
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.copies import Copies
 from sb3_combrel.transfer.copy_sums import CopySums
-from helpers.naive_local_linear import RIDGE
 
 # x' = x + SLOPES x + PUSH[u], unit coordinates: an oscillator that is left alone, pushed down or pushed up.
 SLOPES = np.array([[0.0, 0.15], [-0.12, -0.03]])

@@ -9,7 +9,6 @@ from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import random_source, target_task
 from helpers.ring import Ring
 from helpers.walk import Walk, same_parameters, small, walk_source
-
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel import (
