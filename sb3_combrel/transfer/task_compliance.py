@@ -112,5 +112,6 @@ def instances_of_each(candidates: Candidates, drawn: np.ndarray) -> Instances:
     """
     source, (candidate, number) = candidates.instances, drawn.T
     action = candidates.arrays.action[candidate]
-    columns = (column[action, number] for column in (source.state, source.effect, source.reward, source.terminated))
-    return Instances.of_rows(len(candidates), candidate, *columns, source.periodic)
+    state, effect = source.state[action, number], source.effect[action, number]
+    reward, terminated = source.reward[action, number], source.terminated[action, number]
+    return Instances.of_rows(len(candidates), candidate, state, effect, reward, terminated, source.periodic)
