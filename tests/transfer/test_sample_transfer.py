@@ -237,20 +237,15 @@ def test_nothing_is_transferred_before_the_first_draw_and_draws_follow_growth():
     assert len(method.drawn_counts()) == figures["transfer/candidates_drawn"]
 
 
-def test_more_of_what_is_drawn_stays_than_with_other_random_numbers():
-    method = observed(
-        SampleTransfer(source_of(n=200), n_instances=100, min_transitions=100),
-        transitions_of(100),
-        naive.target_task(POINTS, 2),
-    )
+def test_most_of_what_is_drawn_by_compliance_alone_stays_when_there_are_a_few_more_transitions():
+    method = SampleTransfer(source_of(n=200), n_instances=100, min_transitions=100, relevance=False)
+    observed(method, transitions_of(100), naive.target_task(POINTS, 2))
     before = {tuple(row) for row in method.drawn.tolist()}
     for transition in transitions_of(20, seed=9):
         show(method, transition)
     after = {tuple(row) for row in method.drawn.tolist()}
     assert method.statistics()["transfer/draws"] == 2
-    method._seed += 1
-    other = {tuple(row) for row in method._drawn_by(120).tolist()}
-    assert len(before & after) > 1.5 * len(before & other)
+    assert len(before & after) > 0.8 * len(after)
 
 
 def test_more_is_drawn_from_the_source_that_complies_and_through_the_mapping_that_does():
@@ -286,7 +281,7 @@ def test_it_helps_on_the_walk():
     assert model.policy.transfer.statistics()["transfer/instances_used"] > 0
 
 
-@pytest.mark.parametrize("arguments", [{}, {"relevance": "near"}, {"relevance": False}, {"min_transitions": 500}], ids=repr)
+@pytest.mark.parametrize("arguments", [{}, {"relevance": "near"}, {"relevance": False}, {"min_transitions": 70}], ids=repr)
 def test_saved_and_loaded_it_goes_on_as_it_would(arguments, tmp_path):
     given = {"min_transitions": 15, "n_instances": 40} | arguments
     model = small(Walk(start=-0.5), transfer=SampleTransfer(walk_source(), **given), degree=0)
@@ -296,10 +291,15 @@ def test_saved_and_loaded_it_goes_on_as_it_would(arguments, tmp_path):
     method, again = model.policy.transfer, loaded.policy.transfer
     assert same_parameters(model, loaded)
     assert {name: again.arguments()[name] for name in given} == given
-    assert (len(method.drawn) == 0) == (given["min_transitions"] == 500)
-    for each in (model, loaded):
-        each.learn(each.num_timesteps + 60, reset_num_timesteps=False)
-    assert same_parameters(model, loaded)
+    draws = method.statistics()["transfer/draws"]
+    assert (draws == 0) == (given["min_transitions"] == 70)
+    np.testing.assert_array_equal(again._tasks.sums, method._tasks.sums)
+    # Shown the same: learning on, planners may differ by backups below the tolerance, which a file does not hold.
+    for transition in transitions_of(80, 2):
+        show(method, transition)
+        show(again, transition)
+        np.testing.assert_array_equal(changed_pairs(again), changed_pairs(method))
+    assert method.statistics()["transfer/draws"] > draws
     np.testing.assert_array_equal(again.drawn, method.drawn)
     np.testing.assert_equal(again.statistics(), method.statistics())
 
