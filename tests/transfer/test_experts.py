@@ -429,7 +429,7 @@ def test_arguments_out_of_range_are_refused(argument, message):
 @pytest.mark.parametrize(
     ("source", "mappings", "message"),
     [
-        (None, "injective", "source must be SourceInstances, a path to them, or a list of these, got None"),
+        (None, "injective", "source must be SourceInstances, a path to them, or a list of these.*got None"),
         (walk_source(), "bijective", "mappings must be one of injective"),
         (walk_source(), InterTaskMapping([0, None, 1], [0, 1]), "state must have 2 entries"),
         (walk_source(), InterTaskMapping([0, 1], [0, 2]), "action must hold indices from 0 to 1"),
