@@ -282,8 +282,8 @@ class TestBadInput:
             (("--seeds", "0"), "seeds must be .* got 0"),
             (("--first-seed", "-1"), "first_seed must be .* got -1"),
             (("--jobs", "0"), "jobs must be .* got 0"),
-            (("--backend", "slurm"), "engine must be one of .* got 'slurm'"),
-            (("--backend", "dask"), "engine dask needs the address of a running cluster"),
+            (("--backend", "slurm"), "backend must be one of .* got 'slurm'"),
+            (("--backend", "dask"), "backend dask needs the address of a running cluster"),
         ],
     )
     def test_nothing_is_learned_or_written(self, options, words, files, tmp_path, monkeypatch):
