@@ -59,7 +59,7 @@ def test_the_examples_of_the_readme_run(folder_and_short_task, capsys):
 def test_the_examples_of_the_page_on_usage_run(folder_and_short_task, capsys):
     run_examples(ROOT / "docs/usage.md")
     assert {"source.npz", "car.zip", "logs"} <= {path.name for path in folder_and_short_task.iterdir()}
-    assert "East: Right on (x, vx), Neutral on (y, vy)" in capsys.readouterr().out, "the mapping is not as the comment says"
+    assert "East: Right on (x, vx) as (x, v)" in capsys.readouterr().out, "the mapping is not as the comment says"
 
 
 def test_examples_are_shortened():

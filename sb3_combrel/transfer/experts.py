@@ -85,6 +85,11 @@ class MappingExperts(Transfer):
     value function takes 0.1 seconds for a source of two variables and 1000 instances, once; an expert's action 0.05
     milliseconds.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=MappingExperts(source, max_experts=5))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, a path to them, or a list of several
     :param mappings: the set that the experts are drawn from: "injective", "surjective", "all", "balanced", one of the paper's
         sets, a list of mappings or a ``MappingSet``

@@ -44,6 +44,11 @@ class MASTER(MappingTransfer):
     milliseconds. The number of action mappings does not matter where all of them are in the set. Which mapping is right there
     was found with 20 steps in 12 of 12 seeds: that of one of the two axes. Noisy tasks need more.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=MASTER(source, n_random_steps=20))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, a path to them, or a list of several, of which one mapping to one is chosen
     :param mappings: the mappings to choose from: the name of a set ("injective", "surjective", "all", "balanced"), one of the
         paper's sets, a list of mappings or a ``MappingSet``. Of mappings with the same error the first is chosen

@@ -55,6 +55,11 @@ class SampleTransfer(MappingTransfer):
     transition is compared with all instances through every state mapping and source action, Mountain Car 2D to 4D 0.3
     milliseconds; to draw after n transitions takes as long as relevance, the number of candidates times instances times n.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SampleTransfer(source, relevance="near"))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, a path to them, or a list of several
     :param mappings: the mappings to each source: the name of a set ("injective", "surjective", "all", "balanced"), one of the
         paper's sets, a list of mappings or a ``MappingSet``

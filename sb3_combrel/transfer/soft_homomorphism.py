@@ -73,6 +73,11 @@ class SoftHomomorphism(Transfer):
     Cost: no steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. MountainCar2D to 4D
     (48 mappings, two copies): about 1 s for each of the 16 fits in a run of 12 episodes. It needs ``FittedRMax(degree=1)``.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SoftHomomorphism(source))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, or a path to them
     :param n_copies: copies of the source that the target is made of; None: as many as it has variables for, at least one
     :param mirrored: whether target variables may be read mirrored as well

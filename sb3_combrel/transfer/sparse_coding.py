@@ -117,6 +117,11 @@ class SparseCodingMapping(LearnedTranslation):
 
     Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SparseCodingMapping(source, n_random_steps=100))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, or a path to them
     :param n_random_steps: steps of the target that its sample takes
     :param n_source_samples: source instances that pairs are made of, at most

@@ -58,7 +58,7 @@ def walker(log=None, transfer=None, env=None, **kwargs):
 
 def run_folder(log):
     """The folder of the only run in a log."""
-    (folder,) = log.iterdir()
+    (folder,) = (path for path in log.iterdir() if path.is_dir())
     return folder
 
 

@@ -258,7 +258,7 @@ class TestTablesAndPictures:
     def test_plot_train_and_all_plots_make_pictures_and_a_table(self, logs, tmp_path, capsys):
         pytest.importorskip("seaborn")
         pytest.importorskip("pandas")
-        assert call("plot_train", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs) == 0
+        assert call("plot_train", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs, "-w", 1) == 0
         options = ("--no-display", "--no-million", "-o", tmp_path / "all")
         assert call("all_plots", "-a", "fitted_rmax", "-e", "combrel-MountainCar2D-v0", "-f", logs, *options) == 0
         assert "FITTED_RMAX" in capsys.readouterr().out
