@@ -169,21 +169,39 @@ def _mean_distance(weight, total, mu, bandwidth):
     them. A sum that reaches ``mu`` but for rounding does not stay below.
     """
     limit = mu * total * (1.0 - 1e-12)
+    n = len(weight)
+    # A heap, whose top is the heaviest: only those that are taken are put in order, not thousands that weigh next to nothing.
+    for root in range(n // 2 - 1, -1, -1):
+        _sift_down(weight, root, n)
     gathered = 0.0
     distance = 0.0
     n_taken = 0
-    while n_taken < len(weight):
-        best = 0
-        for i in range(1, len(weight)):
-            if weight[i] > weight[best]:
-                best = i
-        if weight[best] <= 0.0 or (n_taken > 0 and gathered + weight[best] >= limit):
+    while n_taken < n:
+        heaviest = weight[0]
+        if heaviest <= 0.0 or (n_taken > 0 and gathered + heaviest >= limit):
             break
-        gathered += weight[best]
-        distance += np.sqrt(-bandwidth * np.log(weight[best]))
-        weight[best] = -1.0
+        gathered += heaviest
+        distance += np.sqrt(-bandwidth * np.log(heaviest))
         n_taken += 1
+        weight[0] = weight[n - n_taken]
+        _sift_down(weight, 0, n - n_taken)
     return distance / max(n_taken, 1)
+
+
+@inner
+def _sift_down(heap, root, size):
+    """Move the entry at ``root`` down until neither entry below it is larger, in a heap of the first ``size`` entries."""
+    entry = heap[root]
+    below = 2 * root + 1
+    while below < size:
+        if below + 1 < size and heap[below + 1] > heap[below]:
+            below += 1
+        if heap[below] <= entry:
+            break
+        heap[root] = heap[below]
+        root = below
+        below = 2 * root + 1
+    heap[root] = entry
 
 
 _relevance, _near_relevance = EntryPoint(relevance), EntryPoint(near_relevance)
