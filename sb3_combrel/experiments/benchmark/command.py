@@ -12,7 +12,7 @@ from rich.console import Console
 
 from sb3_combrel import SourceInstances, __version__
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of
+from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair, described
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
 from sb3_combrel.experiments.benchmark.report import few_runs, write_report
@@ -212,7 +212,7 @@ def _without_source(
         if pair.name in failed
         for method in methods
         for seed in seeds
-        if method.run_as(pair) == method.name
+        if run_as(method, methods, pair) == method.name
     ]
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from sb3_combrel.experiments.benchmark.methods import NONE, Method
+from sb3_combrel.experiments.benchmark.methods import NONE, Method, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.bootstrap import bootstrap_band
@@ -77,21 +77,21 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Outcome],
     Gather the outcomes of a pair by method.
 
     :param pair: the pair
-    :param methods: the methods
+    :param methods: all that are chosen
     :param outcomes: of any runs
     :param seeds: seeds that count
     """
     own = sorted((each for each in outcomes if each.pair == pair.name and each.seed in seeds), key=lambda each: each.seed)
     cells = {}
     for method in methods:
-        run_as = method.run_as(pair)
-        of_method = [each for each in own if each.method == run_as]
+        name = run_as(method, methods, pair)
+        of_method = [each for each in own if each.method == name]
         misfits = [each.misfit for each in of_method if each.misfit]
         cells[method.name] = Cell(
             tuple(each for each in of_method if each.succeeded),
             misfits[0] if misfits else "",
             {each.seed: each.error for each in of_method if each.error},
-            run_as,
+            name,
         )
     return cells
 
