@@ -7,13 +7,18 @@ Bootstrap intervals are in :mod:`~sb3_combrel.experiments.bootstrap`, effect siz
 
 from __future__ import annotations
 
+import itertools
+import math
 import warnings
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
+#: Level of a test, after Holm's correction over the rows of a table.
+ALPHA = 0.05
 TESTS = ("welch", "mann-whitney", "permutation")
 #: A permutation test draws so many regroupings at random, or takes each one once if there are at most so many.
 N_PERMUTATIONS = 10_000
@@ -201,6 +206,38 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     factors = np.arange(len(order), 0, -1)
     corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
     return corrected
+
+
+def holm_by_name(p_values: Mapping[str, float]) -> dict[str, float]:
+    """
+    Correct p-values by Holm's method, see :func:`holm`.
+
+    :param p_values: by name
+    """
+    return dict(zip(p_values, holm(np.array(list(p_values.values()))).tolist(), strict=True))
+
+
+def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
+    """
+    Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run.
+
+    :param n_first: runs of a method; ``n_second``: of the other
+    :param n_methods: number of tests
+    """
+    if min(n_first, n_second) < 2:
+        return 1.0
+    # The two extreme groupings are equally far apart if the groups are equally large.
+    extreme = 2 if n_first == n_second else 1
+    return min(1.0, n_methods * extreme / math.comb(n_first + n_second, n_first))
+
+
+def fewest_runs(n_methods: int) -> int:
+    """
+    Compute how many runs of each method a permutation test needs for a p-value below :data:`ALPHA`, after Holm's correction.
+
+    :param n_methods: number of tests
+    """
+    return next(n for n in itertools.count(2) if smallest_p_value(n, n, n_methods) < ALPHA)
 
 
 def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) -> float:

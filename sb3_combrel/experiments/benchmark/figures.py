@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS, Cell, Comparison, curves_of
+from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS, Cell, Comparison
 from sb3_combrel.experiments.bootstrap import bootstrap_band
 from sb3_combrel.experiments.figures import COLOURS, moving_average, panels_of, save
-from sb3_combrel.experiments.transfer_measures import LearningCurves
+from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of
 
 #: Moving average over so many episodes.
 WINDOW = 5

@@ -15,7 +15,6 @@ from sb3_combrel.experiments.benchmark.methods import NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.benchmark.scores import (
-    ALPHA,
     FEWEST_RUNS,
     MEASURES,
     Cell,
@@ -27,7 +26,7 @@ from sb3_combrel.experiments.benchmark.scores import (
     ranks,
 )
 from sb3_combrel.experiments.report import Table, csv_text, p_text, without_minus_zero, write_tables
-from sb3_combrel.experiments.statistics import Estimate
+from sb3_combrel.experiments.statistics import ALPHA, Estimate
 from sb3_combrel.experiments.transfer_measures import Comparison as MeasuredDifference
 
 OVERVIEW, PAGE, RUNS = "overview", "benchmark", "runs.csv"
