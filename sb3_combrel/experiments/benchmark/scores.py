@@ -43,7 +43,7 @@ class Cell:
     run_as: str = ""
 
 
-class Comparison(NamedTuple):
+class MethodScores(NamedTuple):
     """
     A method against no transfer.
 
@@ -105,7 +105,7 @@ def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]
     return {name: total_reward_by_steps(each, n_steps) / n_steps for name, each in curves.items()}
 
 
-def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, Comparison]:
+def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
     """
     Compare the methods of a pair with no transfer, where that has been run.
 
@@ -129,7 +129,7 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, Comparison]:
     found = {}
     for name, its_own in of_runs.items():
         tested = cells[name].run_as if cells[name].run_as in measures else name
-        found[name] = Comparison(
+        found[name] = MethodScores(
             its_own,
             interquartile(its_own),
             corrected.get(tested, np.nan),

@@ -37,7 +37,7 @@ def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
     have = {result.method for result in results}
     curves = {method: _curves(results, method) for method in METHODS if method in have}
     without = curves.pop(NO_TRANSFER)
-    # The least return that an episode can have, the same for all rows: of a step it is -1 in both domains.
+    # The ratio depends on it: the lowest return of any run, the same for all rows.
     floor = float(min(result_curves.returns.min() for result_curves in (without, *curves.values())))
     threshold = -float(domain.thresholds[-1]) if domain.name != "icub" else 100.0 - domain.thresholds[-1]
     # In a short trial all episodes are the first, and the last.
