@@ -100,7 +100,7 @@ class BenchmarkJob:
 
     def answered_by(self, result: Outcome) -> bool:
         """Whether a result is that of this job. A run that failed is tried again, for the reason may have gone."""
-        return result.succeeded and result.pair == self.pair.name
+        return result.succeeded and (result.pair, result.method) == (self.pair.name, self.method.name)
 
     def outcome(self, **found: Any) -> Outcome:
         """Make an outcome of this job."""
