@@ -1,8 +1,6 @@
 """The command line, end to end, with budgets too small to learn anything."""
 
-import contextlib
 import csv
-import io
 import os
 import shutil
 import signal
@@ -12,10 +10,11 @@ import time
 
 import gymnasium
 import pytest
+from helpers.command_line import call_for_all_output
 from imageio.v3 import imread
 
 import combrel_envs  # noqa: F401 - registers the tasks
-from sb3_combrel import FittedRMax, SourceInstances, cli
+from sb3_combrel import FittedRMax, SourceInstances
 from sb3_combrel.experiments import demo
 from sb3_combrel.experiments.demo import OUTPUTS
 
@@ -23,19 +22,8 @@ TINY = ("--seeds", "2", "--episodes", "2", "--max-episode-steps", "60")
 METHODS = ("no_transfer", "random_mapping", "timbrel", "combrel")
 
 
-def call(*args):
-    """Exit status and output, standard output and errors together, of a call in this process."""
-    written = io.StringIO()
-    with contextlib.redirect_stdout(written), contextlib.redirect_stderr(written):
-        try:
-            status = cli.main([str(arg) for arg in args])
-        except SystemExit as error:
-            status = error.code
-    return status, written.getvalue()
-
-
 def run_tiny_demo(folder, *more):
-    return call("demo", "--output", folder, *TINY, "--workers", "1", *more)
+    return call_for_all_output("demo", "--output", folder, *TINY, "--workers", "1", *more)
 
 
 def rows_of(path):
@@ -162,7 +150,7 @@ class TestDemo:
 
     @pytest.mark.parametrize("option", ["--seeds", "--episodes", "--max-episode-steps", "--workers"])
     def test_numbers_below_one_are_refused(self, tmp_path, option):
-        status, written = call("demo", "--output", tmp_path / "new", option, "0")
+        status, written = call_for_all_output("demo", "--output", tmp_path / "new", option, "0")
         assert status == 1
         assert "must be at least 1, got 0" in written
         assert not (tmp_path / "new").exists()
@@ -209,7 +197,7 @@ class TestRecord:
     SHORT = ("combrel/MountainCar2D-v0", "--n-instances", "20", "--total-timesteps", "50")
 
     def test_record_writes_source_instances(self, tmp_path):
-        status, written = call("record", *self.SHORT, "--output", tmp_path / "car", "--seed", "3")
+        status, written = call_for_all_output("record", *self.SHORT, "--output", tmp_path / "car", "--seed", "3")
         assert status == 0
         source = SourceInstances.load(tmp_path / "car.npz")
         assert len(source) == 20
@@ -219,11 +207,11 @@ class TestRecord:
     def test_a_file_is_overwritten_only_when_asked(self, tmp_path):
         file = tmp_path / "car.npz"
         file.write_text("mine")
-        status, written = call("record", *self.SHORT, "--output", file)
+        status, written = call_for_all_output("record", *self.SHORT, "--output", file)
         assert status == 1
         assert "--overwrite" in written
         assert file.read_text() == "mine"
-        assert call("record", *self.SHORT, "--output", file, "--overwrite")[0] == 0
+        assert call_for_all_output("record", *self.SHORT, "--output", file, "--overwrite")[0] == 0
         assert len(SourceInstances.load(file)) == 20
 
     @pytest.mark.parametrize(
@@ -231,7 +219,7 @@ class TestRecord:
         [("Nowhere-v0", "Nowhere"), ("no_such_package:Task-v0", "no_such_package"), ("Pendulum-v1", "Discrete")],
     )
     def test_a_task_that_cannot_be_learned_is_named_without_a_traceback(self, tmp_path, env_id, message):
-        status, written = call("record", env_id, "--output", tmp_path / "none.npz")
+        status, written = call_for_all_output("record", env_id, "--output", tmp_path / "none.npz")
         assert status == 1
         assert message in written
         assert "Traceback" not in written
@@ -240,15 +228,15 @@ class TestRecord:
 
 class TestCommandLine:
     def test_help_names_the_commands(self):
-        status, written = call("--help")
+        status, written = call_for_all_output("--help")
         assert status == 0
         assert all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
 
     def test_an_unknown_command_is_refused(self):
-        assert call("dance")[0] == 2
+        assert call_for_all_output("dance")[0] == 2
 
     def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "tyro", None)
-        status, written = call("demo")
+        status, written = call_for_all_output("demo")
         assert status == 1
         assert "sb3-combrel[experiments]" in written

@@ -4,15 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sb3_combrel.experiments.statistics import mean_of_runs
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 #: Okabe and Ito's colours, which the colour-blind can distinguish too.
 COLOURS = ("#555555", "#0072B2", "#D55E00", "#009E73", "#CC79A7")
 MARKERS = ("s", "^", "o", "D", "v")
+
+
+def figure_of(width: float, height: float) -> Figure:
+    """
+    Make a figure that pyplot does not know, so that the caller's pyplot and its backend are left alone.
+
+    :param width: in inches; ``height``: likewise
+    :raises ModuleNotFoundError: if matplotlib is not installed
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def draw_learning_curves(steps: Mapping[str, np.ndarray], path: Path, title: str, cap: int) -> Path:
@@ -25,13 +43,9 @@ def draw_learning_curves(steps: Mapping[str, np.ndarray], path: Path, title: str
     :param cap: steps after which an episode was cut off
     :return: the path
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    # The object-oriented interface leaves the caller's pyplot and its backend alone.
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figure_of(7.0, 4.2)
     axes = figure.add_subplot()
     highest = 0.0
     for (method, samples), colour, marker in zip(steps.items(), COLOURS, MARKERS, strict=False):
@@ -66,12 +80,7 @@ def moving_average(samples: np.ndarray, window: int) -> np.ndarray:
 
 def panels_of(n: int, title: str, sharey: bool = True) -> tuple[Any, list[Any]]:
     """Make a figure with ``n`` panels side by side; the figure and their axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    # The object-oriented interface leaves the caller's pyplot and its backend alone.
-    figure = Figure(figsize=(6.2 * n, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figure_of(6.2 * n, 4.4)
     figure.suptitle(title)
     return figure, list(figure.subplots(1, n, sharey=sharey, squeeze=False)[0])
 

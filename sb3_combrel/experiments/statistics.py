@@ -7,16 +7,18 @@ Bootstrap intervals are in :mod:`~sb3_combrel.experiments.bootstrap`, effect siz
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
-from collections.abc import Iterator
-from itertools import combinations
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
+#: Level of a test, after Holm's correction over the rows of a table.
+ALPHA = 0.05
 TESTS = ("welch", "mann-whitney", "permutation")
 #: A permutation test draws so many regroupings at random, or takes each one once if there are at most so many.
 N_PERMUTATIONS = 10_000
@@ -84,7 +86,7 @@ def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.nd
     """
     Count the episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
 
-    :param steps: steps of each episode, shape (n_runs, n_episodes)
+    :param steps: steps of each episode, or NaN after the last of a run, shape (n_runs, n_episodes)
     """
     if steps.shape[1] < window:
         return np.full(len(steps), np.inf)
@@ -99,8 +101,18 @@ def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarr
 
     :param steps: steps of each episode, shape (n_runs, n_episodes)
     """
-    episodes = episodes_to_reach(steps, threshold, window)
-    return np.array([each[: int(n)].sum() if np.isfinite(n) else np.inf for each, n in zip(steps, episodes, strict=True)])
+    return steps_of_first_episodes(steps, episodes_to_reach(steps, threshold, window))
+
+
+def steps_of_first_episodes(steps: np.ndarray, n_episodes: np.ndarray) -> np.ndarray:
+    """
+    Add up the steps of the first episodes of each run.
+
+    :param steps: steps of each episode, shape (n_runs, n_episodes)
+    :param n_episodes: for each run how many episodes, or inf, shape (n_runs,)
+    :return: inf where the number of episodes is, shape (n_runs,)
+    """
+    return np.array([each[: int(n)].sum() if np.isfinite(n) else np.inf for each, n in zip(steps, n_episodes, strict=True)])
 
 
 def interquartile_mean(samples: np.ndarray, axis: int = 0) -> np.ndarray:
@@ -196,6 +208,38 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     return corrected
 
 
+def holm_by_name(p_values: Mapping[str, float]) -> dict[str, float]:
+    """
+    Correct p-values by Holm's method, see :func:`holm`.
+
+    :param p_values: by name
+    """
+    return dict(zip(p_values, holm(np.array(list(p_values.values()))).tolist(), strict=True))
+
+
+def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
+    """
+    Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run.
+
+    :param n_first: runs of a method; ``n_second``: of the other
+    :param n_methods: number of tests
+    """
+    if min(n_first, n_second) < 2:
+        return 1.0
+    # The two extreme groupings are equally far apart if the groups are equally large.
+    extreme = 2 if n_first == n_second else 1
+    return min(1.0, n_methods * extreme / math.comb(n_first + n_second, n_first))
+
+
+def fewest_runs(n_methods: int) -> int:
+    """
+    Compute how many runs of each method a permutation test needs for a p-value below :data:`ALPHA`, after Holm's correction.
+
+    :param n_methods: number of tests
+    """
+    return next(n for n in itertools.count(2) if smallest_p_value(n, n, n_methods) < ALPHA)
+
+
 def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) -> float:
     """
     Compute the share of regroupings of all values whose means differ at least as much as those of the samples.
@@ -203,20 +247,16 @@ def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) ->
     Random regroupings count the samples' own as one more (Phipson & Smyth, "Permutation p-values should never be zero", 2010).
     """
     together = np.concatenate([first, second])
-    # The values sum to 0, so the difference of the means is proportional to the sum over one group.
-    together = together - together.mean()
-    sums = np.concatenate([together[chosen].sum(axis=1) for chosen in _regroupings(len(first), len(together), seed)])
-    # Sums of the same values in another order differ by rounding.
-    as_large = np.abs(sums) >= np.abs(together[: len(first)].sum()) - 1e-9 * np.abs(together).sum()
-    exact = math.comb(len(together), len(first)) <= N_PERMUTATIONS
-    return float(as_large.mean() if exact else (1 + as_large.sum()) / (1 + len(sums)))
+    mean = together.mean()
+    largest = np.abs(together - mean).sum()
 
+    def difference(one: np.ndarray, other: np.ndarray, axis: int) -> np.ndarray:
+        # All values sum to 0, so the difference of the means is proportional to the sum over one group. Sums of the same
+        # values in another order differ by rounding: SciPy allows for less of it than there is where the sum is near 0.
+        return np.round(np.abs(one.sum(axis=axis)) / largest, 9)
 
-def _regroupings(n_chosen: int, n: int, seed: int) -> Iterator[np.ndarray]:
-    """Yield the places of the first group's values, shape (n_regroupings, n_chosen), in blocks."""
-    if math.comb(n, n_chosen) <= N_PERMUTATIONS:
-        yield np.array(list(combinations(range(n), n_chosen)))
-        return
-    rng = np.random.default_rng(seed)
-    for _ in range(N_PERMUTATIONS // 1000):
-        yield rng.permuted(np.tile(np.arange(n), (1000, 1)), axis=1)[:, :n_chosen]
+    samples, rng = (first - mean, second - mean), np.random.default_rng(seed)
+    found = stats.permutation_test(
+        samples, difference, n_resamples=N_PERMUTATIONS, alternative="greater", vectorized=True, random_state=rng
+    )
+    return float(found.pvalue)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -30,7 +30,8 @@ def mended() -> Iterator[None]:
 
     RL-Zoo 2.9 takes a function from huggingface_sb3 that version 3 has under another name, and expects that a file that is
     missing on the hub is reported by an exception of ``requests``, which huggingface_hub no longer uses. Model cards of this
-    package's algorithms name its own commands.
+    package's algorithms name its own commands. RL-Zoo's commands are scripts, which import these functions by name when they
+    run: they must be replaced where they are defined, before.
 
     :raises ConnectionError: if the hub cannot be reached
     """
@@ -38,10 +39,11 @@ def mended() -> Iterator[None]:
     from huggingface_hub import errors, repocard
 
     upload = _module_of_upload()
-    with ExitStack() as patches:
-        patches.enter_context(mock.patch.object(upload, "generate_metadata", _metadata_with_tag(upload), create=True))
-        patches.enter_context(mock.patch.object(repocard, "metadata_save", _reworded(repocard.metadata_save)))
-        patches.enter_context(mock.patch.object(huggingface_sb3, "load_from_hub", _as_expected(huggingface_sb3.load_from_hub)))
+    with (
+        mock.patch.object(upload, "generate_metadata", _metadata_with_tag(upload), create=True),
+        mock.patch.object(repocard, "metadata_save", _reworded(repocard.metadata_save)),
+        mock.patch.object(huggingface_sb3, "load_from_hub", _as_expected(huggingface_sb3.load_from_hub)),
+    ):
         try:
             yield
         except errors.HTTPError as error:

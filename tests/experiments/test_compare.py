@@ -117,6 +117,16 @@ def test_with_too_few_runs_nothing_is_claimed(monkeypatch, n_runs):
     assert "too few runs to tell" in found.sentence and "helped" not in found.sentence
 
 
+def test_with_several_methods_more_seeds_are_asked_for(monkeypatch):
+    one = made_up(monkeypatch, {"none": around(-60.0, 3), "COMBREL": around(-5.0, 3)})
+    assert "take at least 4 seeds, better 10" in one.sentence
+    # Of 70 regroupings of four and four two are extreme: with two tests that is 0.057.
+    two = made_up(monkeypatch, {"none": around(-60.0, 4), "COMBREL": around(-5.0, 4), "TIMBREL": around(-5.0, 4)})
+    assert two.sentence.count("take at least 5 seeds, better 10") == 2
+    enough = made_up(monkeypatch, {"none": around(-60.0, 5), "COMBREL": around(-5.0, 5), "TIMBREL": around(-5.0, 5)})
+    assert enough.sentence.count("transfer helped") == 2
+
+
 def test_several_methods_are_corrected_for_their_number(monkeypatch):
     runs = {"none": around(-60.0, 5), "one": around(-50.0, 5), "two": around(-40.0, 5)}
     found = made_up(monkeypatch, runs)

@@ -322,6 +322,18 @@ def test_files_that_are_no_whole_monitor_log_are_refused(tmp_path, text, message
     assert str(tmp_path / "monitor.csv") in str(error.value)
 
 
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    (tmp_path / "monitor.csv").write_bytes(b"\x93NUMPY\xff\xfe")
+    with pytest.raises(ValueError, match=r"monitor.csv must be a Monitor log"):
+        read_monitor_logs(tmp_path)
+
+
+def test_a_row_ends_where_its_line_does(tmp_path):
+    # Monitor's csv writer leaves such separators in the text of an info keyword unquoted.
+    (tmp_path / "monitor.csv").write_text('#{"t_start": 1.0}\nr,l,t,note\n1,10,1.0,one\u2028two\n2,20,2.0,x\n', "utf-8")
+    assert read_monitor_logs(tmp_path).returns.tolist() == [[1.0, 2.0]]
+
+
 def test_logs_that_are_not_there_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere does not exist"):
         read_monitor_logs(tmp_path / "nowhere")

@@ -1,11 +1,10 @@
 """The files of docs/add_to_the_benchmark.md, and calls of ``sb3-combrel benchmark``."""
 
-import contextlib
-import io
 import re
+from functools import partial
 from pathlib import Path
 
-from sb3_combrel import cli
+from helpers import command_line
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "add_to_the_benchmark.md"
 
@@ -24,27 +23,4 @@ def command():
     return line.split()
 
 
-def call(*args):
-    """Exit status, standard output, and standard error of a call in this process."""
-    output, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
-        try:
-            status = cli.main(["benchmark", *map(str, args)])
-        except SystemExit as error:
-            status = error.code
-    return status, output.getvalue(), errors.getvalue()
-
-
-def succeed(*args):
-    status, output, errors = call(*args)
-    assert status == 0, errors
-    return output
-
-
-def fail(*args):
-    """The one line that a call which fails writes."""
-    status, output, errors = call(*args)
-    assert status == 1, (output, errors)
-    assert errors.startswith("sb3-combrel: ") and errors.count("\n") == 1
-    assert "Traceback" not in output + errors
-    return errors
+call, succeed, fail = (partial(each, "benchmark") for each in (command_line.call, command_line.succeed, command_line.fail))

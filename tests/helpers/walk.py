@@ -76,6 +76,18 @@ def same_parameters(one, other):
     return one.keys() == other.keys() and all(th.equal(one[k], other[k]) for k in one)
 
 
+def learnt_on(model, folder, n_steps):
+    """A model that is saved, and the one loaded from its file, both after so many steps more."""
+    model.save(folder / "model")
+    loaded = FittedRMax.load(folder / "model", env=Walk())
+    model.set_env(Walk())
+    # Loading has seeded the environment again.
+    model.get_env().seed(model.seed)
+    for goes_on in (model, loaded):
+        goes_on.learn(n_steps, reset_num_timesteps=False)
+    return model, loaded
+
+
 def stored(model):
     """(state, next state, reward, terminated) of all instances, raw units, by action."""
     instances, rows = model.agent.model.instances, []

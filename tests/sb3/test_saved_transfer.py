@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.walk import METHODS, STRIDE, Walk, same_parameters, small, stored, walk_source
+from helpers.walk import METHODS, STRIDE, Walk, learnt_on, same_parameters, small, stored, walk_source
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
@@ -34,14 +34,7 @@ def after_episodes(n, transfer, env=None, **kwargs):
 
 def test_learning_goes_on_to_the_last_bit(variant, tmp_path):
     """Saved at an episode's end, a loaded model learns what the model itself learns when it learns on."""
-    model = after_episodes(3, variant())
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
-    model.set_env(Walk())
-    # Loading has seeded the environment again.
-    model.get_env().seed(model.seed)
-    for goes_on in (model, loaded):
-        goes_on.learn(150, reset_num_timesteps=False)
+    model, loaded = learnt_on(after_episodes(3, variant()), tmp_path, 150)
     assert same_parameters(model, loaded)
     assert model.agent.model.n_instances > 150
     if model.policy.transfer is not None:

@@ -1,32 +1,19 @@
 """``explain``: the report and the pictures of a model, in Python and on the command line."""
 
-import contextlib
-import io
-
 import numpy as np
 import pytest
+from helpers.command_line import call_for_all_output
 from helpers.dashboard import METHODS, NamedWalk, walker
 from helpers.own_method import Mine
 from matplotlib.image import imread
 
-from sb3_combrel import FittedRMax, cli, explain
+from sb3_combrel import FittedRMax, explain
 from sb3_combrel.tensorboard import pictures
 from sb3_combrel.tensorboard.explain import FILE_DPI
 from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.tensorboard.plane import plane_through
 
 TEXTS = ("mappings.md", "report.txt")
-
-
-def call(*args):
-    """Exit status and output of the command line."""
-    written = io.StringIO()
-    with contextlib.redirect_stdout(written), contextlib.redirect_stderr(written):
-        try:
-            status = cli.main([str(arg) for arg in args])
-        except SystemExit as error:
-            status = error.code
-    return status, written.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +93,8 @@ def test_what_cannot_be_explained_is_refused(saved, transfers, tmp_path):
 def test_the_command_prints_the_report_and_writes_it_with_the_pictures(saved, tmp_path):
     model, path = saved
     text = str(model.transfer.report())
-    assert call("explain", path) == (0, f"{text}\n")
-    status, written = call("explain", path, "--output", tmp_path)
+    assert call_for_all_output("explain", path) == (0, f"{text}\n")
+    status, written = call_for_all_output("explain", path, "--output", tmp_path)
     assert status == 0 and written.startswith(text)
     assert (tmp_path / "report.txt").read_text() == f"{text}\n"
     assert all(str(file) in written for file in tmp_path.iterdir())
@@ -118,5 +105,5 @@ def test_the_command_prints_the_report_and_writes_it_with_the_pictures(saved, tm
 def test_the_command_says_in_a_sentence_what_is_wrong(tmp_path):
     walker().learn(40).save(tmp_path / "without.zip")
     for file, message in (("without.zip", "no transfer method"), ("nowhere.zip", "there is no model file")):
-        status, written = call("explain", tmp_path / file)
+        status, written = call_for_all_output("explain", tmp_path / file)
         assert status == 1 and message in written and "Traceback" not in written

@@ -11,12 +11,10 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import sb3_combrel
 from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, MappingSet, SourceInstances
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.transfer.experts import best_by_ucb1
 from sb3_combrel.transfer.source_policy import SourcePolicy
-from sb3_combrel.zoo.algorithm import ZooFittedRMax
 
 SAME = InterTaskMapping([0, 1], [0, 1])
 OPPOSITE = InterTaskMapping([0, 1], [1, 0])
@@ -388,18 +386,6 @@ def test_its_figures_are_logged(tmp_path):
     [*_, last] = events.Scalars("transfer/expert_steps")
     assert last.value > 0.0
     assert {"transfer/steps_to_find_mapping", "transfer/best_expert"} <= set(events.Tags()["scalars"])
-
-
-def test_by_its_name_as_in_a_yaml_file(tmp_path):
-    path = str(walk_source().save(tmp_path / "source.npz"))
-    for name in ("MappingExperts", "sb3_combrel.MappingExperts", "sb3_combrel.transfer.experts.MappingExperts"):
-        model = small(transfer={name: {"source": path, "mappings": "surjective", "max_experts": 3}})
-        assert type(model.policy.transfer) is MappingExperts is sb3_combrel.MappingExperts
-        assert model.policy.transfer.max_experts == 3
-    of_zoo = ZooFittedRMax(
-        "FittedRMaxPolicy", Walk(), {"max_experts": 4}, transfer={"sb3_combrel.MappingExperts": {"source": path}}
-    )
-    assert of_zoo.policy.transfer.max_experts == 4
 
 
 # --------------------------------------------------------------------- bad input

@@ -8,7 +8,7 @@ from helpers import factored as f
 from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import random_source, target_task
 from helpers.ring import Ring
-from helpers.walk import Walk, same_parameters, small, walk_source
+from helpers.walk import Walk, learnt_on, same_parameters, small, walk_source
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel import (
@@ -221,14 +221,9 @@ RESUMED = {
 @pytest.mark.parametrize("name", RESUMED)
 def test_learning_goes_on_to_the_last_bit(name, tmp_path):
     """Saved at an episode's end, a loaded model learns what the model itself learns when it learns on."""
-    model = small(transfer=RESUMED[name]()).learn(10**6, callback=StopTrainingOnMaxEpisodes(3))
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
-    model.set_env(Walk())
-    # Loading has seeded the environment again.
-    model.get_env().seed(model.seed)
-    for goes_on in (model, loaded):
-        goes_on.learn(80, reset_num_timesteps=False)
+    model, loaded = learnt_on(
+        small(transfer=RESUMED[name]()).learn(10**6, callback=StopTrainingOnMaxEpisodes(3)), tmp_path, 80
+    )
     assert same_parameters(model, loaded)
     assert model.agent.model.n_instances > 100
 

@@ -11,12 +11,10 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import sb3_combrel
 from sb3_combrel import MASTER, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, MappingSet, SourceInstances
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel
-from sb3_combrel.zoo.algorithm import ZooFittedRMax
 
 USES = ["instances", "prior"]
 POINTS = np.random.default_rng(5).random((12, 3))
@@ -269,20 +267,6 @@ def test_it_is_shown_on_the_dashboard(use, tmp_path):
     found = [event.value for event in events.Scalars("transfer/mapping_found")]
     assert found[0] == 0.0 and found[-1] == 1.0
     assert events.Scalars("transfer/steps_to_find_mapping")[-1].value == 90.0
-
-
-def test_by_its_name_as_in_a_yaml_file(tmp_path):
-    path = str(walk_source().save(tmp_path / "source.npz"))
-    for name in ("MASTER", "sb3_combrel.MASTER", "sb3_combrel.transfer.master.MASTER"):
-        model = small(transfer={name: {"source": path, "mappings": "surjective", "n_random_steps": 7}})
-        assert type(model.policy.transfer) is MASTER is sb3_combrel.MASTER
-        assert model.policy.transfer.n_random_steps == 7
-    of_zoo = ZooFittedRMax(
-        "FittedRMaxPolicy", Walk(), {"n_random_steps": 4}, transfer={"sb3_combrel.MASTER": {"source": path}}
-    )
-    assert of_zoo.policy.transfer.n_random_steps == 4
-    with pytest.raises(ValueError, match=r"known are .*sb3_combrel\.MASTER, "):
-        small(transfer={"MASTERR": {"source": path}})
 
 
 # --------------------------------------------------------------------- bad input

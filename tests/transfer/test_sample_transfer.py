@@ -21,7 +21,6 @@ from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
 from sb3_combrel.transfer.task_compliance import candidate_compliances, draw_instances
-from sb3_combrel.zoo.algorithm import ZooFittedRMax
 
 POINTS = np.random.default_rng(5).random((12, 3))
 BANDWIDTHS = (0.05, 0.02, 1.0)
@@ -308,18 +307,6 @@ def test_several_environments_are_observed_together():
     model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=SampleTransfer(walk_source(), min_transitions=20)).learn(120)
     assert model.policy.transfer.mapping_steps() == 20
     assert "SampleTransfer" in str(model.policy.transfer.report())
-
-
-def test_by_its_name_as_in_a_yaml_file(tmp_path):
-    path = str(walk_source().save(tmp_path / "source.npz"))
-    for name in ("SampleTransfer", "sb3_combrel.SampleTransfer", "sb3_combrel.transfer.sample_transfer.SampleTransfer"):
-        model = small(transfer={name: {"source": path, "relevance": "near"}})
-        assert type(model.policy.transfer) is SampleTransfer is sb3_combrel.SampleTransfer
-        assert model.policy.transfer.relevance == "near"
-    of_zoo = ZooFittedRMax(
-        "FittedRMaxPolicy", Walk(), {"n_instances": 44}, transfer={"sb3_combrel.SampleTransfer": {"source": path}}
-    )
-    assert of_zoo.policy.transfer.n_instances == 44
 
 
 # --------------------------------------------------------------------- bad input

@@ -140,28 +140,27 @@ class TestShippedConfigurations:
 
 
 class TestTransfer:
-    @pytest.mark.parametrize("algo", ["timbrel", "combrel"])
-    @pytest.mark.parametrize("env", [CAR, BIG_CAR])
-    def test_the_shipped_configurations_run(self, tmp_path, algo, env):
-        conf = tmp_path / "short.yml"
+    def trained(self, folder, algo, env):
+        """The transfer method of a short run with a shipped configuration; and its name there."""
         entry = yaml.safe_load((CONFIGS / f"{algo}.yml").read_text())[env]
         ((method, arguments),) = entry["transfer"].items()
         entry["transfer"] = {method: {**arguments, "source": RECIPE}}
+        conf = folder / "short.yml"
         conf.write_text(yaml.dump({env: entry}))
-        assert call("train", *train_args(tmp_path, "--eval-freq", -1, algo=algo, env=env, conf=conf, n=60)) == 0
-        (model_file,) = tmp_path.glob(f"{algo}/*/*.zip")
-        assert len(FittedRMax.load(model_file).policy.transfer.source) == 50
+        assert call("train", *train_args(folder, "--eval-freq", -1, algo=algo, env=env, conf=conf, n=60)) == 0
+        (model_file,) = folder.glob(f"{algo}/*/*.zip")
+        return FittedRMax.load(model_file).policy.transfer, method
+
+    @pytest.mark.parametrize("algo", ["timbrel", "combrel"])
+    @pytest.mark.parametrize("env", [CAR, BIG_CAR])
+    def test_the_shipped_configurations_run(self, tmp_path, algo, env):
+        transfer, _ = self.trained(tmp_path, algo, env)
+        assert len(transfer.source) == 50
 
     @pytest.mark.parametrize("algo", ["master", "mapping_experts", "soft_homomorphism"])
     def test_the_configurations_of_the_other_methods_run(self, tmp_path, algo):
-        conf = tmp_path / "short.yml"
-        entry = yaml.safe_load((CONFIGS / f"{algo}.yml").read_text())[BIG_CAR]
-        ((method, arguments),) = entry["transfer"].items()
-        entry["transfer"] = {method: {**arguments, "source": RECIPE}}
-        conf.write_text(yaml.dump({BIG_CAR: entry}))
-        assert call("train", *train_args(tmp_path, "--eval-freq", -1, algo=algo, env=BIG_CAR, conf=conf, n=60)) == 0
-        (model_file,) = tmp_path.glob(f"{algo}/*/*.zip")
-        assert type(FittedRMax.load(model_file).policy.transfer).__name__ == method.rpartition(".")[2]
+        transfer, method = self.trained(tmp_path, algo, BIG_CAR)
+        assert type(transfer).__name__ == method.rpartition(".")[2]
 
     def test_a_source_task_is_learnt_once_and_then_read(self, capsys):
         from sb3_combrel.zoo.sources import find_source

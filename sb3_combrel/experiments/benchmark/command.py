@@ -12,7 +12,7 @@ from rich.console import Console
 
 from sb3_combrel import SourceInstances, __version__
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of
+from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair, described
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
 from sb3_combrel.experiments.benchmark.report import few_runs, write_report
@@ -22,7 +22,7 @@ from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.experiments.carrying_out import LOCAL, Engine, progress_of
 from sb3_combrel.experiments.engines import JobError
 from sb3_combrel.experiments.output_folder import prepare_folder
-from sb3_combrel.experiments.result_files import RunFiles
+from sb3_combrel.experiments.result_files import RunFiles, run_name
 from sb3_combrel.experiments.source_files import FOLDER, load_or
 
 ALL = "all"
@@ -63,6 +63,7 @@ def benchmark(
     chosen_methods = methods_of(methods)
     _check_names("pairs", [pair.name for pair in chosen_pairs])
     _check_names("methods", [method.name for method in chosen_methods])
+    _check_run_names(chosen_pairs, chosen_methods)
     _check_sources(chosen_pairs)
     engine.check()
     console = console or Console()
@@ -128,6 +129,8 @@ def settings_of(pairs: Sequence[Pair], methods: Sequence[Method], digests: dict[
     now: dict[str, Any] = {"version": __version__}
     for pair in pairs:
         now[f"pair {pair.name}"] = pair.settings() | ({"digest": digests[pair.name]} if pair.name in digests else {})
+        # Pairs of other calls may have a source in the same file.
+        now |= {f"source {source.name}": described(source.learn) for source in pair.sources}
     return now | {f"method {method.name}": method.digest for method in methods}
 
 
@@ -212,7 +215,7 @@ def _without_source(
         if pair.name in failed
         for method in methods
         for seed in seeds
-        if method.run_as(pair) == method.name
+        if run_as(method, methods, pair) == method.name
     ]
 
 
@@ -220,6 +223,19 @@ def _check_names(argument: str, names: Sequence[str]) -> None:
     twice = [name for name, n in Counter(map(str.lower, names)).items() if n > 1]
     if twice:
         raise ValueError(f"{argument} must have different names, got {', '.join(twice)} twice")
+
+
+def _check_run_names(pairs: Sequence[Pair], methods: Sequence[Method]) -> None:
+    """
+    :raises ValueError: if runs of two methods or pairs have the same file
+    """
+    seen: dict[str, str] = {}
+    for pair in pairs:
+        for method in methods:
+            title = f"{method.name} on {pair.name}"
+            other = seen.setdefault(run_name(pair.name, method.name, 0), title)
+            if other != title:
+                raise ValueError(f"methods: the runs of {title} and of {other} would have the same files; rename one")
 
 
 def _check_sources(pairs: Sequence[Pair]) -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS, Cell, Comparison, curves_of
+from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS, Cell, MethodScores
 from sb3_combrel.experiments.bootstrap import bootstrap_band
 from sb3_combrel.experiments.figures import COLOURS, moving_average, panels_of, save
-from sb3_combrel.experiments.transfer_measures import LearningCurves
+from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of
 
 #: Moving average over so many episodes.
 WINDOW = 5
@@ -26,7 +26,7 @@ def style_of(number: int) -> tuple[str, str]:
     return _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS) % len(_LINES)]
 
 
-def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Comparison], path: Path) -> list[Path]:
+def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, MethodScores], path: Path) -> list[Path]:
     """
     Draw the learning curves of a pair, interquartile means with 95% bootstrap bands, and the performance of its methods.
 

@@ -68,9 +68,21 @@ class Method:
         check_name(self.name)
 
     def run_as(self, pair: Pair) -> str:
-        """Name of the method whose runs are this one's in a pair."""
+        """Name of the method that makes the same in a pair, or its own; see :func:`run_as`."""
         other = None if self.same_as is None else self.same_as(pair)
         return self.name if other is None else other
+
+
+def run_as(method: Method, methods: Sequence[Method], pair: Pair) -> str:
+    """
+    Name of the method whose runs are those of a method in a pair: its own where the one that makes the same is not chosen.
+
+    :param method: one of those that are chosen
+    :param methods: all that are chosen
+    :param pair: the pair
+    """
+    name = method.run_as(pair)
+    return name if any(each.name == name for each in methods) else method.name
 
 
 def the_one(sources: Sources, name: str) -> SourceInstances:

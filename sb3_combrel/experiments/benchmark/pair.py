@@ -114,6 +114,22 @@ class Pair:
                 f"{self.name}: known must have one factored mapping for each of the {len(self.sources)} sources, "
                 f"got {len(self.known)}"  # type: ignore[arg-type]
             )
+        self._check_sources_by_action()
+
+    def _check_sources_by_action(self) -> None:
+        numbers, known = self.sources_by_action, self.known_by_action
+        if not numbers:
+            return
+        if isinstance(known, Sequence) and len(numbers) != len(known):
+            raise ValueError(
+                f"{self.name}: sources_by_action must have one number for each of the {len(known)} mappings of "
+                f"known_by_action, got {len(numbers)}"
+            )
+        if not set(numbers) <= set(range(len(self.sources))):
+            raise ValueError(
+                f"{self.name}: sources_by_action must have numbers of the {len(self.sources)} sources, counted from 0, "
+                f"got {tuple(numbers)!r}"
+            )
 
     @property
     def budget(self) -> str:
@@ -163,7 +179,11 @@ def check_name(name: object) -> None:
 
 
 def described(value: Any) -> Any:
-    """Return a value as JSON can hold it: functions by name, with what they are called with, and others as their ``repr``."""
+    """
+    Return a value as JSON can hold it: functions by name, with what they are called with, and others as their ``repr``.
+
+    Objects without a ``repr`` of their own, which names their place in memory, by their class.
+    """
     if isinstance(value, functools.partial):
         keywords = {name: described(each) for name, each in value.keywords.items()}
         return {"function": described(value.func), "arguments": [described(each) for each in value.args], **keywords}
@@ -173,4 +193,6 @@ def described(value: Any) -> Any:
         return {str(name): described(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
         return [described(each) for each in value]
+    if type(value).__repr__ is object.__repr__:
+        return f"{type(value).__module__}.{type(value).__qualname__}"
     return value if value is None or isinstance(value, bool | int | float | str) else repr(value)

@@ -15,11 +15,10 @@ from sb3_combrel.experiments.benchmark.methods import NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.benchmark.scores import (
-    ALPHA,
     FEWEST_RUNS,
     MEASURES,
     Cell,
-    Comparison,
+    MethodScores,
     cells_of,
     compare,
     mean_ranks,
@@ -27,8 +26,8 @@ from sb3_combrel.experiments.benchmark.scores import (
     ranks,
 )
 from sb3_combrel.experiments.report import Table, csv_text, p_text, without_minus_zero, write_tables
-from sb3_combrel.experiments.statistics import Estimate
-from sb3_combrel.experiments.transfer_measures import Comparison as MeasuredDifference
+from sb3_combrel.experiments.statistics import ALPHA, Estimate
+from sb3_combrel.experiments.transfer_measures import Comparison
 
 OVERVIEW, PAGE, RUNS = "overview", "benchmark", "runs.csv"
 _EMPTY = "-"
@@ -84,7 +83,7 @@ def write_report(
     return [*made, page]
 
 
-def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Comparison]) -> Table:
+def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, MethodScores]) -> Table:
     """
     Make the table of a pair: a row for each method.
 
@@ -145,11 +144,11 @@ def number_text(number: float) -> str:
     return f"{without_minus_zero(number, digits):,.{digits}f}"
 
 
-def _measure_text(pair: Pair, found: Comparison, measure: str) -> str:
+def _measure_text(pair: Pair, found: MethodScores, measure: str) -> str:
     """The effect of a measure against no transfer and, in brackets, its corrected p-value."""
     if found.measures is None:
         return _EMPTY
-    comparison: MeasuredDifference | None = getattr(found.measures, measure_name(pair, measure))
+    comparison: Comparison | None = getattr(found.measures, measure_name(pair, measure))
     if comparison is None or not np.isfinite(comparison.effect):
         return _EMPTY
     p_value = found.p_values[measure]
@@ -160,7 +159,7 @@ def _measure_text(pair: Pair, found: Comparison, measure: str) -> str:
 
 
 def rank_table(
-    methods: Sequence[Method], cells: Mapping[str, Mapping[str, Cell]], compared: Mapping[str, Mapping[str, Comparison]]
+    methods: Sequence[Method], cells: Mapping[str, Mapping[str, Cell]], compared: Mapping[str, Mapping[str, MethodScores]]
 ) -> Table:
     """
     Make the table of mean ranks: and in how many pairs a method is better and worse than no transfer, by the corrected tests.
@@ -188,7 +187,7 @@ def performance_table(
     pairs: Sequence[Pair],
     methods: Sequence[Method],
     cells: Mapping[str, Mapping[str, Cell]],
-    compared: Mapping[str, Mapping[str, Comparison]],
+    compared: Mapping[str, Mapping[str, MethodScores]],
 ) -> Table:
     """
     Make the table of performance: interquartile means, and ranks in brackets; a row for each method, a column for each pair.

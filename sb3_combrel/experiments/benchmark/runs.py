@@ -14,7 +14,7 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.experiments.benchmark.methods import Method, Sources
+from sb3_combrel.experiments.benchmark.methods import Method, Sources, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.result_files import run_name
 from sb3_combrel.experiments.runs import chosen_on_purpose
@@ -100,7 +100,7 @@ class BenchmarkJob:
 
     def answered_by(self, result: Outcome) -> bool:
         """Whether a result is that of this job. A run that failed is tried again, for the reason may have gone."""
-        return result.succeeded and result.pair == self.pair.name
+        return result.succeeded and (result.pair, result.method) == (self.pair.name, self.method.name)
 
     def outcome(self, **found: Any) -> Outcome:
         """Make an outcome of this job."""
@@ -248,6 +248,6 @@ def jobs_of(
     for seed in seeds:
         for pair in (pair for pair in pairs if pair.name in sources):
             for method in methods:
-                job = BenchmarkJob(pair, by_name.get(method.run_as(pair), method), seed, sources[pair.name])
+                job = BenchmarkJob(pair, by_name[run_as(method, methods, pair)], seed, sources[pair.name])
                 jobs.setdefault(job.name, job)
     return list(jobs.values())

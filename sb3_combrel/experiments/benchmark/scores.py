@@ -9,25 +9,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from sb3_combrel.experiments.benchmark.methods import NONE, Method
+from sb3_combrel.experiments.benchmark.methods import NONE, Method, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import Outcome
-from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.statistics import Estimate, holm, interquartile_mean, p_value_of_difference
-from sb3_combrel.experiments.transfer_measures import (
-    LearningCurves,
-    TransferMeasures,
-    compare_learning,
-    total_reward,
-    total_reward_by_steps,
-)
+from sb3_combrel.experiments.bootstrap import bootstrap_band, resampled
+from sb3_combrel.experiments.learning_curves import curves_of
+from sb3_combrel.experiments.learning_measures import counts_within, total_reward, total_reward_by_steps
+from sb3_combrel.experiments.statistics import Estimate, holm_by_name, interquartile_mean, p_value_of_difference
+from sb3_combrel.experiments.transfer_measures import TransferMeasures, compare_learning
 
 #: With fewer runs of each method there are neither intervals nor tests.
 FEWEST_RUNS = 3
-#: Level of a test, after Holm's correction over the rows of a pair's table.
-ALPHA = 0.05
-#: Episodes of the jumpstart, and of the asymptotic performance; fewer where a run has fewer.
-N_FIRST, N_LAST = 5, 10
 #: Taylor & Stone's measures, by the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`; the areas
 #: are those over environment steps where the budget is in steps.
 MEASURES = ("jumpstart", "asymptotic_performance", "total_reward", "transfer_ratio", "time_to_threshold")
@@ -51,7 +43,7 @@ class Cell:
     run_as: str = ""
 
 
-class Comparison(NamedTuple):
+class MethodScores(NamedTuple):
     """
     A method against no transfer.
 
@@ -77,28 +69,23 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Outcome],
     Gather the outcomes of a pair by method.
 
     :param pair: the pair
-    :param methods: the methods
+    :param methods: all that are chosen
     :param outcomes: of any runs
     :param seeds: seeds that count
     """
     own = sorted((each for each in outcomes if each.pair == pair.name and each.seed in seeds), key=lambda each: each.seed)
     cells = {}
     for method in methods:
-        run_as = method.run_as(pair)
-        of_method = [each for each in own if each.method == run_as]
+        name = run_as(method, methods, pair)
+        of_method = [each for each in own if each.method == name]
         misfits = [each.misfit for each in of_method if each.misfit]
         cells[method.name] = Cell(
             tuple(each for each in of_method if each.succeeded),
             misfits[0] if misfits else "",
             {each.seed: each.error for each in of_method if each.error},
-            run_as,
+            name,
         )
     return cells
-
-
-def curves_of(outcomes: Sequence[Outcome]) -> LearningCurves:
-    """Return the learning curves of some runs."""
-    return LearningCurves.from_rows([each.returns for each in outcomes], [each.steps for each in outcomes])
 
 
 def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
@@ -118,7 +105,7 @@ def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]
     return {name: total_reward_by_steps(each, n_steps) / n_steps for name, each in curves.items()}
 
 
-def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, Comparison]:
+def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
     """
     Compare the methods of a pair with no transfer, where that has been run.
 
@@ -137,12 +124,12 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, Comparison]:
         measures[name] = _measures(pair, cells[name], cells[NONE], floor)
         enough = min(len(its_own), len(without)) >= FEWEST_RUNS
         raw[name] = p_value_of_difference(its_own, without, "permutation") if enough else np.nan
-    corrected = _holm(raw)
-    of_measures = {measure: _holm(_p_values(pair, measures, measure)) for measure in MEASURES}
+    corrected = holm_by_name(raw)
+    of_measures = {measure: holm_by_name(_p_values(pair, measures, measure)) for measure in MEASURES}
     found = {}
     for name, its_own in of_runs.items():
         tested = cells[name].run_as if cells[name].run_as in measures else name
-        found[name] = Comparison(
+        found[name] = MethodScores(
             its_own,
             interquartile(its_own),
             corrected.get(tested, np.nan),
@@ -167,13 +154,13 @@ def measure_name(pair: Pair, measure: str) -> str:
 
 
 def _measures(pair: Pair, cell: Cell, without: Cell, floor: float) -> TransferMeasures:
-    both = curves_of(cell.outcomes), curves_of(without.outcomes)
-    shortest = int(min(each.n_episodes.min() for each in both))
+    curves, curves_without = curves_of(cell.outcomes), curves_of(without.outcomes)
+    shortest = int(min(each.n_episodes.min() for each in (curves, curves_without)))
     return compare_learning(
-        *both,
+        curves,
+        curves_without,
         threshold=pair.threshold,
-        n_first=min(N_FIRST, shortest),
-        n_last=min(N_LAST, shortest),
+        **counts_within(shortest),
         floor=min(0.0, floor),
     )
 
@@ -187,10 +174,6 @@ def _p_values(pair: Pair, measures: Mapping[str, TransferMeasures], measure: str
         else:
             found[name] = comparison.p_value
     return found
-
-
-def _holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    return dict(zip(p_values, holm(np.array(list(p_values.values()))).tolist(), strict=True))
 
 
 def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, float]:
@@ -249,13 +232,13 @@ def mean_ranks(
     drawn: dict[str, list[np.ndarray]] = {}
     for pair, of_pair in distinct.items():
         means = [np.array([interquartile_mean(each)]) for each in of_pair.values()]
-        resampled = [_resampled(each, n_resamples, rng) for each in of_pair.values()]
+        draws = [resampled(each[:, None], interquartile_mean, n_resamples, rng)[:, 0] for each in of_pair.values()]
         enough = min(map(len, of_pair.values()), default=0) >= FEWEST_RUNS
-        of_means, of_draws = (dict(zip(of_pair, _stretched(each, most), strict=True)) for each in (means, resampled))
+        of_means, of_draws = (dict(zip(of_pair, _stretched(each, most), strict=True)) for each in (means, draws))
         for name in performance[pair]:
-            run_as = cells[pair][name].run_as
-            observed.setdefault(name, []).append(float(of_means[run_as][0]))
-            drawn.setdefault(name, []).append(of_draws[run_as] if enough else np.full(n_resamples, np.nan))
+            runs_of = cells[pair][name].run_as
+            observed.setdefault(name, []).append(float(of_means[runs_of][0]))
+            drawn.setdefault(name, []).append(of_draws[runs_of] if enough else np.full(n_resamples, np.nan))
     found = {}
     for name, of_pairs in observed.items():
         low, high = np.percentile(np.mean(drawn[name], axis=0), (2.5, 97.5)).tolist()
@@ -274,9 +257,3 @@ def _stretched(means: Sequence[np.ndarray], most: int) -> np.ndarray:
         return np.zeros((0, 0))
     found = stats.rankdata(-np.array(means), axis=0)
     return np.ones_like(found) if len(found) < 2 else 1.0 + (found - 1.0) * (most - 1.0) / (len(found) - 1.0)
-
-
-def _resampled(samples: np.ndarray, n_resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """The interquartile mean of each draw of runs, shape (n_resamples,)."""
-    drawn = rng.integers(len(samples), size=(n_resamples, len(samples)))
-    return interquartile_mean(samples[drawn], axis=1)

@@ -30,13 +30,14 @@ def load_attribute(argument: str, text: str) -> tuple[Any, str]:
 
 
 def _load(argument: str, place: str) -> tuple[ModuleType, str]:
+    is_file = place.endswith(".py")
+    if is_file and not Path(place).is_file():
+        raise ValueError(f"{argument}: there is no file {place}")
     try:
-        module = _of_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    except FileNotFoundError:
-        raise ValueError(f"{argument}: there is no file {place}") from None
+        module = _of_file(Path(place)) if is_file else importlib.import_module(place)
     except Exception as error:  # whatever the module raises
         raise ValueError(f"{argument}: {place} cannot be imported: {type(error).__name__}: {error}") from error
-    if not module.__name__.startswith("sb3_combrel."):
+    if module.__name__.partition(".")[0] != "sb3_combrel":
         # Workers need not have it: what it defines goes to them with the job.
         cloudpickle.register_pickle_by_value(module)
     return module, _digest(Path(module.__file__)) if module.__file__ else ""

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of
+from sb3_combrel.experiments.learning_measures import counts_within
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.paper.methods import METHODS, NO_TRANSFER
 from sb3_combrel.experiments.paper.runs import Result
 from sb3_combrel.experiments.report import Table, p_text, without_minus_zero
 from sb3_combrel.experiments.statistics import holm
-from sb3_combrel.experiments.transfer_measures import Comparison, LearningCurves, compare_learning
+from sb3_combrel.experiments.transfer_measures import Comparison, compare_learning
 
-#: Episodes of the jumpstart and of the asymptotic performance.
-N_FIRST, N_LAST = 5, 10
 #: Columns of the table, and the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`.
 _COLUMNS = {
     "jumpstart": "jumpstart",
@@ -37,12 +37,11 @@ def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
     have = {result.method for result in results}
     curves = {method: _curves(results, method) for method in METHODS if method in have}
     without = curves.pop(NO_TRANSFER)
-    # The least return that an episode can have, the same for all rows: of a step it is -1 in both domains.
+    # The ratio depends on it: the lowest return of any run, the same for all rows.
     floor = float(min(result_curves.returns.min() for result_curves in (without, *curves.values())))
     threshold = -float(domain.thresholds[-1]) if domain.name != "icub" else 100.0 - domain.thresholds[-1]
-    n_episodes = without.returns.shape[1]
     # In a short trial all episodes are the first, and the last.
-    counts = {"n_first": min(N_FIRST, n_episodes), "n_last": min(N_LAST, n_episodes)}
+    counts = counts_within(without.returns.shape[1])
     found = {
         method: compare_learning(its_own, without, threshold=threshold, floor=floor, **counts)
         for method, its_own in curves.items()
@@ -62,7 +61,7 @@ def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
 
 def _curves(results: Sequence[Result], method: str) -> LearningCurves:
     runs = sorted((result for result in results if result.method == method), key=lambda result: result.seed)
-    return LearningCurves.from_rows([run.returns for run in runs], [run.steps for run in runs])
+    return curves_of(runs)
 
 
 def _cell(comparison: Comparison, p_value: float, percent: bool) -> str:

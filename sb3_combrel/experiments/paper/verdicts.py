@@ -14,10 +14,8 @@ from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.curves import WINDOW
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
 from sb3_combrel.experiments.report import Table, p_text, without_minus_zero
-from sb3_combrel.experiments.statistics import holm, p_value_of_difference, steps_to_reach
+from sb3_combrel.experiments.statistics import ALPHA, holm, p_value_of_difference, steps_to_reach
 
-#: Significance level, after Holm's correction over the rows of a table.
-ALPHA = 0.05
 HELD, NOT_HELD, OPPOSITE = "held", "not held", "opposite"
 PAPERS, CONTROL = "paper", "control"
 
@@ -102,7 +100,7 @@ def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verd
     Judge all claims of a kind whose methods have been run.
 
     The steps of all of a run's episodes, the area under its learning curve, are compared. A claim held if the better method
-    takes fewer, with a corrected p-value below :data:`ALPHA`; the opposite if it takes more, with such a p-value.
+    takes fewer, with a corrected p-value below ``ALPHA``; the opposite if it takes more, with such a p-value.
 
     :param steps: by domain and method the steps of each run's episodes, shape (n_runs, n_episodes)
     :param kind: "paper" or "control"

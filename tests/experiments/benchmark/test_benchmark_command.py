@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 
+import cloudpickle
 import pytest
 from helpers.benchmark_files import PAGE, call, command, fail, succeed, write_files
 from helpers.clusters import dask_cluster
@@ -15,6 +16,7 @@ from sb3_combrel.experiments import carrying_out
 from sb3_combrel.experiments.benchmark.methods import METHODS
 from sb3_combrel.experiments.benchmark.page import main as take_into_docs
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
+from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.experiments.pages import include
 from sb3_combrel.experiments.result_files import RESULTS, TIMES
 
@@ -296,6 +298,11 @@ class TestBadInput:
         monkeypatch.chdir(tmp_path)
         assert "pairs: bad.py cannot be imported: ZeroDivisionError: division by zero" in fail("--pairs", "bad.py")
 
+    def test_a_file_that_lacks_another_is_not_the_one_that_is_missing(self, tmp_path, monkeypatch):
+        (tmp_path / "bad.py").write_text("open('table.csv')\n")
+        monkeypatch.chdir(tmp_path)
+        assert re.search(r"pairs: bad.py cannot be imported: FileNotFoundError: .*table.csv", fail("--pairs", "bad.py"))
+
     def test_a_pair_that_has_changed_since(self, copied, files, tmp_path):
         changed = tmp_path / "two_walks.py"
         changed.write_text((files / "two_walks.py").read_text().replace("n_episodes=6", "n_episodes=7"))
@@ -307,6 +314,25 @@ class TestBadInput:
         (tmp_path / "other.py").write_text(text)
         message = fail("--pairs", files / "two_walks.py", tmp_path / "other.py", "--output", tmp_path / "out")
         assert "other: another pair has a source of the name 'walk' that is recorded in another way" in message
+
+    def test_two_sources_of_one_name_in_two_calls(self, copied, files, tmp_path):
+        text = (files / "two_walks.py").read_text().replace("two-walks", "other").replace("n_episodes=5", "n_episodes=4")
+        (tmp_path / "other.py").write_text(text)
+        message = fail("--pairs", tmp_path / "other.py", "--methods", "none", *TINY, "--output", copied)
+        assert "has results of other settings (source walk was" in message
+
+    def test_runs_that_would_have_the_same_files(self, files, tmp_path):
+        for name in ("a", "a_b"):
+            (tmp_path / f"{name}.py").write_text((files / "two_walks.py").read_text().replace("two-walks", name))
+        methods = "from sb3_combrel import COMBREL\nb_c, c = (lambda source, pair: COMBREL(source) for _ in range(2))\n"
+        (tmp_path / "methods.py").write_text(methods)
+        args = ("--pairs", tmp_path / "a.py", tmp_path / "a_b.py", "--methods")
+        message = fail(*args, *(f"{tmp_path / 'methods.py'}:{name}" for name in ("b_c", "c")), "--output", tmp_path / "out")
+        assert "the runs of c on a_b and of b_c on a would have the same files" in message
+
+    def test_what_the_package_has_is_sent_by_name(self):
+        load_attribute("methods", "sb3_combrel:COMBREL")
+        assert "sb3_combrel" not in cloudpickle.list_registry_pickle_by_value()
 
 
 @pytest.mark.integration

@@ -347,6 +347,9 @@ class TestCartWithPendulum:
         assert turned[0] != turned[1]
 
 
+SAME = InterTaskMapping((0, 1), (0, 1))
+
+
 class TestPairArguments:
     @pytest.mark.parametrize(
         "options, words",
@@ -358,6 +361,8 @@ class TestPairArguments:
             ({"threshold": np.nan}, "threshold must be .* got nan"),
             ({"sources": ()}, "sources must be a tuple of at least one Source"),
             ({"known": (FactoredMapping((disguise(ORDER, SIGNS, ACTIONS),)),) * 2}, "each of the 1 sources, got 2"),
+            ({"known_by_action": (SAME,) * 2, "sources_by_action": (0,)}, "sources_by_action must .* 2 mappings .* got 1"),
+            ({"known_by_action": SAME, "sources_by_action": (0, 1)}, r"numbers of the 1 sources, .*, got \(0, 1\)"),
         ],
     )
     def test_wrong_ones_are_named(self, options, words):
@@ -374,3 +379,20 @@ class TestPairArguments:
         assert described(one.learn) != described(other.learn)
         assert PAIRS["icub"].settings() != replace(PAIRS["icub"], n_steps=4999).settings()
         assert PAIRS["icub"].settings() == replace(PAIRS["icub"], description="In other words.").settings()
+
+    def test_settings_are_the_same_in_another_process(self):
+        class Maker:
+            def __call__(self):
+                return gym.make("CartPole-v1")
+
+        # Two objects have two places in memory, as one object has in two processes.
+        one, other = (Pair("p", "", (recorded("s", Maker()),), Maker(), n_episodes=1) for _ in range(2))
+        assert one.settings() == other.settings()
+
+
+def test_a_result_answers_its_own_job_only():
+    """File systems may not tell capitals apart, so names of runs do not."""
+    jobs = [BenchmarkJob(PAIRS["icub"], Method(name, "", None), 1, ()) for name in ("Mine", "mine")]
+    assert jobs[0].name == jobs[1].name
+    result = jobs[0].outcome(steps=[1])
+    assert jobs[0].answered_by(result) and not jobs[1].answered_by(result)

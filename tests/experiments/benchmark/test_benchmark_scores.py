@@ -17,7 +17,7 @@ from sb3_combrel.experiments.benchmark.report import (
     rank_table,
     write_report,
 )
-from sb3_combrel.experiments.benchmark.runs import Outcome
+from sb3_combrel.experiments.benchmark.runs import Outcome, jobs_of
 from sb3_combrel.experiments.benchmark.scores import Cell, cells_of, compare, interquartile, mean_ranks, performances, ranks
 from sb3_combrel.experiments.statistics import holm
 from sb3_combrel.experiments.suite_tasks import Source
@@ -105,6 +105,14 @@ class TestRanks:
         compared = compare(pair, cells)
         assert note_of("b", cells["b"]) == "the same as c"
         np.testing.assert_array_equal(compared["b"].performance, compared["c"].performance)
+
+    def test_a_method_is_run_by_itself_where_the_one_that_makes_the_same_is_not_chosen(self):
+        pair, methods = pair_of(), [method_of(NONE), method_of("b", same_as="c")]
+        jobs = jobs_of([pair], methods, range(5), {pair.name: ()})
+        assert [job.method.name for job in jobs[:2]] == [NONE, "b"]
+        outcomes = [job.outcome(returns=[1.0], steps=[1], terminated=[True]) for job in jobs]
+        cells = cells_of(pair, methods, outcomes, range(5))
+        assert len(cells["b"].outcomes) == 5 and note_of("b", cells["b"]) == ""
 
     def test_mean_ranks_are_those_of_a_naive_computation(self):
         levels = {"one": {"a": 0.0, "b": 0.2, "c": 0.4}, "two": {"a": 0.3, "b": 0.0, "c": 0.2}}

@@ -1,7 +1,5 @@
 """``sb3-combrel reproduce``: figures, tables, resuming, engines, bad input. Most runs are cut off early, to take a second."""
 
-import contextlib
-import io
 import itertools
 import json
 import os
@@ -12,13 +10,14 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 
 import pytest
+from helpers import command_line
 from helpers.clusters import HOST, dask_cluster, free_port
 from helpers.paper_results import made_up
 from imageio.v3 import imread
 
-from sb3_combrel import cli
 from sb3_combrel.experiments import carrying_out
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper import reproduce
@@ -32,30 +31,7 @@ TABLES = {"table2": 3, "table4": 2, "table5": 1, "table6": 4, "measures": 2}
 TINY = ("--runs", "2", "--episodes", "2", "--jobs", "2")
 
 
-def call(*args):
-    """Exit status, standard output, and standard error of a call in this process."""
-    output, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
-        try:
-            status = cli.main(["reproduce", *map(str, args)])
-        except SystemExit as error:
-            status = error.code
-    return status, output.getvalue(), errors.getvalue()
-
-
-def succeed(*args):
-    status, output, errors = call(*args)
-    assert status == 0, errors
-    return output
-
-
-def fail(*args):
-    """The one line that a call which fails writes."""
-    status, output, errors = call(*args)
-    assert status == 1, (output, errors)
-    assert errors.startswith("sb3-combrel: ") and errors.count("\n") == 1
-    assert "Traceback" not in output + errors
-    return errors
+call, succeed, fail = (partial(each, "reproduce") for each in (command_line.call, command_line.succeed, command_line.fail))
 
 
 def results_in(folder):
