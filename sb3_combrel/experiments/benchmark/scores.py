@@ -101,8 +101,14 @@ def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]
     curves = {name: curves_of(cell.outcomes) for name, cell in cells.items() if cell.outcomes}
     if pair.n_steps is None:
         return {name: total_reward(each, pair.n_episodes) / float(pair.n_episodes or 1) for name, each in curves.items()}
-    n_steps = int(min((each.n_steps.min() for each in curves.values()), default=1))
+    n_steps = _steps_of_all(cells)
     return {name: total_reward_by_steps(each, n_steps) / n_steps for name, each in curves.items()}
+
+
+def _steps_of_all(cells: Mapping[str, Cell]) -> int:
+    """Environment steps that each run has in episodes that have ended: what is measured over steps ends there, in all rows."""
+    curves = (curves_of(cell.outcomes) for cell in cells.values() if cell.outcomes)
+    return int(min((each.n_steps.min() for each in curves), default=1))
 
 
 def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
@@ -117,11 +123,12 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
     without = of_runs.get(NONE)
     raw, measures = {}, {}
     floor = min((min(each.returns) for name in of_runs for each in cells[name].outcomes), default=0.0)
+    n_steps = _steps_of_all(cells)
     for name, its_own in of_runs.items():
         # Of methods whose runs are the same, one is tested.
         if without is None or name == NONE or (cells[name].run_as != name and cells[name].run_as in of_runs):
             continue
-        measures[name] = _measures(pair, cells[name], cells[NONE], floor)
+        measures[name] = _measures(pair, cells[name], cells[NONE], floor, n_steps)
         enough = min(len(its_own), len(without)) >= FEWEST_RUNS
         raw[name] = p_value_of_difference(its_own, without, "permutation") if enough else np.nan
     corrected = holm_by_name(raw)
@@ -153,7 +160,7 @@ def measure_name(pair: Pair, measure: str) -> str:
     return f"{measure}_by_steps" if measure in _AREAS and pair.n_steps is not None else measure
 
 
-def _measures(pair: Pair, cell: Cell, without: Cell, floor: float) -> TransferMeasures:
+def _measures(pair: Pair, cell: Cell, without: Cell, floor: float, n_steps: int) -> TransferMeasures:
     curves, curves_without = curves_of(cell.outcomes), curves_of(without.outcomes)
     shortest = int(min(each.n_episodes.min() for each in (curves, curves_without)))
     return compare_learning(
@@ -162,6 +169,7 @@ def _measures(pair: Pair, cell: Cell, without: Cell, floor: float) -> TransferMe
         threshold=pair.threshold,
         **counts_within(shortest),
         floor=min(0.0, floor),
+        n_steps=n_steps,
     )
 
 

@@ -191,6 +191,14 @@ class TestComparison:
         assert found.total_reward.effect == pytest.approx(difference.sum(axis=1).mean())
         assert found.floor == pytest.approx(min(min(each.returns) for cell in cells.values() for each in cell.outcomes))
 
+    def test_areas_over_steps_end_at_the_same_step_in_all_rows(self):
+        steps = {NONE: 10, "a": 10, "shorter": 4}
+        outcomes = [outcome("made-up", name, seed, [1.0 * seed] * 8, [n] * 8) for name, n in steps.items() for seed in range(3)]
+        pair = pair_of(n_steps=80)
+        found = compare(pair, cells_of(pair, [method_of(name) for name in steps], outcomes, range(3)))
+        # The shortest run of all methods has 32 steps; the returns are the seed's.
+        assert found["a"].measures.total_reward_by_steps.with_transfer.tolist() == [0.0, 32.0, 64.0]
+
     def test_without_no_transfer_nothing_is_compared(self):
         pair, cells = cells_by({"a": 0.0, "b": 1.0})
         found = compare(pair, cells)
