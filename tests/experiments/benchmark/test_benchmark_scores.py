@@ -193,7 +193,8 @@ class TestComparison:
 
     def test_areas_over_steps_end_at_the_same_step_in_all_rows(self):
         steps = {NONE: 10, "a": 10, "shorter": 4}
-        outcomes = [outcome("made-up", name, seed, [1.0 * seed] * 8, [n] * 8) for name, n in steps.items() for seed in range(3)]
+        runs = [(name, seed) for name in steps for seed in range(3)]
+        outcomes = [outcome("made-up", name, seed, [1.0 * seed] * 8, [steps[name]] * 8) for name, seed in runs]
         pair = pair_of(n_steps=80)
         found = compare(pair, cells_of(pair, [method_of(name) for name in steps], outcomes, range(3)))
         # The shortest run of all methods has 32 steps; the returns are the seed's.
