@@ -47,3 +47,13 @@ class RecordedTransitions:
         """Return all of them, one a row: state, effect, reward, action; shape (n, 2 * n_variables + 2)."""
         n = self.n
         return np.hstack([self.states[:n], self.effects[:n], self.rewards[:n, None], self.actions[:n, None]])
+
+    def restore(self, rows: np.ndarray, n_actions: int) -> None:
+        """
+        Record what :meth:`rows` returned once more; for a new object.
+
+        :param n_actions: number of target actions; whatever a file says, only these are recorded
+        """
+        d = self.states.shape[1]
+        for row in rows:
+            self.add(row[:d], int(np.clip(row[-1], 0, n_actions - 1)), float(row[-2]), row[d : 2 * d])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
@@ -15,7 +15,6 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.borne_out import GOES_ON, Outcomes
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
 from sb3_combrel.transfer.copy_sums import LARGEST_MISS
-from sb3_combrel.transfer.mapping_transfer import check_boolean
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.soft_mapping import (
     FitData,

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-
 import numpy as np
 
 from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.mappings.factored_mapping import describe_both_sides, describe_copy
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import GOES_ON, TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
-from sb3_combrel.transfer.candidates import Candidate, MappedVariables
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior_choice import Choice, Chooser, moved
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.source_use import SourceUse
 
 FIRST_RENEWAL = 10
 # Choice and trust are renewed whenever this many times as much has been observed as at the last time.
@@ -34,7 +30,7 @@ MIN_EXPLAINED = 0.5
 TRUST_STEP = 0.1
 
 
-class SourcePrior:
+class SourcePrior(SourceUse):
     """
     What a source predicts of the target, through a mapping that is given or chosen by compliance.
 
@@ -60,6 +56,8 @@ class SourcePrior:
         predict. Equal to ``max_transitions``, it is chosen once
     """
 
+    candidates: PriorCandidates
+
     def __init__(
         self,
         copies: Copies,
@@ -71,16 +69,16 @@ class SourcePrior:
         transfer_terminals: bool = True,
         first_renewal: int = FIRST_RENEWAL,
     ):
-        self.copies = copies
         self.task = task
+        self.sources = copies.sources
+        self.copies = copies
+        self.candidates = PriorCandidates(copies, task)
         self.whole = whole
         self._choose = None if isinstance(choose, Choice) else choose
         self.max_transitions = 0 if self._choose is None else max_transitions
         self.transfer_terminals = transfer_terminals
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
-        self.n_observed = 0
         self.n_switches = 0
-        self.version = 0
         self.trust = np.zeros(task.n_actions)
         # Whether the source's effects on each variable are used, by target action.
         self.explains = np.ones((task.n_actions, task.n_variables), dtype=np.bool_)
@@ -97,8 +95,6 @@ class SourcePrior:
         self._renewal_due = float(first_renewal)
         self._all_measured = max(ALL_MEASURED, first_renewal)
         self._warned = False
-        self._uses: Counter[tuple[int, ...]] = Counter()
-        self._candidates: list[tuple[int, ...]] = []
         self.choice: Choice | None = None
         self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
         if isinstance(choose, Choice):
@@ -197,7 +193,7 @@ class SourcePrior:
         self.n_claimed += bool(self._claimed(end, weight, actions)[0] > 0.0)
         self._compare(state, action, effect, predicted_effect[0], float(weight[0]))
         self.outcomes.note(float(weight[0]), float(end[0]), float(r[0]), reward, terminated)
-        self._uses[self._key(action)] += 1
+        self.candidates.note_use(action, self._moved(action))
         if not recorded:
             self.copies.follow(self._used, action, effect, predicted, self.sums)
 
@@ -356,72 +352,27 @@ class SourcePrior:
             found[a] = np.prod(means) if means else np.nan
         return found
 
-    def copy_mapping(self, copy: int, action: tuple[int, ...] | None = None) -> InterTaskMapping:
-        """
-        Return a copy as an inter-task mapping, with names.
-
-        :param action: source action of each target action; None: 0 throughout
-        """
-        return self.copies.mapping(copy, self.task, action or (0,) * self.task.n_actions)
-
     def describe(self) -> str:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
-        choice, names = self.choice, self.task.action_names
-        moves = [[] if choice is None else moved(choice, a) for a in range(self.task.n_actions)]
-        return "; ".join(
-            f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True)
-        )
+        return self.candidates.describe_choice(self.choice)
 
-    def describe_action(self, choice: Choice, action: int) -> str:
-        """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
-        return self._describe_moves(moved(choice, action), describe_copy)
+    @property
+    def makes_choices(self) -> bool:
+        return True
 
-    def _describe_moves(self, moves: Sequence[tuple[int, int]], variables_of: Callable[[InterTaskMapping], str]) -> str:
-        words = (f"{self._action_name(copy, used)} on {variables_of(self.copy_mapping(copy))}" for copy, used in moves)
-        return ", ".join(words) if moves else "nothing"
-
-    def _action_name(self, copy: int, used: int) -> str:
-        return self.copies.sources[self.copies.source[copy]].action_names[used]
-
-    def _key(self, action: int) -> tuple[int, ...]:
-        """A target action and what it is made of, as numbers; listed as a candidate."""
-        key = (action, *(number for pair in self._moved(action) for number in pair))
-        if key not in self._uses:
-            self._candidates.append(key)
-            self._uses[key] = 0
-        return key
+    def choices_by_action(self) -> np.ndarray:
+        """The candidate in use for each target action, int64, shape (n_target_actions,), -1 for none."""
+        moves = [self._moved(a) for a in range(self.task.n_actions)]
+        return np.array([self.candidates.number(a, of) if of else -1 for a, of in enumerate(moves)], dtype=np.int64)
 
     def choices(self) -> np.ndarray:
-        """The candidate in use for each target action, int64, shape (n_target_actions,), -1 for none."""
-        keys = [self._key(a) if self._moved(a) else None for a in range(self.task.n_actions)]
-        return np.array([-1 if key is None else self._candidates.index(key) for key in keys], dtype=np.int64)
+        return np.repeat(self.choices_by_action(), len(self.task.sample_states))
 
-    def candidate(self, number: int) -> Candidate:
-        """A candidate's parts, by name."""
-        action, *rest = self._candidates[number]
-        moves = list(zip(rest[::2], rest[1::2], strict=True))
-        names = " + ".join(self._action_name(copy, used) for copy, used in moves) or "nothing"
-        return Candidate(action, names, " + ".join(describe_copy(self.copy_mapping(copy)) for copy, _ in moves))
-
-    def mapped_variables(self, number: int) -> MappedVariables:
-        """What a candidate makes of each target variable, in numbers."""
-        action, *rest = self._candidates[number]
-        found = MappedVariables.none(action, self.task.n_variables)
-        for copy, used in zip(rest[::2], rest[1::2], strict=True):
-            has = self.copies.state[copy] >= 0
-            found.source[has] = self.copies.source[copy]
-            found.variable[has] = self.copies.state[copy, has]
-            found.sign[has] = np.where(self.copies.sign[copy, has] < 0, -1, 1)
-            found.action[has] = used
-        return found
+    def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return self.choices_by_action()[actions]
 
     def uses(self) -> dict[int, int]:
-        """For how many of the target's transitions each candidate was in use."""
-        return {number: self._uses[key] for number, key in enumerate(self._candidates) if self._uses[key]}
-
-    def source_action_names(self) -> list[str]:
-        """The names of the source actions, or of several at once, of all candidates."""
-        return list(dict.fromkeys(self.candidate(number).source_action for number in range(len(self._candidates))))
+        return self.candidates.uses()
 
     # -------------------------------------------------------------------- saving
 
@@ -433,7 +384,6 @@ class SourcePrior:
             chosen[0] = 0.0
             for row, array in zip(chosen[1:], self.choice, strict=True):
                 row[:, : array.shape[1]] = array
-        uses = [[self._uses[key], *key, *[-1] * (2 * d + 1 - len(key))] for key in self._candidates]
         figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, self._n_slots()
         return {
             "transitions": np.column_stack([self.transitions.rows(), self._ended[:n]]),
@@ -443,7 +393,7 @@ class SourcePrior:
             "prior_outcomes": self.outcomes.get_state(),
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": np.concatenate([[float(self.n_claimed)], self.errors.sums.ravel()]),
-            "prior_uses": np.array(uses, dtype=np.float64).reshape(-1, 2 * d + 2),
+            "prior_uses": self.candidates.get_state(),
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
 
@@ -473,8 +423,4 @@ class SourcePrior:
         self.n_claimed = int(state["prior_errors"][0])
         self.errors.sums.ravel()[:] = state["prior_errors"][1:]
         self._claims = self.outcomes.doubted, self._ends_believed
-        self._candidates, self._uses = [], Counter()
-        for n, *key in state["prior_uses"].astype(np.int64).tolist():
-            kept = tuple(key[: 1 + 2 * sum(number >= 0 for number in key[1::2])])
-            self._candidates.append(kept)
-            self._uses[kept] = n
+        self.candidates.set_state(state["prior_uses"])
