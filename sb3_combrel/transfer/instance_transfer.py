@@ -18,6 +18,8 @@ from sb3_combrel.transfer.translation import Translator
 # Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
 RELEVANCE_GROWTH = 1.2
 MIN_TRANSITIONS_FOR_RELEVANCE = 50
+#: What stands in files that do not say by how many transitions relevance was measured: by all that were used.
+ALL_USED = -1
 
 
 class MeasureRelevance(Protocol):
@@ -51,6 +53,7 @@ class InstanceTransfer(SourceUse):
         self.breadth_decay = breadth_decay
         self.measure_relevance = measure_relevance
         self._by_relevance = translator.rules.by_relevance
+        # Recorded transitions that relevance was last measured by.
         self._n_of_relevance = 0
         #: Compares what was transferred with what happened, wherever the agent acted on it.
         self.check = InstancesCheck(self.sources, float(task.exploration_threshold))
@@ -160,6 +163,7 @@ class InstanceTransfer(SourceUse):
             "instances_used": np.array([float(self._instances_used)]),
             "check": self.check.get_state(),
             "errors": np.concatenate([[float(self.n_observed)], self.errors.sums.ravel()]),
+            **({"relevance_of": np.array([float(self._n_of_relevance)])} if self._by_relevance else {}),
             **self.selector.get_state(),
         }
 
@@ -175,5 +179,8 @@ class InstanceTransfer(SourceUse):
         self.check.set_state(state["check"])
         self.n_observed = int(state["errors"][0])
         self.errors.sums.ravel()[:] = state["errors"][1:]
-        if self._by_relevance and self.selector.n_used():
-            self._renew_relevance(self.selector.n_used())
+        if self._by_relevance:
+            n_used, saved = self.selector.n_used(), int(state["relevance_of"][0])
+            n = n_used if saved == ALL_USED else min(saved, n_used)
+            if n > 0:
+                self._renew_relevance(n)

@@ -64,6 +64,36 @@ def test_two_halves_make_the_run_that_was_not_interrupted(name, tmp_path):
         np.testing.assert_array_equal(halves.policy.transfer.choices(), whole.policy.transfer.choices())
 
 
+BY_RELEVANCE = {
+    "TIMBREL": lambda: TIMBREL(walk_source(), MAPPING, relevance="near"),
+    "pool": lambda: TIMBREL(walk_source(), "pool", relevance=True),
+    "COMBREL": lambda: COMBREL(walk_source(), relevance="near"),
+}
+
+
+@pytest.mark.parametrize("name", BY_RELEVANCE)
+def test_relevance_is_that_of_its_last_renewal_once_loaded(name, tmp_path):
+    for n_episodes in (3, 8):
+        model = after_episodes(n_episodes, BY_RELEVANCE[name](), model_breadth=0.05, exploration_threshold=2.0)
+        model.save(tmp_path / "model")
+        loaded = FittedRMax.load(tmp_path / "model")
+        ours, theirs = (each.policy.transfer._instances.translator.relevance for each in (model, loaded))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("name", BY_RELEVANCE)
+def test_a_file_that_does_not_say_by_what_relevance_was_measured_has_it_measured_by_all_transitions(name):
+    model = after_episodes(8, BY_RELEVANCE[name](), model_breadth=0.05, exploration_threshold=2.0)
+    parameters = model.get_parameters()["policy"]
+    instances = model.policy.transfer._instances
+    assert 0 < parameters["transfer_relevance_of"].item() < instances.transitions.n
+    expected = np.ones_like(instances.translator.relevance)
+    instances.measure_relevance(n_used=instances.transitions.n, values=expected)
+    del parameters["transfer_relevance_of"]
+    model.set_parameters({"policy": parameters})
+    np.testing.assert_array_equal(model.policy.transfer._instances.translator.relevance, expected)
+
+
 @pytest.mark.parametrize("name", ["TIMBREL", "COMBREL", "two sources", "first episode", "drawn"])
 @pytest.mark.parametrize("steps", [0, 13, 47])
 def test_choices_compliance_and_transferred_instances_are_the_same_at_once(name, steps, tmp_path):
