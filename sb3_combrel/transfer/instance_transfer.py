@@ -124,6 +124,8 @@ class InstanceTransfer(SourceUse):
     def _renew_relevance(self, n_used: int) -> None:
         self.measure_relevance(n_used=n_used, values=self.translator.relevance)
         self._n_of_relevance = n_used
+        # Another order, for all states: one that is asked for when it is loaded must not differ from the others.
+        self.all_changed = True
 
     # -------------------------------------------------------------- describing
 
@@ -171,8 +173,6 @@ class InstanceTransfer(SourceUse):
         self.translator.set_breadth(float(state["breadth"][0]))
         self.transitions.restore(state["transitions"], self.task.n_actions)
         self.selector.set_state(state)
-        # All pairs of the sample are asked for again with what is restored here.
-        self.all_changed = False
         used = np.flatnonzero(state["uses"] >= 1.0)
         self._uses = Counter(dict(zip(used.tolist(), state["uses"][used].astype(np.int64).tolist(), strict=True)))
         self._instances_used = int(state["instances_used"][0])
@@ -184,3 +184,5 @@ class InstanceTransfer(SourceUse):
             n = n_used if saved == ALL_USED else min(saved, n_used)
             if n > 0:
                 self._renew_relevance(n)
+        # All pairs of the sample are asked for again with what is restored here.
+        self.all_changed = False
