@@ -60,7 +60,7 @@ class COMBREL(MappingTransfer):
     target's own instances are fitted to what it leaves over. Compliance is then that of the source's predictions with the
     target's transitions, and one mapping is chosen for all states, or with sets that are not factored one for each target
     action: after 10 transitions, and again whenever there are 1.4 times as many. What the prior claims to know without the
-    target's own instances is said in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs
+    target's own instances is said in :class:`~sb3_combrel.transfer.claims.Claims`. It needs
     ``FittedRMax(degree=1)``.
 
     ::

@@ -51,7 +51,7 @@ def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
     :param prior: after one step at least
     """
     names = prior.task.action_names
-    pairs = np.argwhere(~prior.explains)
+    pairs = np.argwhere(~prior.claims.explains)
     choice = prior.choice
     next_division, next_error = _next_division(prior) if choice is not None else ("", np.nan)
     return TransferReport(
@@ -68,8 +68,8 @@ def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
         n_worse=int(prior.errors.of_actions[:, 3].sum()),
         contradictions=prior.errors.contradictions(),
         not_used=tuple((names[a], prior.task.state_names[v]) for a, v in pairs.tolist()),
-        ends=(prior.outcomes.confirmed, prior.outcomes.contradicted),
-        rewards=(prior.outcomes.rewards_right, prior.outcomes.rewards_wrong),
+        ends=(prior.claims.outcomes.confirmed, prior.claims.outcomes.contradicted),
+        rewards=(prior.claims.outcomes.rewards_right, prior.claims.outcomes.rewards_wrong),
         statistics=prior.statistics(),
     )
 
@@ -107,7 +107,7 @@ def _mappings_of_prior(prior: SourcePrior, choice: Choice) -> tuple[MappingRepor
                 error=error if rows.any() else float(placed[a]),
                 next_best_error=next_error,
                 n_compared=int(rows.sum()) if rows.any() else int(compared[a]),
-                trust=float(prior.trust[a]),
+                trust=float(prior.claims.trust[a]),
             )
         )
     return tuple(found)

@@ -36,7 +36,7 @@ class TIMBREL(MappingTransfer):
 
     With ``use="prior"`` the source's own local linear model, seen through the mapping, is the prior of the target's model: the
     target's own instances are fitted to what it leaves over. What it claims to know without them is said in
-    :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs ``FittedRMax(degree=1)``.
+    :class:`~sb3_combrel.transfer.claims.Claims`. It needs ``FittedRMax(degree=1)``.
 
     ::
 
