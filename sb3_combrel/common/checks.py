@@ -24,6 +24,14 @@ def check_finite(name: str, value: object) -> None:
         raise ValueError(f"{name} must be a finite number, got {value!r}")
 
 
+def check_boolean(name: str, value: object) -> None:
+    """
+    :raises ValueError: unless ``value`` is True or False
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
 def check_count(
     name: str, value: object, *, min: int = 1, max: int | None = None, none_allowed: bool = False, why_max: str = ""
 ) -> None:

@@ -72,7 +72,7 @@ class FittedRMaxAgent:
         self.model_settings = settings.model_settings(d)
         breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
         self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight, self.periodic)
-        transfers = transfer is not None and transfer.use != "actions"
+        transfers = transfer is not None and transfer.informs_model
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
         warn_if_long(self.workload, self.grid)
         self.n_truncated = 0
@@ -114,7 +114,7 @@ class FittedRMaxAgent:
         """Make model and planner, without any instances."""
         max_value = float(self.settings.max_value)
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.settings.gamma)
-        of_model = None if self.transfer is None or self.transfer.use == "actions" else self.transfer
+        of_model = self.transfer if self.transfer is not None and self.transfer.informs_model else None
         self.model = self.model_class(self.mdp, self.model_settings, of_model)
         self.planner = Planner(
             self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=self.settings.planning_tolerance
@@ -359,7 +359,7 @@ class FittedRMaxAgent:
 
     def _changed_by(self, transfer: Transfer) -> np.ndarray:
         """The pairs, not known, for which the transfer method may have other instances than when it was last asked."""
-        if transfer.use == "actions":
+        if not transfer.informs_model:
             return NO_PAIRS
         changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
         if isinstance(changed, bool | np.bool_):

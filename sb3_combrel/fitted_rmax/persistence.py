@@ -48,8 +48,8 @@ class PersistentAlgorithm(BaseAlgorithm):
         returns. What cannot be written so is left out, with a warning, and must be passed to :meth:`load`.
 
         A model saved at the end of an episode and loaded learns on as this one would, bit for bit. In the middle of an episode
-        its planning is completed first. Not saved but computed again are ``TIMBREL``'s random draws, the order of
-        ``relevance``, and lists shortened by an instance that ``max_instances`` has since removed.
+        its planning is completed first. Not saved but computed again are ``TIMBREL``'s random draws, and lists shortened by an
+        instance that ``max_instances`` has since removed.
 
         :param path: path to the file where the rl agent should be saved
         :param exclude: name of parameters that should be excluded in addition to the default ones

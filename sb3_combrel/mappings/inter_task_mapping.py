@@ -84,7 +84,8 @@ class InterTaskMapping:
             )
             signs = None if signs is None else numbers("sign", signs, groups.target_variables, (), default=1)
         if not named or names is not None:
-            given, signs = _checked(*given), _signs(signs, _checked(*given)[0])
+            given = _checked(*given)
+            signs = _signs(signs, given[0])
             names = None if names is None else _checked_names(names, *given)
         for name, value in {"state": given[0], "action": given[1], "sign": signs, "names": names}.items():
             object.__setattr__(self, name, value)

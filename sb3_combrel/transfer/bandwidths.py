@@ -1,5 +1,10 @@
 """Kernel bandwidths of compliance and relevance, chosen from a source's instances and a mapping's variables."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from sb3_combrel.common.instances import Instances
@@ -8,6 +13,31 @@ from sb3_combrel.transfer.equations import Bandwidths
 
 # So many instances are to share in a prediction, typically.
 N_SHARING = 20
+
+
+class CandidateBandwidths(NamedTuple):
+    """
+    Bandwidths of compliance and relevance of all candidates.
+
+    :param of_all: of Eq. 2
+    :param starts: the start bandwidth of each state mapping, float64, shape (n_state_mappings,)
+    """
+
+    of_all: Bandwidths
+    starts: np.ndarray
+
+
+def candidate_bandwidths(candidates: Candidates, given: Sequence[float] | None) -> CandidateBandwidths:
+    """
+    Take the bandwidths given, the same for all mappings; or choose them from the data.
+
+    :param given: (start, outcome, reward), or None
+    """
+    if given is not None:
+        of_all = Bandwidths(*given)
+        return CandidateBandwidths(of_all, np.full(len(candidates.table.variable), of_all.start))
+    of_all = default_bandwidths(candidates.instances)
+    return CandidateBandwidths(of_all, start_bandwidths(candidates, of_all.start))
 
 
 def default_bandwidths(source: Instances) -> Bandwidths:

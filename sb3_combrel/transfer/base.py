@@ -24,6 +24,7 @@ FOR_THE_ALGORITHM = frozenset(
     (
         *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
         *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "renamed_arguments", "makes_choices"),
+        "informs_model",
     )
 )
 
@@ -127,6 +128,11 @@ class Transfer(ABC):
         """
         assert self.task is not None
         return self.transferred(self.task.sample_states[points], actions, own_weight)
+
+    @property
+    def informs_model(self) -> bool:
+        """Whether the target's model uses the source, in either way: not with ``use="actions"``."""
+        return self.use != "actions"
 
     def action(self, state: np.ndarray) -> int | None:
         """

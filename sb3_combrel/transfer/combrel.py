@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
+from sb3_combrel.transfer.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
 from sb3_combrel.transfer.compliance import DEFAULT_MIN_EVIDENCE
@@ -20,6 +21,7 @@ from sb3_combrel.transfer.mapping_transfer import (
 )
 from sb3_combrel.transfer.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
+from sb3_combrel.transfer.selectors import SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior
 
@@ -58,7 +60,7 @@ class COMBREL(MappingTransfer):
     target's own instances are fitted to what it leaves over. Compliance is then that of the source's predictions with the
     target's transitions, and one mapping is chosen for all states, or with sets that are not factored one for each target
     action: after 10 transitions, and again whenever there are 1.4 times as many. What the prior claims to know without the
-    target's own instances is said in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs
+    target's own instances is said in :class:`~sb3_combrel.transfer.claims.Claims`. It needs
     ``FittedRMax(degree=1)``.
 
     ::
@@ -218,10 +220,6 @@ class COMBREL(MappingTransfer):
             self.use, self.mappings = ("prior", "factored") if task.takes_prior else ("instances", "injective")
             self._decides = False
         super().bind(task, rng)
-        if self.use == "prior":
-            return
-        # Nothing is selected before the first transition, so nothing is returned for any state of the sample.
-        self._all_changed = False
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         given = is_factored(self.mappings) and not isinstance(self.mappings, str)
@@ -239,10 +237,10 @@ class COMBREL(MappingTransfer):
     def _whole_mappings(self) -> bool:
         return self.neighbors == "state_action"
 
-    def _make_selector(self, task: TargetTask) -> ComplianceSelector:
+    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> ComplianceSelector:
         options = SelectionOptions(
-            bandwidths=self._bandwidths,
-            starts=self._starts,
+            bandwidths=bandwidths.of_all,
+            starts=bandwidths.starts,
             n_neighbors=self.n_neighbors,
             all_actions=self._whole_mappings(),
             neighbor_radius=self.neighbor_radius,
@@ -252,7 +250,7 @@ class COMBREL(MappingTransfer):
             min_evidence=self.min_evidence,
             min_compliance=self.min_compliance,
         )
-        self._compliance_selector = ComplianceSelector(self.candidates, task, self._transitions, self.rng, options)
+        self._compliance_selector = ComplianceSelector(*parts, options)
         return self._compliance_selector
 
     def chosen_compliance(self, pairs: np.ndarray) -> np.ndarray:
@@ -264,7 +262,7 @@ class COMBREL(MappingTransfer):
         """
         if self.use == "prior":
             assert self.task is not None
-            return self._prior.mean_compliance()[pairs // len(self.task.sample_states)]
+            return self.source_prior.mean_compliance()[pairs // len(self.task.sample_states)]
         return self._compliance_selector.mean_compliance(pairs)
 
 

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source
-from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, check_boolean
+from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
 from sb3_combrel.transfer.timbrel import TIMBREL
 
 # With fewer samples there is nothing to learn a mapping from.

@@ -1,4 +1,4 @@
-"""What TIMBREL and COMBREL share: a selector of mappings, and a translator of source instances."""
+"""What TIMBREL and COMBREL share: arguments, and what is done with the source as ``use`` says."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import warnings
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_positive
+from sb3_combrel.common.checks import check_boolean, check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
@@ -18,7 +19,7 @@ from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
 from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.bandwidths import default_bandwidths, start_bandwidths
+from sb3_combrel.transfer.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import (
     Candidate,
@@ -28,25 +29,22 @@ from sb3_combrel.transfer.candidates import (
     SourceLike,
     load_sources,
 )
-from sb3_combrel.transfer.equations import Bandwidths
-from sb3_combrel.transfer.explaining import describe_sources, mappings_of_instances, report_of_prior
-from sb3_combrel.transfer.instances_check import InstancesCheck
-from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.instance_transfer import InstanceTransfer, MeasureRelevance
 from sb3_combrel.transfer.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.relevance import renew_near_relevance, renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
 from sb3_combrel.transfer.report import TransferReport
-from sb3_combrel.transfer.selectors import Ranges, Selector
+from sb3_combrel.transfer.report_of_instances import report_of_instances
+from sb3_combrel.transfer.report_of_prior import report_of_prior
+from sb3_combrel.transfer.selectors import Selector, SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.source_use import SourceUse
 from sb3_combrel.transfer.translation import Translator
 
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8
-# Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
-RELEVANCE_GROWTH = 1.2
-MIN_TRANSITIONS_FOR_RELEVANCE = 50
 #: The relevance that does not favour distant instances, ``equations.near_relevances``.
 NEAR = "near"
 
@@ -61,7 +59,11 @@ _RENAMED_ATTRIBUTES = {**RENAMED_ARGUMENTS, "target": "task", "way": "candidate"
 
 class MappingTransfer(Transfer):
     """
-    Translates source instances through mappings: a selector chooses the mappings, a translator the instances.
+    Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
+
+    What it does once bound is done by an object, as ``use`` says: an
+    :class:`~sb3_combrel.transfer.instance_transfer.InstanceTransfer`, or a
+    :class:`~sb3_combrel.transfer.source_prior.SourcePrior`.
 
     :param source: instances, a path to them, the id or recipe of a task to learn them from, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
@@ -144,25 +146,8 @@ class MappingTransfer(Transfer):
         self._replace_names(sources, task)
         self._periodic = np.array(task.periodic)
         self._wraps = bool(self._periodic.any())
-        if self.use == "prior":
-            self._prior = self._make_prior(task)
-            return
-        self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
-        self._choose_bandwidths()
-        self._transitions = RecordedTransitions(task.n_variables)
-        self._by_relevance = bool(self.relevance) and self.ranks_by_relevance
-        self._translator = self._make_translator(self.candidates, task)
-        self._selector = self._make_selector(task)
-        self._last_selected: Ranges = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-        self._last_state = np.empty(0)
-        self._check = InstancesCheck(self.candidates.sources, float(task.exploration_threshold))
-        self._uses: Counter[int] = Counter()
-        self._instances_used = 0
-        self._n_steps = 0
-        self._errors = PlacedErrors(task)
-        self._n_of_relevance = 0
-        # What has been returned for any state of the sample may have changed.
-        self._all_changed = True
+        #: What is done with the source, as ``use`` says.
+        self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
     def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
         """Replace names of variables and actions in mappings by their numbers, now that both tasks are known."""
@@ -172,32 +157,44 @@ class MappingTransfer(Transfer):
         ]
         self.mappings = with_numbers(self.mappings, names)
 
+    def _make_instances(self, task: TargetTask) -> InstanceTransfer:
+        """Make the transfer of instances to the target task that the method was just bound to."""
+        self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
+        bandwidths = candidate_bandwidths(self.candidates, self.bandwidths)
+        parts = SelectorParts(self.candidates, task, RecordedTransitions(task.n_variables), self.rng)
+        return InstanceTransfer(
+            self._make_selector(parts, bandwidths),
+            self._make_translator(self.candidates, task, float(self.breadth)),
+            breadth_decay=self.breadth_decay,
+            measure_relevance=self._relevance_to(parts.transitions, bandwidths),
+        )
+
+    def _relevance_to(self, transitions: RecordedTransitions, bandwidths: CandidateBandwidths) -> MeasureRelevance:
+        """Return what measures the candidates' relevance to recorded transitions."""
+        given = self.candidates, transitions
+        if self.relevance == NEAR:
+            return partial(renew_near_relevance, *given, bandwidths=bandwidths, periodic=self._periodic)
+        mu = float(self.relevance_fraction)
+        return partial(renew_relevance, *given, bandwidths=bandwidths, periodic=self._periodic, mu=mu)
+
     def _whole_mappings(self) -> bool:
         """Return whether whole mappings are the candidates."""
         return False
 
-    def _choose_bandwidths(self) -> None:
-        """Take the bandwidths given, the same for all mappings; or choose them from the data."""
-        if self.bandwidths is None:
-            self._bandwidths = default_bandwidths(self.candidates.instances)
-            self._starts = start_bandwidths(self.candidates, self._bandwidths.start)
-        else:
-            self._bandwidths = Bandwidths(*self.bandwidths)
-            self._starts = np.full(len(self.candidates.table.variable), self._bandwidths.start)
-
-    def _make_translator(self, candidates: Candidates, task: TargetTask) -> Translator:
+    def _make_translator(self, candidates: Candidates, task: TargetTask, breadth: float) -> Translator:
         """Make the translator of the instances of some candidates."""
+        by_relevance = bool(self.relevance) and self.ranks_by_relevance
         return Translator(
             candidates,
             task,
-            breadth=float(self.breadth),
+            breadth=breadth,
             transfer_terminals=self.transfer_terminals,
-            by_relevance=self._by_relevance,
-            times_weight=self._by_relevance and self.relevance == NEAR,
+            by_relevance=by_relevance,
+            times_weight=by_relevance and self.relevance == NEAR,
         )
 
     @abstractmethod
-    def _make_selector(self, task: TargetTask) -> Selector:
+    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
         """Make the selector for the target task that the method was just bound to."""
 
     @abstractmethod
@@ -207,37 +204,42 @@ class MappingTransfer(Transfer):
     @property
     def sources(self) -> list[SourceInstances]:
         """The source tasks' instances, once bound."""
-        return list(self._prior.copies.sources) if self.use == "prior" else self.candidates.sources
+        return list(self._source_use.sources)
+
+    @property
+    def source_prior(self) -> SourcePrior:
+        """
+        The source as the prior of the target's model, once bound.
+
+        :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
+        """
+        self._check_bound("source_prior")
+        if not isinstance(self._source_use, SourcePrior):
+            raise ValueError(f'use must be "prior" for source_prior, got {self.use!r}')
+        return self._source_use
+
+    @property
+    def _instances(self) -> InstanceTransfer:
+        """The transfer of instances, once bound; only with ``use="instances"``."""
+        assert isinstance(self._source_use, InstanceTransfer)
+        return self._source_use
 
     # ------------------------------------------------------------------ asking
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        if self.use == "prior":
-            return TransferredInstances.empty(len(actions), states.shape[1])
-        self._last_selected = self._selector.select(states, actions, own_weight)
-        self._last_state = states[0]
-        return self._translator(states, own_weight, self._last_selected)
+        return self._source_use.transferred(states, actions, own_weight)
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        assert self.task is not None
-        if self.use == "prior":
-            return TransferredInstances.empty(len(actions), self.task.n_variables)
-        selected = self._selector.select_at_sample(points, actions, own_weight)
-        return self._translator(self.task.sample_states[points], own_weight, selected)
+        return self._source_use.transferred_to_sample(points, actions, own_weight)
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        return self._prior.predict(states, actions)
+        return self._source_use.predict(states, actions)
 
     def prior_version(self) -> int:
-        return self._prior.version
+        return self._source_use.version
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
-        if self.use == "prior":
-            return False
-        if self._all_changed:
-            self._all_changed = False
-            return True
-        return self._selector.changed(known)
+        return self._source_use.changed(known)
 
     def lowest_reward(self) -> float:
         return min(float(source.rewards.min()) for source in self.sources)
@@ -246,70 +248,19 @@ class MappingTransfer(Transfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
-        if self.use == "prior":
-            self._prior.observe(state, action, reward, effect, terminated)
-            return
-        self._n_steps += 1
-        predicted = self._check.observe(state, action, reward, effect, terminated)
-        if predicted is not None:
-            self._errors.note(state, action, effect, predicted)
-        selector = self._selector
-        selector.before_transition()
-        if (self._by_relevance or selector.needs_transitions) and selector.takes_transitions():
-            selector.add_transition(self._transitions.add(state, action, reward, effect))
-            n_used = selector.n_used()
-            if self._by_relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
-                self._renew_relevance(n_used)
+        self._source_use.observe(state, action, reward, effect, terminated)
 
     def end_episode(self, truncated: bool) -> None:
-        """
-        Take in the end of an episode.
-
-        One that reached its time limit narrows the kernel of transferred instances, if the target's own transitions have
-        contradicted them: where they reach the threshold everywhere, wrongly, nothing is optimistic and nothing would ever be
-        explored. A time limit alone says nothing against them.
-        """
-        if self.use == "prior":
-            self._prior.end_episode(truncated)
-            return
-        if self._check.end_episode(truncated) and self.breadth_decay < 1.0:
-            self._translator.set_breadth(self._translator.rules.breadth * self.breadth_decay)
-            self._all_changed = True
-        if self._selector.end_episode() and self._by_relevance:
-            self._renew_relevance(self._selector.n_used())
+        self._source_use.end_episode(truncated)
 
     def note_use(self, transferred: TransferredInstances) -> None:
-        if self.use == "prior":
-            return
-        first, _ = self._last_selected
-        self._check.note_use(self._last_state, transferred, len(first))
-        for candidate, n in zip(first.tolist(), transferred.length[: len(first)].tolist(), strict=True):
-            if n > 0 and self._selector.selects_one:
-                self._uses[candidate] += 1
-            self._instances_used += n
-
-    def _renew_relevance(self, n_used: int) -> None:
-        self._measure_relevance(n_used, self._translator.relevance)
-        self._n_of_relevance = n_used
-
-    def _measure_relevance(self, n_used: int, values: np.ndarray) -> None:
-        """Write to ``values`` the relevance of each candidate's instances to the first ``n_used`` recorded transitions."""
-        bandwidths = self._bandwidths, self._starts
-        given = self.candidates, self._transitions, n_used, bandwidths, self._periodic
-        if self.relevance == NEAR:
-            renew_near_relevance(*given, values)
-        else:
-            renew_relevance(*given, float(self.relevance_fraction), values)
+        self._source_use.note_use(transferred)
 
     # --------------------------------------------------------------- describing
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""
-        if self.use == "prior":
-            parts = self._prior.candidate(candidate)
-            assert self.task is not None
-            return f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
-        return self.candidates.describe(candidate)
+        return self._source_use.candidates.describe(candidate)
 
     def describe_prior(self) -> str:
         """
@@ -322,20 +273,20 @@ class MappingTransfer(Transfer):
         self._check_bound("describe_prior")
         if self.use != "prior":
             raise ValueError(f'use must be "prior" for describe_prior, got {self.use!r}')
-        return self._prior.describe()
+        return self.source_prior.describe()
 
     def candidate(self, number: int) -> Candidate:
         """Return a candidate's parts, by name."""
-        return self._prior.candidate(number) if self.use == "prior" else self.candidates.parts(number)
+        return self._source_use.candidates.parts(number)
 
     def mapped_variables(self, number: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""
-        return self._prior.mapped_variables(number) if self.use == "prior" else self.candidates.mapped_variables(number)
+        return self._source_use.candidates.mapped_variables(number)
 
     @property
     def makes_choices(self) -> bool:
         """Whether :meth:`choices` ever names a candidate."""
-        return self.use == "prior" or self._selector.makes_choices
+        return self._source_use.makes_choices
 
     def choices(self) -> np.ndarray:
         """
@@ -343,11 +294,7 @@ class MappingTransfer(Transfer):
 
         :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
         """
-        if self.use == "prior":
-            of_actions = self._prior.choices()
-            assert self.task is not None
-            return np.repeat(of_actions, len(self.task.sample_states))
-        return self._selector.choices()
+        return self._source_use.choices()
 
     def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """
@@ -357,34 +304,22 @@ class MappingTransfer(Transfer):
         :param actions: int64, shape (n,)
         :return: int64, shape (n,); -1 where there is none, or not a single one
         """
-        if self.use == "prior":
-            return self._prior.choices()[actions]
-        first, last = self._selector.select(states, actions, np.zeros(len(actions)))
-        return np.where(last - first == 1, first, -1)
+        return self._source_use.selected(states, actions)
 
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions of all sources, each name once."""
-        return self._prior.source_action_names() if self.use == "prior" else self.candidates.source_action_names()
+        return self._source_use.candidates.source_action_names()
 
     def uses(self) -> dict[int, int]:
         """Return for how many of the agent's steps and actions each candidate's instances were used."""
-        return self._prior.uses() if self.use == "prior" else dict(self._uses)
+        return self._source_use.uses()
 
     def mapping_counts(self) -> list[tuple[str, int]]:
         """Return how often each candidate's instances were used, the most used first, by name."""
         return [(self.describe(candidate), n) for candidate, n in Counter(self.uses()).most_common()]
 
     def statistics(self) -> dict[str, float]:
-        if self.use == "prior":
-            return self._prior.statistics()
-        return {
-            "transfer/instances_used": self._instances_used,
-            "transfer/uses": sum(self._uses.values()),
-            "transfer/mappings_used": len(self._uses),
-            "transfer/prediction_error": self._check.error(),
-            "transfer/breadth": self._translator.rules.breadth,
-            **self._selector.statistics(),
-        }
+        return self._source_use.statistics()
 
     def report(self) -> TransferReport:
         """
@@ -395,70 +330,19 @@ class MappingTransfer(Transfer):
         :raises ValueError: before the first step of learning
         """
         self._check_bound("report")
-        if (self._prior.n_observed if self.use == "prior" else self._n_steps) == 0:
+        if self._source_use.n_observed == 0:
             raise ValueError("there is nothing to report before learning: call model.learn(total_timesteps) first")
-        return report_of_prior(repr(self), self._prior) if self.use == "prior" else self._report_of_instances()
-
-    def _report_of_instances(self) -> TransferReport:
-        assert self.task is not None
-        n_actions, outcomes, used = self.task.n_actions, self._check.outcomes, self.uses()
-        parts = [self.candidates.parts(candidate) for candidate in used]
-        sure = [self._selector.confidence(action) for action in range(n_actions)]
-        totals = self._errors.of_actions.sum(axis=0)
-        return TransferReport(
-            method=repr(self),
-            use=self.use,
-            sources=describe_sources(self.sources),
-            n_steps=self._n_steps,
-            n_rested=self._check.n_compared,
-            mappings=mappings_of_instances(used, parts, self.task.action_names, sure, self._errors),
-            error=self._errors.error(),
-            n_compared=int(totals[0]),
-            n_worse=int(totals[3]),
-            contradictions=self._errors.contradictions(),
-            ends=(outcomes.confirmed, outcomes.contradicted),
-            rewards=(outcomes.rewards_right, outcomes.rewards_wrong),
-            statistics=self.statistics(),
-        )
+        if self.use == "prior":
+            return report_of_prior(repr(self), self.source_prior)
+        return report_of_instances(repr(self), self._instances, self.statistics())
 
     # --------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
-        if self.use == "prior":
-            return self._prior.get_state()
-        uses = np.zeros(len(self.candidates))
-        uses[list(self._uses)] = list(self._uses.values())
-        return {
-            "transitions": self._transitions.rows(),
-            "breadth": np.array([self._translator.rules.breadth]),
-            "uses": uses,
-            "instances_used": np.array([float(self._instances_used)]),
-            "check": self._check.get_state(),
-            "errors": np.concatenate([[float(self._n_steps)], self._errors.sums.ravel()]),
-            **self._selector.get_state(),
-        }
+        return self._source_use.get_state()
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        assert self.task is not None
-        if self.use == "prior":
-            self._prior.set_state(state)
-            return
-        d = self.task.n_variables
-        self._translator.set_breadth(float(state["breadth"][0]))
-        for row in state["transitions"]:
-            action = int(np.clip(row[-1], 0, self.task.n_actions - 1))
-            self._transitions.add(row[:d], action, float(row[-2]), row[d : 2 * d])
-        self._selector.set_state(state)
-        # All pairs of the sample are asked for again with what is restored here.
-        self._all_changed = False
-        used = np.flatnonzero(state["uses"] >= 1.0)
-        self._uses = Counter(dict(zip(used.tolist(), state["uses"][used].astype(np.int64).tolist(), strict=True)))
-        self._instances_used = int(state["instances_used"][0])
-        self._check.set_state(state["check"])
-        self._n_steps = int(state["errors"][0])
-        self._errors.sums.ravel()[:] = state["errors"][1:]
-        if self._by_relevance and self._selector.n_used():
-            self._renew_relevance(self._selector.n_used())
+        self._source_use.set_state(state)
 
 
 def check_relevance(value: object) -> None:
@@ -467,14 +351,6 @@ def check_relevance(value: object) -> None:
     """
     if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value == NEAR):
         raise ValueError(f'relevance must be True, False or "{NEAR}", got {value!r}')
-
-
-def check_boolean(name: str, value: object) -> None:
-    """
-    :raises ValueError: unless ``value`` is True or False
-    """
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
 def __getattr__(name: str) -> Any:

@@ -9,11 +9,13 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.transfer.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike
 from sb3_combrel.transfer.least_error import LeastErrorSelector, check_action_mappings, choose_least_error
 from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
 from sb3_combrel.transfer.prior_sets import copies_of, is_factored
+from sb3_combrel.transfer.selectors import SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior
 
@@ -105,13 +107,10 @@ class MASTER(MappingTransfer):
             self.use = "prior" if task.takes_prior else "instances"
             self._decides = False
         super().bind(task, rng)
-        # Nothing is selected before the mapping is, so nothing is returned for any state of the sample.
-        self._all_changed = False
 
-    def _make_selector(self, task: TargetTask) -> LeastErrorSelector:
-        check_action_mappings(self.candidates.sets)
-        copies = copies_of(self.candidates, task, float(self.source_breadth))
-        parts = self.candidates, task, self._transitions, self.rng
+    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> LeastErrorSelector:
+        check_action_mappings(parts.candidates.sets)
+        copies = copies_of(parts.candidates, parts.task, float(self.source_breadth))
         self._least_error = LeastErrorSelector(*parts, copies, self.n_random_steps)
         return self._least_error
 
@@ -132,7 +131,7 @@ class MASTER(MappingTransfer):
     @property
     def _n_seen(self) -> int:
         """Transitions by which is chosen that have been seen."""
-        return min(self.n_random_steps, self._prior.n_observed if self.use == "prior" else self._transitions.n)
+        return min(self.n_random_steps, self._source_use.n_observed)
 
     def action(self, state: np.ndarray) -> int | None:
         if self._n_seen >= self.n_random_steps:
@@ -148,7 +147,7 @@ class MASTER(MappingTransfer):
     def chosen(self) -> InterTaskMapping | None:
         """The mapping that was chosen, with names; None before."""
         assert self.task is not None
-        made_by = self._prior if self.use == "prior" else self._least_error
+        made_by = self.source_prior if self.use == "prior" else self._least_error
         if made_by.choice is None:
             return None
         actions = tuple(made_by.choice.actions[:, 0].tolist())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 
@@ -11,6 +13,9 @@ class RecordedTransitions:
 
     :param n_variables: number of state variables of the target
     """
+
+    #: The arrays, which grow together.
+    columns: ClassVar[tuple[str, ...]] = ("states", "effects", "rewards", "actions")
 
     def __init__(self, n_variables: int):
         self.n = 0
@@ -29,7 +34,7 @@ class RecordedTransitions:
         :return: its number
         """
         if self.n == len(self.rewards):
-            for name in ("states", "effects", "rewards", "actions"):
+            for name in self.columns:
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.empty_like(old)]))
         i = self.n
@@ -47,3 +52,51 @@ class RecordedTransitions:
         """Return all of them, one a row: state, effect, reward, action; shape (n, 2 * n_variables + 2)."""
         n = self.n
         return np.hstack([self.states[:n], self.effects[:n], self.rewards[:n, None], self.actions[:n, None]])
+
+    def restore(self, rows: np.ndarray, n_actions: int) -> None:
+        """
+        Record what :meth:`rows` returned once more; for a new object.
+
+        :param n_actions: number of target actions; whatever a file says, only these are recorded
+        """
+        d = self.states.shape[1]
+        for row in rows:
+            self.add(row[:d], int(np.clip(row[-1], 0, n_actions - 1)), float(row[-2]), row[d : 2 * d])
+
+
+class RecordedEpisodes(RecordedTransitions):
+    """
+    Recorded transitions, and how the episode of each went on: ``GOES_ON``, ``TERMINATED`` or ``TIME_LIMIT``.
+
+    :param n_variables: number of state variables of the target
+    """
+
+    columns = (*RecordedTransitions.columns, "ended")
+    GOES_ON, TERMINATED, TIME_LIMIT = 0, 1, 2
+
+    def __init__(self, n_variables: int):
+        super().__init__(n_variables)
+        self.ended = np.empty(64, dtype=np.int64)
+
+    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
+        """
+        Record one transition; parameters: see :meth:`RecordedTransitions.add`.
+
+        :param terminated: it ended its episode in a terminal state
+        """
+        i = super().add(state, action, reward, effect)
+        self.ended[i] = self.TERMINATED if terminated else self.GOES_ON
+        return i
+
+    def note_time_limit(self) -> None:
+        """Take in that the episode of the last transition reached its time limit; nothing if there is none."""
+        if self.n:
+            self.ended[self.n - 1] = self.TIME_LIMIT
+
+    def rows(self) -> np.ndarray:
+        """Return all of them, one a row: state, effect, reward, action, how it ended; shape (n, 2 * n_variables + 3)."""
+        return np.column_stack([super().rows(), self.ended[: self.n]])
+
+    def restore(self, rows: np.ndarray, n_actions: int) -> None:
+        super().restore(rows[:, :-1], n_actions)
+        self.ended[: self.n] = rows[:, -1]

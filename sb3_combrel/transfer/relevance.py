@@ -7,8 +7,8 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inner
 from sb3_combrel.common.periodic import difference
+from sb3_combrel.transfer.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 
@@ -16,7 +16,7 @@ def renew_relevance(
     candidates: Candidates,
     transitions: RecordedTransitions,
     n_used: int,
-    bandwidths: tuple[Bandwidths, np.ndarray],
+    bandwidths: CandidateBandwidths,
     periodic: np.ndarray,
     mu: float,
     values: np.ndarray,
@@ -26,7 +26,7 @@ def renew_relevance(
 
     :param candidates: the candidates of every target action
     :param transitions: the target transitions, of which the first ``n_used`` count
-    :param bandwidths: of Eq. 2, and the start bandwidth of each state mapping, shape (n_state_mappings,)
+    :param bandwidths: of Eq. 2
     :param periodic: which state variables of the target are periodic, bool, shape (n_variables,)
     :param mu: fraction of the weight of Eq. 4
     :param values: receives the relevances, shape (n_candidates, most instances of an action)
@@ -40,7 +40,7 @@ def renew_near_relevance(
     candidates: Candidates,
     transitions: RecordedTransitions,
     n_used: int,
-    bandwidths: tuple[Bandwidths, np.ndarray],
+    bandwidths: CandidateBandwidths,
     periodic: np.ndarray,
     values: np.ndarray,
 ) -> None:
@@ -58,7 +58,7 @@ def _problems(
     candidates: Candidates,
     transitions: RecordedTransitions,
     n_used: int,
-    bandwidths: tuple[Bandwidths, np.ndarray],
+    bandwidths: CandidateBandwidths,
     periodic: np.ndarray,
 ) -> Iterator[tuple[Any, ...]]:
     """What compiled code is told of each candidate: target, source, action, mapping, bandwidths."""

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sb3_combrel.sources.source_instances import SourceInstances
+
 
 class NotBoundError(ValueError, AttributeError):
     """
@@ -183,6 +185,11 @@ class TransferReport:
             return "The method says nothing of its mappings, and has no figures."
         rows = [(name, f"{value:g}") for name, value in self.statistics.items()]
         return "\n".join(["The method says nothing of its mappings; its figures:", *_aligned(rows)])
+
+
+def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
+    """Name source tasks, and how many instances each has."""
+    return tuple(f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances)" for source in sources)
 
 
 _FIGURES = ("compliance", "next best", "no change", "error", "next best's", "trust")

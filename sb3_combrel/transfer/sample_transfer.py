@@ -6,16 +6,14 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.transfer.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.instance_transfer import RELEVANCE_GROWTH
 from sb3_combrel.transfer.least_error import check_action_mappings
-from sb3_combrel.transfer.mapping_transfer import (
-    DEFAULT_BREADTH,
-    DEFAULT_BREADTH_DECAY,
-    RELEVANCE_GROWTH,
-    MappingTransfer,
-)
+from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
 from sb3_combrel.transfer.prior_sets import is_factored
+from sb3_combrel.transfer.selectors import SelectorParts
 from sb3_combrel.transfer.source_prior import SourcePrior
 from sb3_combrel.transfer.task_compliance import candidate_compliances, draw_instances, instances_of_each
 from sb3_combrel.transfer.task_compliance_selector import TaskComplianceSelector
@@ -123,13 +121,10 @@ class SampleTransfer(MappingTransfer):
         self._show_drawn(np.empty((0, 2), dtype=np.int64))
         self._seed = 0
         self._n_of_draw = self._n_of_first = self._n_draws = 0
-        # Nothing is transferred before instances are drawn.
-        self._all_changed = False
 
-    def _make_selector(self, task: TargetTask) -> TaskComplianceSelector:
-        check_action_mappings(self.candidates.sets)
-        parts = self.candidates, task, self._transitions, self.rng
-        self._tasks = TaskComplianceSelector(*parts, self._bandwidths, self._starts, self.max_transitions)
+    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> TaskComplianceSelector:
+        check_action_mappings(parts.candidates.sets)
+        self._tasks = TaskComplianceSelector(*parts, *bandwidths, self.max_transitions)
         return self._tasks
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
@@ -139,7 +134,7 @@ class SampleTransfer(MappingTransfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         super().observe(state, action, reward, next_state, terminated)
-        n = self._transitions.n
+        n = self._tasks.transitions.n
         if n > self._n_of_draw and n >= max(self.min_transitions, RELEVANCE_GROWTH * self._n_of_draw):
             self._draw(n)
 
@@ -152,14 +147,14 @@ class SampleTransfer(MappingTransfer):
         self._n_draws += 1
         if self._n_of_first == 0 and len(self.drawn):
             self._n_of_first = n
-        self._all_changed = True
+        self._instances.all_changed = True
 
     def _drawn_by(self, n: int) -> np.ndarray:
         """Candidates and numbers of the instances that the first ``n`` transitions, the selector's, say are to be drawn."""
         assert self.task is not None
         relevances = np.ones((len(self.candidates), int(self.candidates.instances.size.max())))
         if self.relevance:
-            self._measure_relevance(n, relevances)
+            self._instances.measure_relevance(n_used=n, values=relevances)
         compliances = candidate_compliances(self.candidates, self._tasks.sums, n)
         n_each = max(1, self.n_instances // self.task.n_actions)
         return draw_instances(self.candidates, compliances, relevances, n_each, np.random.default_rng(self._seed))
@@ -168,11 +163,9 @@ class SampleTransfer(MappingTransfer):
         """Transfer these instances from now on."""
         assert self.task is not None
         self.drawn = drawn
-        breadth = self._translator.rules.breadth
-        self._translator = self._make_translator(
-            self.candidates.with_own(instances_of_each(self.candidates, drawn)), self.task
-        )
-        self._translator.set_breadth(breadth)
+        candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
+        instances = self._instances
+        instances.translator = self._make_translator(candidates, self.task, instances.translator.rules.breadth)
 
     # --------------------------------------------------------------- describing
 
@@ -195,7 +188,7 @@ class SampleTransfer(MappingTransfer):
 
     def mapping_steps(self) -> int:
         """Return after how many transitions of the target instances were first drawn; all so far if none have been."""
-        return self._n_of_first or self._n_steps
+        return self._n_of_first or self._instances.n_observed
 
     def statistics(self) -> dict[str, float]:
         return {

@@ -14,6 +14,22 @@ from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 Ranges = tuple[np.ndarray, np.ndarray]
 
 
+class SelectorParts(NamedTuple):
+    """
+    What every selector is made from.
+
+    :param candidates: the candidates of every target action
+    :param task: the target task
+    :param transitions: the recorded target transitions
+    :param rng: random number generator
+    """
+
+    candidates: Candidates
+    task: TargetTask
+    transitions: RecordedTransitions
+    rng: np.random.Generator
+
+
 class Confidence(NamedTuple):
     """
     How sure choices are: mean compliances with the nearest transitions, averaged over states of the sample.

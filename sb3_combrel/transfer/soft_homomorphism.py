@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.borne_out import GOES_ON, Outcomes
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
+from sb3_combrel.transfer.claims import FIRST_RENEWAL, MIN_EXPLAINED, MIN_TRANSITIONS, RENEWAL_GROWTH, Claims, trust_in
 from sb3_combrel.transfer.copy_sums import LARGEST_MISS
-from sb3_combrel.transfer.mapping_transfer import check_boolean
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.soft_mapping import (
     FitData,
     Logits,
@@ -31,7 +30,6 @@ from sb3_combrel.transfer.soft_mapping import (
 )
 from sb3_combrel.transfer.soft_predictions import MixturePredictions, Predicted
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
-from sb3_combrel.transfer.source_prior import FIRST_RENEWAL, MIN_EXPLAINED, MIN_TRANSITIONS, RENEWAL_GROWTH, TRUST_STEP
 
 # Each mapping predicts every transition that is fitted to with each source action.
 MAX_MAPPINGS = 2000
@@ -65,7 +63,7 @@ class SoftHomomorphism(Transfer):
     added. Scale and offset are not parameters: in unit coordinates, ranges correspond. As only the mean is fitted, a source
     action can also come out as the mean of others that it equals, such as no push as half a push to either side.
 
-    What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.source_prior.SourcePrior`:
+    What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.claims.Claims`:
     the weight of the source's data times the part of the target's effects that the mixture explains, of the variable of which
     it explains least, from 10 transitions of an action on; nothing of what it explains less than half, and no end before one
     has been confirmed. Effects on variables of which it explains less than half under an action are predicted as 0.
@@ -138,13 +136,8 @@ class SoftHomomorphism(Transfer):
         self._logits: Logits | None = None
         self._mixture = MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
         self._periodic = np.array(task.periodic)
-        self._transitions = RecordedTransitions(d)
-        # How each recorded transition's episode went on: 0 it did, 1 it terminated, 2 it reached its time limit.
-        self._ended: list[int] = []
-        self._outcomes = Outcomes(source.rewards, float(task.exploration_threshold))
-        self._trust = np.zeros(task.n_actions)
-        self._explains = np.ones((task.n_actions, d), dtype=np.bool_)
-        self._claims = False, False
+        self._transitions = RecordedEpisodes(d)
+        self._claims = Claims(source.rewards, task, self.transfer_terminals)
         # Squared errors of predictions, and squared effects, of transitions as they came.
         self._squares = np.zeros(2)
         self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
@@ -170,17 +163,7 @@ class SoftHomomorphism(Transfer):
         if self._logits is None:
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, reward, end, weight = self._mixture.predict(states, actions)
-        effect = np.where(self._explains[actions], effect, 0.0)
-        if self._outcomes.doubted:
-            return PriorPredictions(effect, reward, end, np.zeros(len(actions)))
-        weight = weight * self._trust[actions]
-        if not self._ends_believed:
-            weight[end >= GOES_ON] = 0.0
-        return PriorPredictions(effect, reward, end, weight)
-
-    @property
-    def _ends_believed(self) -> bool:
-        return self.transfer_terminals and self._outcomes.confirmed > 0
+        return self._claims.applied(effect, reward, end, weight, actions)
 
     # ----------------------------------------------------------------- observing
 
@@ -188,29 +171,22 @@ class SoftHomomorphism(Transfer):
         effect = differences(next_state, state, self._periodic)
         self._n_observed += 1
         if self._n_observed <= self.max_transitions:
-            self._transitions.add(state, action, reward, effect)
-            self._ended.append(int(terminated))
+            self._transitions.add(state, action, reward, effect, terminated)
         if self._logits is not None:
             [expected], [mean_reward], [end], [weight] = self._mixture.predict(state[None], np.array([action]))
             self._squares += ((expected - effect) ** 2).sum(), effect @ effect
-            self._outcomes.note(float(weight), float(end), float(mean_reward), reward, terminated)
+            self._claims.outcomes.note(float(weight), float(end), float(mean_reward), reward, terminated)
         if self._fit_due <= self._n_observed <= self.max_transitions:
             self._fit_due = RENEWAL_GROWTH * self._n_observed
             self._fit()
-        self._note_claims()
+        self._version += self._claims.have_changed()
 
     def end_episode(self, truncated: bool) -> None:
-        if truncated and self._ended and self._n_observed <= self.max_transitions:
-            self._ended[-1] = 2
+        if truncated and self._n_observed <= self.max_transitions:
+            self._transitions.note_time_limit()
         if self._logits is not None:
-            self._outcomes.end_episode(truncated)
-            self._note_claims()
-
-    def _note_claims(self) -> None:
-        """Let the version grow if ends and rewards are doubted, or believed, that were not before."""
-        claims = self._outcomes.doubted, self._ends_believed
-        self._version += claims != self._claims
-        self._claims = claims
+            self._claims.outcomes.end_episode(truncated)
+            self._version += self._claims.have_changed()
 
     # ------------------------------------------------------------------- fitting
 
@@ -229,7 +205,7 @@ class SoftHomomorphism(Transfer):
             self._steps_to_find = self._n_observed
         predicted = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
         self._judge(predicted, size)
-        self._replay(predicted)
+        self._claims.replay(seen, *predicted[1:])
         self._n_fits += 1
         self._version += 1
         self._seconds += perf_counter() - began
@@ -257,27 +233,17 @@ class SoftHomomorphism(Transfer):
         assert self.task is not None
         effects, actions = self._transitions.effects[: self._transitions.n], self._transitions.actions[: self._transitions.n]
         effect, _, _, weight = predicted
+        least, explains = np.zeros(self.task.n_actions), np.ones((self.task.n_actions, len(size)), dtype=np.bool_)
         founded = np.minimum(1.0, weight / self.task.exploration_threshold)
         compared = np.maximum(effects**2, np.maximum((LEAST_EFFECT * size) ** 2, 1e-300))
         missed = founded[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared)
         for a in range(self.task.n_actions):
             rows = actions == a
             total = founded[rows].sum()
-            enough = total >= MIN_TRANSITIONS
-            explained = 1.0 - missed[rows].sum(axis=0) / total if enough else np.ones(len(size))
-            self._explains[a] = explained >= MIN_EXPLAINED
-            least = explained.min() if enough else 0.0
-            self._trust[a] = np.floor(least / TRUST_STEP + 1e-9) * TRUST_STEP if least >= MIN_EXPLAINED else 0.0
-
-    def _replay(self, predicted: Predicted) -> None:
-        """Count anew what confirms and contradicts the ends and rewards that are predicted."""
-        self._outcomes.forget()
-        _, reward, end, weight = predicted
-        for i, ended in enumerate(self._ended):
-            got = float(self._transitions.rewards[i])
-            self._outcomes.note(float(weight[i]), float(end[i]), float(reward[i]), got, ended == 1)
-            if ended:
-                self._outcomes.end_episode(ended == 2)
+            if total >= MIN_TRANSITIONS:
+                explained = 1.0 - missed[rows].sum(axis=0) / total
+                least[a], explains[a] = explained.min(), explained >= MIN_EXPLAINED
+        self._claims.renew(trust_in(least), explains)
 
     # --------------------------------------------------------------- describing
 
@@ -342,8 +308,8 @@ class SoftHomomorphism(Transfer):
         certainty = float(probabilities(self._logits, self._readings)[0].max(axis=1).mean()) if self._logits else np.nan
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
-            "transfer/prior_trust": float(self._trust.mean()),
-            "transfer/prior_doubted": float(self._outcomes.doubted),
+            "transfer/prior_trust": float(self._claims.trust.mean()),
+            "transfer/prior_doubted": float(self._claims.outcomes.doubted),
             "transfer/mapping_probability": certainty,
             "transfer/steps_to_find_mapping": self._steps_to_find,
             "transfer/fits": self._n_fits,
@@ -361,29 +327,20 @@ class SoftHomomorphism(Transfer):
         logits = self._shape if self._logits is None else self._logits
         figures = self._n_observed, self._n_fits, self._version, self._steps_to_find, self._fit_due, *self._squares
         return {
-            "transitions": np.column_stack([self._transitions.rows(), np.array(self._ended, dtype=np.float64)]),
+            "transitions": self._transitions.rows(),
             "soft_state_logits": logits.state.ravel().copy(),
             "soft_action_logits": logits.action.ravel().copy(),
-            "soft_trust": self._trust.copy(),
-            "soft_explains": self._explains.ravel().astype(np.float64),
-            "soft_outcomes": self._outcomes.get_state(),
+            **self._claims.get_state("soft_"),
             "soft_figures": np.array(figures, dtype=np.float64),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         assert self.task is not None
-        d, n_actions = self.task.n_variables, self.task.n_actions
-        for *row, ended in state["transitions"].tolist():
-            action = int(np.clip(row[-1], 0, n_actions - 1))
-            self._transitions.add(np.array(row[:d]), action, row[-2], np.array(row[d : 2 * d]))
-            self._ended.append(int(ended))
+        self._transitions.restore(state["transitions"], self.task.n_actions)
         *counts, self._fit_due, wrong, baseline = state["soft_figures"].tolist()
         self._n_observed, self._n_fits, self._version, self._steps_to_find = (int(count) for count in counts)
         self._squares = np.array([wrong, baseline])
         if self._n_fits:
             given = state["soft_state_logits"], state["soft_action_logits"]
             self._use(Logits(*(array.reshape(like.shape).copy() for array, like in zip(given, self._shape, strict=True))))
-        self._trust = state["soft_trust"].copy()
-        self._explains = state["soft_explains"].reshape(n_actions, d) > 0.5
-        self._outcomes.set_state(state["soft_outcomes"])
-        self._claims = self._outcomes.doubted, self._ends_believed
+        self._claims.set_state(state, "soft_")

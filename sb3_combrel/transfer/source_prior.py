@@ -2,53 +2,31 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-
 import numpy as np
 
 from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.mappings.factored_mapping import describe_both_sides, describe_copy
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.borne_out import GOES_ON, TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
-from sb3_combrel.transfer.candidates import Candidate, MappedVariables
+from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
+from sb3_combrel.transfer.claims import FIRST_RENEWAL, MIN_EXPLAINED, MIN_TRANSITIONS, RENEWAL_GROWTH, Claims, trust_in
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior_choice import Choice, Chooser, moved
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
+from sb3_combrel.transfer.source_use import SourceUse
 
-FIRST_RENEWAL = 10
-# Choice and trust are renewed whenever this many times as much has been observed as at the last time.
-RENEWAL_GROWTH = 2**0.5
 # So many transitions are compared with what all copies predict; later ones one in so many, which suffices to notice a change.
 ALL_MEASURED, MEASURED_LATER = 500, 5
-# Transitions of a target action from which on a source is believed about it.
-MIN_TRANSITIONS = 10
-# How much of a variable's effects must be explained; less is not clearly better than "nothing changes". With 0.25 for the
-# mean that is fitted to, a Mountain Car as the source cost the iCub's arm 18 to 87 % more steps (two times ten seeds); with
-# 0.5 it costs 3 to 5 %, and sources that are right are not affected.
-MIN_EXPLAINED = 0.5
-# Trust is in steps of this: with every change all pairs are predicted anew.
-TRUST_STEP = 0.1
 
 
-class SourcePrior:
+class SourcePrior(SourceUse):
     """
     What a source predicts of the target, through a mapping that is given or chosen by compliance.
 
-    *What it claims.* The weight of a prediction is that of the source's data there, the least of all copies', times the
-    trust in the mapping for the target action: which part of the effects of the target's own transitions with it the source
-    explains, of the variable of which it explains least (see :meth:`explained`; a sum over variables would hide a wrong
-    action, which shows in velocities alone). No trust below ``MIN_EXPLAINED``, or before ``MIN_TRANSITIONS`` of the action;
-    of a mapping that is given, trust in all actions together stands in for that of an action with fewer. Nothing is claimed
-    any more while the source's ends or rewards are doubted (see :class:`Outcomes`), and no transition that may end before
-    an end has been confirmed.
-
-    *What it predicts.* Its effects are the mean that the target's own instances are fitted to wherever it claims nothing, too:
-    all but those on variables of which it turns out to explain less than ``MIN_EXPLAINED`` under the action;
-    these are 0.
+    What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.claims.Claims`. The weight of
+    the source's data is the least of all copies'. What is explained is said in :meth:`explained`; of a mapping that is given,
+    what is explained of all actions together stands in for an action with too few transitions.
 
     :param copies: the copies that can be chosen
     :param task: the target task
@@ -59,6 +37,8 @@ class SourcePrior:
     :param first_renewal: target transitions after which is chosen first; all of them are compared with what all copies
         predict. Equal to ``max_transitions``, it is chosen once
     """
+
+    candidates: PriorCandidates
 
     def __init__(
         self,
@@ -71,34 +51,26 @@ class SourcePrior:
         transfer_terminals: bool = True,
         first_renewal: int = FIRST_RENEWAL,
     ):
-        self.copies = copies
         self.task = task
+        self.sources = copies.sources
+        self.copies = copies
+        self.candidates = PriorCandidates(copies, task)
         self.whole = whole
         self._choose = None if isinstance(choose, Choice) else choose
         self.max_transitions = 0 if self._choose is None else max_transitions
-        self.transfer_terminals = transfer_terminals
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
-        self.n_observed = 0
         self.n_switches = 0
-        self.version = 0
-        self.trust = np.zeros(task.n_actions)
-        # Whether the source's effects on each variable are used, by target action.
-        self.explains = np.ones((task.n_actions, task.n_variables), dtype=np.bool_)
         rewards = np.concatenate([source.rewards for source in copies.sources])
-        self.outcomes = Outcomes(rewards, float(task.exploration_threshold))
+        #: What it claims to know.
+        self.claims = Claims(rewards, task, transfer_terminals)
         #: Errors of the mapping in use, where the source has data.
         self.errors = PlacedErrors(task)
         #: Transitions whose outcome the source claimed to know.
         self.n_claimed = 0
-        self._claims = False, False
-        self.transitions = RecordedTransitions(task.n_variables)
-        # How each recorded transition's episode went on: 0 it did, 1 it terminated, 2 it reached its time limit.
-        self._ended = np.zeros(64, dtype=np.int64)
+        self.transitions = RecordedEpisodes(task.n_variables)
         self._renewal_due = float(first_renewal)
         self._all_measured = max(ALL_MEASURED, first_renewal)
         self._warned = False
-        self._uses: Counter[tuple[int, ...]] = Counter()
-        self._candidates: list[tuple[int, ...]] = []
         self.choice: Choice | None = None
         self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
         if isinstance(choose, Choice):
@@ -126,22 +98,7 @@ class SourcePrior:
         if self.choice is None:
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, reward, end, coverage = self._raw(np.ascontiguousarray(states, dtype=np.float64), actions)
-        if not self.explains.all():
-            effect *= self.explains[actions]
-        return PriorPredictions(effect, reward, end, self._claimed(end, coverage, actions))
-
-    def _claimed(self, end: np.ndarray, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """The weight that is claimed for predictions: that of the source's data, as far as it is believed."""
-        if self.outcomes.doubted:
-            return np.zeros(len(actions))
-        weight = coverage * self.trust[actions]
-        if not self._ends_believed:
-            weight[end >= GOES_ON] = 0.0
-        return weight
-
-    @property
-    def _ends_believed(self) -> bool:
-        return self.transfer_terminals and self.outcomes.confirmed > 0
+        return self.claims.applied(effect, reward, end, coverage, actions)
 
     def _raw(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
         """Predictions and coverage. Those of many pairs at once are stored: what is claimed of them changes more often."""
@@ -170,7 +127,7 @@ class SourcePrior:
         self.n_observed += 1
         recorded = self.n_observed <= self.max_transitions
         if recorded:
-            self._record(state, action, reward, effect, terminated)
+            self.transitions.add(state, action, reward, effect, terminated)
             if self.n_observed <= self._all_measured or self.n_observed % MEASURED_LATER == 0:
                 self.copies.measure(state, action, effect, self.sums, self.whole)
         if self.choice is not None:
@@ -179,13 +136,7 @@ class SourcePrior:
             self._renewal_due = RENEWAL_GROWTH * self.n_observed
             self._renew(recorded)
             self._warn()
-        self._note_claims()
-
-    def _record(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
-        i = self.transitions.add(state, action, reward, effect)
-        if i == len(self._ended):
-            self._ended = np.concatenate([self._ended, np.zeros_like(self._ended)])
-        self._ended[i] = int(terminated)
+        self.version += self.claims.have_changed()
 
     def _check(
         self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool, recorded: bool
@@ -194,10 +145,10 @@ class SourcePrior:
         actions = np.array([action], dtype=np.int64)
         predicted = self.copies.predict(self._used, self._work_space, np.ascontiguousarray(state)[None], actions)
         predicted_effect, r, end, weight = predicted
-        self.n_claimed += bool(self._claimed(end, weight, actions)[0] > 0.0)
+        self.n_claimed += bool(self.claims.weight(end, weight, actions)[0] > 0.0)
         self._compare(state, action, effect, predicted_effect[0], float(weight[0]))
-        self.outcomes.note(float(weight[0]), float(end[0]), float(r[0]), reward, terminated)
-        self._uses[self._key(action)] += 1
+        self.claims.outcomes.note(float(weight[0]), float(end[0]), float(r[0]), reward, terminated)
+        self.candidates.note_use(action, self._moved(action))
         if not recorded:
             self.copies.follow(self._used, action, effect, predicted, self.sums)
 
@@ -210,16 +161,10 @@ class SourcePrior:
         if self.n_observed == 0:
             return
         if truncated and self.n_observed <= self.max_transitions:
-            self._ended[self.transitions.n - 1] = 2
+            self.transitions.note_time_limit()
         if self.choice is not None:
-            self.outcomes.end_episode(truncated)
-        self._note_claims()
-
-    def _note_claims(self) -> None:
-        """Let the version grow if ends and rewards are doubted, or believed, that were not before."""
-        claims = self.outcomes.doubted, self._ends_believed
-        self.version += claims != self._claims
-        self._claims = claims
+            self.claims.outcomes.end_episode(truncated)
+        self.version += self.claims.have_changed()
 
     # ------------------------------------------------------------------ choosing
 
@@ -232,13 +177,10 @@ class SourcePrior:
                 self._set_choice(choice)
                 self._replay()
                 self.version += 1
-        explained = self.explained()
-        trust = np.where(explained >= MIN_EXPLAINED, np.floor(explained / TRUST_STEP + 1e-9) * TRUST_STEP, 0.0)
+        trust = trust_in(self.explained())
         missed, founded = self._missed()
         explains = (founded < MIN_TRANSITIONS) | (missed <= (1.0 - MIN_EXPLAINED) * founded) | ~self._in_copies()
-        if not (np.array_equal(trust, self.trust) and np.array_equal(explains, self.explains)):
-            self.trust, self.explains = trust, explains
-            self.version += 1
+        self.version += self.claims.renew(trust, explains)
 
     def _set_choice(self, choice: Choice) -> None:
         self.choice = choice
@@ -248,15 +190,12 @@ class SourcePrior:
 
     def _replay(self) -> None:
         """Count anew what confirms and contradicts what is predicted through another mapping."""
-        self.outcomes.forget()
         self.errors.forget()
         n, seen = self.transitions.n, self.transitions
         effect, reward, end, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
-        for i, ended in enumerate(self._ended[:n].tolist()):
+        for i in range(n):
             self._compare(seen.states[i], int(seen.actions[i]), seen.effects[i], effect[i], float(weight[i]))
-            self.outcomes.note(float(weight[i]), float(end[i]), float(reward[i]), float(seen.rewards[i]), ended == 1)
-            if ended:
-                self.outcomes.end_episode(ended == 2)
+        self.claims.replay(seen, reward, end, weight)
 
     def explained(self) -> np.ndarray:
         """
@@ -328,10 +267,10 @@ class SourcePrior:
         """Figures for the logger, by name."""
         return {
             "transfer/prediction_error": self.error(),
-            "transfer/prior_trust": float(self.trust.mean()),
-            "transfer/prior_doubted": float(self.outcomes.doubted),
-            "transfer/ends_confirmed": self.outcomes.confirmed,
-            "transfer/ends_contradicted": self.outcomes.contradicted,
+            "transfer/prior_trust": float(self.claims.trust.mean()),
+            "transfer/prior_doubted": float(self.claims.outcomes.doubted),
+            "transfer/ends_confirmed": self.claims.outcomes.confirmed,
+            "transfer/ends_contradicted": self.claims.outcomes.contradicted,
             "transfer/prior_copies": 0 if self.choice is None else int((self.choice.copies >= 0).sum(axis=1).max(initial=0)),
             "transfer/switches": self.n_switches,
             "transfer/target_transitions": self.n_observed,
@@ -356,94 +295,45 @@ class SourcePrior:
             found[a] = np.prod(means) if means else np.nan
         return found
 
-    def copy_mapping(self, copy: int, action: tuple[int, ...] | None = None) -> InterTaskMapping:
-        """
-        Return a copy as an inter-task mapping, with names.
-
-        :param action: source action of each target action; None: 0 throughout
-        """
-        return self.copies.mapping(copy, self.task, action or (0,) * self.task.n_actions)
-
     def describe(self) -> str:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
-        choice, names = self.choice, self.task.action_names
-        moves = [[] if choice is None else moved(choice, a) for a in range(self.task.n_actions)]
-        return "; ".join(
-            f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True)
-        )
+        return self.candidates.describe_choice(self.choice)
 
-    def describe_action(self, choice: Choice, action: int) -> str:
-        """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
-        return self._describe_moves(moved(choice, action), describe_copy)
+    @property
+    def makes_choices(self) -> bool:
+        return True
 
-    def _describe_moves(self, moves: Sequence[tuple[int, int]], variables_of: Callable[[InterTaskMapping], str]) -> str:
-        words = (f"{self._action_name(copy, used)} on {variables_of(self.copy_mapping(copy))}" for copy, used in moves)
-        return ", ".join(words) if moves else "nothing"
-
-    def _action_name(self, copy: int, used: int) -> str:
-        return self.copies.sources[self.copies.source[copy]].action_names[used]
-
-    def _key(self, action: int) -> tuple[int, ...]:
-        """A target action and what it is made of, as numbers; listed as a candidate."""
-        key = (action, *(number for pair in self._moved(action) for number in pair))
-        if key not in self._uses:
-            self._candidates.append(key)
-            self._uses[key] = 0
-        return key
+    def choices_by_action(self) -> np.ndarray:
+        """The candidate in use for each target action, int64, shape (n_target_actions,), -1 for none."""
+        moves = [self._moved(a) for a in range(self.task.n_actions)]
+        return np.array([self.candidates.number(a, of) if of else -1 for a, of in enumerate(moves)], dtype=np.int64)
 
     def choices(self) -> np.ndarray:
-        """The candidate in use for each target action, int64, shape (n_target_actions,), -1 for none."""
-        keys = [self._key(a) if self._moved(a) else None for a in range(self.task.n_actions)]
-        return np.array([-1 if key is None else self._candidates.index(key) for key in keys], dtype=np.int64)
+        return np.repeat(self.choices_by_action(), len(self.task.sample_states))
 
-    def candidate(self, number: int) -> Candidate:
-        """A candidate's parts, by name."""
-        action, *rest = self._candidates[number]
-        moves = list(zip(rest[::2], rest[1::2], strict=True))
-        names = " + ".join(self._action_name(copy, used) for copy, used in moves) or "nothing"
-        return Candidate(action, names, " + ".join(describe_copy(self.copy_mapping(copy)) for copy, _ in moves))
-
-    def mapped_variables(self, number: int) -> MappedVariables:
-        """What a candidate makes of each target variable, in numbers."""
-        action, *rest = self._candidates[number]
-        found = MappedVariables.none(action, self.task.n_variables)
-        for copy, used in zip(rest[::2], rest[1::2], strict=True):
-            has = self.copies.state[copy] >= 0
-            found.source[has] = self.copies.source[copy]
-            found.variable[has] = self.copies.state[copy, has]
-            found.sign[has] = np.where(self.copies.sign[copy, has] < 0, -1, 1)
-            found.action[has] = used
-        return found
+    def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return self.choices_by_action()[actions]
 
     def uses(self) -> dict[int, int]:
-        """For how many of the target's transitions each candidate was in use."""
-        return {number: self._uses[key] for number, key in enumerate(self._candidates) if self._uses[key]}
-
-    def source_action_names(self) -> list[str]:
-        """The names of the source actions, or of several at once, of all candidates."""
-        return list(dict.fromkeys(self.candidate(number).source_action for number in range(len(self._candidates))))
+        return self.candidates.uses()
 
     # -------------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What was learned, float64 arrays."""
-        n, d = self.transitions.n, self.task.n_variables
-        chosen = np.full((3, self.task.n_actions, d), -1.0)
+        chosen = np.full((3, self.task.n_actions, self.task.n_variables), -1.0)
         if self.choice is not None:
             chosen[0] = 0.0
             for row, array in zip(chosen[1:], self.choice, strict=True):
                 row[:, : array.shape[1]] = array
-        uses = [[self._uses[key], *key, *[-1] * (2 * d + 1 - len(key))] for key in self._candidates]
         figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, self._n_slots()
         return {
-            "transitions": np.column_stack([self.transitions.rows(), self._ended[:n]]),
+            "transitions": self.transitions.rows(),
             "prior_choice": chosen.ravel(),
-            "prior_trust": self.trust.copy(),
-            "prior_explains": self.explains.ravel().astype(np.float64),
-            "prior_outcomes": self.outcomes.get_state(),
+            **self.claims.get_state("prior_"),
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": np.concatenate([[float(self.n_claimed)], self.errors.sums.ravel()]),
-            "prior_uses": np.array(uses, dtype=np.float64).reshape(-1, 2 * d + 2),
+            "prior_uses": self.candidates.get_state(),
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
 
@@ -453,10 +343,7 @@ class SourcePrior:
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`get_state` returned; for a new object."""
         d, n_actions = self.task.n_variables, self.task.n_actions
-        for *row, ended in state["transitions"]:
-            action = int(np.clip(row[-1], 0, n_actions - 1))
-            self._record(np.array(row[:d]), action, float(row[-2]), np.array(row[d : 2 * d]), False)
-            self._ended[self.transitions.n - 1] = int(ended)
+        self.transitions.restore(state["transitions"], n_actions)
         for name, array in self.sums._asdict().items():
             array.ravel()[:] = state[f"prior_sums_{name}"]
         observed, switches, version, due, warned, n_slots = state["prior_figures"].tolist()
@@ -467,14 +354,7 @@ class SourcePrior:
             self._set_choice(Choice(copies, np.minimum(chosen[2], most)))
         self.n_observed, self.n_switches, self.version = int(observed), int(switches), int(version)
         self._renewal_due, self._warned = due, warned > 0.5
-        self.trust = state["prior_trust"].copy()
-        self.explains = state["prior_explains"].reshape(n_actions, d) > 0.5
-        self.outcomes.set_state(state["prior_outcomes"])
+        self.claims.set_state(state, "prior_")
         self.n_claimed = int(state["prior_errors"][0])
         self.errors.sums.ravel()[:] = state["prior_errors"][1:]
-        self._claims = self.outcomes.doubted, self._ends_believed
-        self._candidates, self._uses = [], Counter()
-        for n, *key in state["prior_uses"].astype(np.int64).tolist():
-            kept = tuple(key[: 1 + 2 * sum(number >= 0 for number in key[1::2])])
-            self._candidates.append(kept)
-            self._uses[kept] = n
+        self.candidates.set_state(state["prior_uses"])

@@ -10,6 +10,7 @@ import numpy as np
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
 from sb3_combrel.transfer.mapping_transfer import (
@@ -20,7 +21,7 @@ from sb3_combrel.transfer.mapping_transfer import (
 )
 from sb3_combrel.transfer.prior_sets import make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
-from sb3_combrel.transfer.selectors import FixedSelector, PooledSelector, RandomSelector, Selector
+from sb3_combrel.transfer.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_prior import SourcePrior
 
@@ -35,7 +36,7 @@ class TIMBREL(MappingTransfer):
 
     With ``use="prior"`` the source's own local linear model, seen through the mapping, is the prior of the target's model: the
     target's own instances are fitted to what it leaves over. What it claims to know without them is said in
-    :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. It needs ``FittedRMax(degree=1)``.
+    :class:`~sb3_combrel.transfer.claims.Claims`. It needs ``FittedRMax(degree=1)``.
 
     ::
 
@@ -121,17 +122,15 @@ class TIMBREL(MappingTransfer):
         if not isinstance(self.mapping, str):
             self.mapping = self.mappings  # type: ignore[assignment]
 
-    def _make_selector(self, task: TargetTask) -> Selector:
-        parts = self.candidates, task, self._transitions, self.rng
+    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
         if isinstance(self.mapping, str):
             return PooledSelector(*parts) if self.mapping == "pool" else RandomSelector(*parts)
         n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
-        if n_given not in (1, task.n_actions):
-            raise ValueError(
-                f"mapping must be one mapping or one for each of the {task.n_actions} target actions, got {n_given}"
-            )
-        given = self.candidates.sets[0]
-        fixed = [self.candidates.find(a, given[a if n_given > 1 else 0]) for a in range(task.n_actions)]
+        n_actions = parts.task.n_actions
+        if n_given not in (1, n_actions):
+            raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {n_given}")
+        given = parts.candidates.sets[0]
+        fixed = [parts.candidates.find(a, given[a if n_given > 1 else 0]) for a in range(n_actions)]
         return FixedSelector(*parts, fixed=np.array(fixed, dtype=np.int64))
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:

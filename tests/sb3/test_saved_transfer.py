@@ -5,7 +5,7 @@ import pytest
 from helpers.walk import METHODS, STRIDE, Walk, learnt_on, same_parameters, small, stored, walk_source
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
-from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet, SampleTransfer
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import Transfer
 
@@ -55,6 +55,64 @@ def test_two_halves_make_the_run_that_was_not_interrupted(name, tmp_path):
     np.testing.assert_allclose(halves.agent.planner.values, whole.agent.planner.values, atol=1e-8)
     if name != "none":
         np.testing.assert_array_equal(halves.policy.transfer.choices(), whole.policy.transfer.choices())
+
+
+BY_RELEVANCE = {
+    "TIMBREL": lambda: TIMBREL(walk_source(), MAPPING, relevance="near"),
+    "pool": lambda: TIMBREL(walk_source(), "pool", relevance=True),
+    "COMBREL": lambda: COMBREL(walk_source(), relevance="near"),
+    "SampleTransfer": lambda: SampleTransfer(walk_source(), min_transitions=20, relevance=True),
+}
+
+
+@pytest.mark.parametrize("name", BY_RELEVANCE)
+@pytest.mark.parametrize("n_episodes", [3, 8])
+def test_two_halves_by_relevance_make_the_run_that_was_not_interrupted(name, n_episodes, tmp_path):
+    """Relevance is measured by the transitions of its last renewal, of which there may have been none, not by all so far."""
+    given = dict(planning_tolerance=1e-10, max_backups=100_000, model_breadth=0.05, exploration_threshold=2.0)
+    whole = after_episodes(n_episodes + 6, BY_RELEVANCE[name](), Walk(start=-0.5), **given)
+    half = after_episodes(n_episodes, BY_RELEVANCE[name](), Walk(start=-0.5), **given)
+    half.save(tmp_path / "half")
+    halves = FittedRMax.load(tmp_path / "half", env=Walk(start=-0.5))
+    halves.learn(10**6, callback=StopTrainingOnMaxEpisodes(6), reset_num_timesteps=False)
+    assert halves.num_timesteps == whole.num_timesteps > 60
+    np.testing.assert_array_equal(stored(halves), stored(whole))
+    np.testing.assert_allclose(halves.agent.planner.values, whole.agent.planner.values, atol=1e-8)
+    assert halves.policy.transfer.uses() == whole.policy.transfer.uses()
+    for one, other in zip(*(transferred_by(model.policy.transfer) for model in (halves, whole)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def transferred_by(method):
+    """Weights, effects and rewards of the instances that a method transfers to all pairs of the sample."""
+    points = method.task.sample_states
+    pairs = np.tile(np.arange(len(points)), 2), np.repeat([0, 1], len(points)), np.zeros(2 * len(points))
+    found = method.transferred_to_sample(*pairs)
+    there = np.arange(found.weight.shape[1]) < found.length[: 2 * len(points), None]
+    return [array[: 2 * len(points)][there] for array in (found.weight, found.effect, found.reward)]
+
+
+@pytest.mark.parametrize("name", ["TIMBREL", "pool", "COMBREL"])
+def test_relevance_is_that_of_its_last_renewal_once_loaded(name, tmp_path):
+    for n_episodes in (3, 8):
+        model = after_episodes(n_episodes, BY_RELEVANCE[name](), model_breadth=0.05, exploration_threshold=2.0)
+        model.save(tmp_path / "model")
+        loaded = FittedRMax.load(tmp_path / "model")
+        ours, theirs = (each.policy.transfer._instances.translator.relevance for each in (model, loaded))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("name", ["TIMBREL", "pool", "COMBREL"])
+def test_a_file_that_does_not_say_by_what_relevance_was_measured_has_it_measured_by_all_transitions(name):
+    model = after_episodes(8, BY_RELEVANCE[name](), model_breadth=0.05, exploration_threshold=2.0)
+    parameters = model.get_parameters()["policy"]
+    instances = model.policy.transfer._instances
+    assert 0 < parameters["transfer_relevance_of"].item() < instances.transitions.n
+    expected = np.ones_like(instances.translator.relevance)
+    instances.measure_relevance(n_used=instances.transitions.n, values=expected)
+    del parameters["transfer_relevance_of"]
+    model.set_parameters({"policy": parameters})
+    np.testing.assert_array_equal(model.policy.transfer._instances.translator.relevance, expected)
 
 
 @pytest.mark.parametrize("name", ["TIMBREL", "COMBREL", "two sources", "first episode", "drawn"])

@@ -176,7 +176,7 @@ def test_combrel_transfers_the_instances_of_the_equations(seed, breadth):
     method, _, source, rng = combrel_and_its_sample(seed, breadth=breadth)
     states, actions, own = rng.random((6, 3)), np.tile(np.arange(2), 3), rng.uniform(0.0, 1.2, 6)
     found = method.transferred(states, actions, own)
-    chosen, last = method._selector.select(states, actions, own)
+    chosen, last = method._instances.selector.select(states, actions, own)
     rules = TransferRules(breadth, method.task.exploration_threshold, method.task.min_weight, method.task.min_fraction)
     for row, (state, action) in enumerate(zip(states, actions, strict=True)):
         n = found.length[row]

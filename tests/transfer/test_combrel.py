@@ -173,7 +173,7 @@ def test_choices_of_known_pairs_are_not_renewed_until_they_are_unknown_again():
         show(eager, transition)
     assert sorted(changed_pairs(lazy, known)) == sorted(set(changed_pairs(eager)) - set(np.flatnonzero(known)))
     assert (lazy.choices()[known] == -1).all()
-    assert 0 < lazy._selector._cache.measured.sum() < eager._selector._cache.measured.sum()
+    assert 0 < lazy._instances.selector._cache.measured.sum() < eager._instances.selector._cache.measured.sum()
     lazy.end_episode(False)
     np.testing.assert_array_equal(choices_of(lazy), eager.choices())
 

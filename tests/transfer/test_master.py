@@ -156,7 +156,7 @@ def test_all_random_transitions_count_however_many():
     """A prior whose mapping may change later measures one in five of them from some time on."""
     method = bound(MASTER(source_of(), n_random_steps=520, use="prior"), naive.target_task(POINTS, 2))
     show(method, transitions_of(519, 3, 2))
-    assert method.chosen is None and method._prior.sums.n.sum() == 519
+    assert method.chosen is None and method.source_prior.sums.n.sum() == 519
     show(method, transitions_of(1, 3, 2))
     assert method.chosen is not None
 

@@ -176,7 +176,7 @@ class TestMethod:
 
     def selected(self, method, state):
         """The first candidates of the range selected for each action."""
-        return method._selector.select(np.tile(state, (2, 1)), np.arange(2), np.zeros(2))[0].tolist()
+        return method._instances.selector.select(np.tile(state, (2, 1)), np.arange(2), np.zeros(2))[0].tolist()
 
     def test_to_ask_leaves_no_trace(self):
         method = self.bound()

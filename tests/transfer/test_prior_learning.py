@@ -52,7 +52,7 @@ def test_two_cars_are_found_in_mountain_car_4d_within_one_episode(seed, mappings
         state = after
         if step + 1 in (150, 300):
             assert transfer.describe_prior() == FOUND
-    assert transfer._prior.trust.min() >= 0.8
+    assert transfer.source_prior.claims.trust.min() >= 0.8
 
 
 class Oscillators(gym.Env):

@@ -52,8 +52,8 @@ def test_the_mapping_of_a_prior_is_named_with_compliances_and_errors_of_the_targ
         used = {copy: TWO.copies[copy].action[a] for copy in (0, 1)}
         predicted = np.zeros((rows.sum(), 4))
         for copy, place in places.items():
-            number = next(k for k, row in enumerate(transfer._prior.copies.state) if row[place].tolist() == [0, 1])
-            predicted[:, place] = f.predicted_by(transfer._prior.copies, number, used[copy], states[rows])[:, place]
+            number = next(k for k, row in enumerate(transfer.source_prior.copies.state) if row[place].tolist() == [0, 1])
+            predicted[:, place] = f.predicted_by(transfer.source_prior.copies, number, used[copy], states[rows])[:, place]
         squared = (effects[rows] - predicted) ** 2
         assert each.compliance == pytest.approx(np.exp(-(squared / scale).sum(axis=1)).mean(), rel=1e-3)
         assert each.no_change_compliance == pytest.approx(np.exp(-(effects[rows] ** 2 / scale).sum(axis=1)).mean())
@@ -85,9 +85,9 @@ def test_the_compliance_in_logs_stays_when_no_more_transitions_are_recorded():
     transfer = bound(COMBREL(f.oscillator_source(noise=0.01), "factored", use="prior", max_transitions=60))
     states, actions, effects = f.walk(TWO, 300, seed=3)
     shown(transfer, (states[:60], actions[:60], effects[:60]))
-    before = transfer._prior.mean_compliance()
+    before = transfer.source_prior.mean_compliance()
     shown(transfer, (states[60:], actions[60:], effects[60:]))
-    np.testing.assert_array_equal(transfer._prior.mean_compliance(), before)
+    np.testing.assert_array_equal(transfer.source_prior.mean_compliance(), before)
 
 
 @pytest.mark.filterwarnings("ignore:what was transferred")
@@ -118,7 +118,7 @@ def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
     before = transfer.describe_prior()
     shown(transfer, right)
     assert transfer.describe_prior() != before and transfer.statistics()["transfer/switches"] >= 1
-    prior, errors = transfer._prior, PlacedErrors(transfer.task)
+    prior, errors = transfer.source_prior, PlacedErrors(transfer.task)
     for state, action, effect in zip(*(np.concatenate(parts) for parts in zip(wrong, right, strict=True)), strict=True):
         predicted, _, _, weight = prior.copies.predict(prior._used, prior._work_space, state[None], np.array([action]))
         if weight[0] >= prior.copies.threshold:
@@ -186,7 +186,7 @@ def test_the_confidence_of_combrel_is_that_of_its_choices_and_they_are_the_best(
     source = SourceInstances.record(None, NamedWalk(), n_instances=200, seed=0)
     transfer = COMBREL(source, "signed_injective", use="instances", min_compliance=1.0)
     model = small(NamedWalk(), transfer=transfer, degree=0).learn(150)
-    selector = model.transfer._selector
+    selector = model.transfer._instances.selector
     # Choices that are due wait until there is more to renew, or an episode ends.
     selector.end_episode()
     selector.changed(np.zeros((2, len(selector.task.sample_states)), dtype=np.bool_))

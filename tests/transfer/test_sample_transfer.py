@@ -206,7 +206,7 @@ def test_relevance_is_that_of_the_equations():
         method = SampleTransfer(source, LISTED, min_transitions=40, relevance=relevance, bandwidths=BANDWIDTHS)
         observed(method, transitions, naive.target_task(POINTS, 2))
         values = np.full((len(method.candidates), int(method.candidates.instances.size.max())), np.nan)
-        method._measure_relevance(40, values)
+        method._instances.measure_relevance(n_used=40, values=values)
         for candidate, (_, action, state, signs, source_action) in ((c, key_of(method, c)) for c in range(len(values))):
             mapping, given = InterTaskMapping(state, [source_action] * 2, signs), Bandwidths(*BANDWIDTHS)
             if relevance == "near":

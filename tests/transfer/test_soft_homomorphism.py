@@ -55,7 +55,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
     predicted = method.prior(states, actions)
     expected = f.target_effects(SWAPPED, states, actions)
     assert ((predicted.effect - expected) ** 2).sum() < 0.01 * (expected**2).sum()
-    assert method._trust.min() >= 0.8 and predicted.weight.min() > 1.0
+    assert method._claims.trust.min() >= 0.8 and predicted.weight.min() > 1.0
     assert method.statistics()["transfer/prediction_error"] < 0.1
     assert 10 <= method.statistics()["transfer/steps_to_find_mapping"] <= 150
 
@@ -120,7 +120,7 @@ def test_a_target_that_has_nothing_in_common_is_not_claimed_to_be_known():
     states, actions = rng.random((200, 2)), rng.integers(3, size=200)
     method = bound(SoftHomomorphism(f.oscillator_source()), 2, 3)
     show(method, (states, actions, 0.1 * np.sin(40.0 * states[:, ::-1])))
-    assert method._trust.tolist() == [0.0, 0.0, 0.0]
+    assert method._claims.trust.tolist() == [0.0, 0.0, 0.0]
     assert method.prior(*inside(50, 2, 3)).weight.max() == 0.0
 
 

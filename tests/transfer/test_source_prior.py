@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping
-from sb3_combrel.transfer.source_prior import MIN_TRANSITIONS
+from sb3_combrel.transfer.claims import MIN_TRANSITIONS
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
 ALONG_FIRST = InterTaskMapping([0, None, 1, None], [0, 1, 2, 0, 0])
@@ -67,7 +67,7 @@ MAPPINGS = [
 @pytest.mark.parametrize("n", [1, 7, 400])
 def test_predictions_are_those_of_the_copies(mapping, n):
     source = f.oscillator_source(rewards=lambda states: states[:, 0])
-    prior = bound(TIMBREL(source, mapping, use="prior"))._prior
+    prior = bound(TIMBREL(source, mapping, use="prior")).source_prior
     rng = np.random.default_rng(n)
     # Few different values, as on a grid, in any order.
     states, actions = rng.integers(0, 5, size=(n, 4)) / 4.0, rng.integers(5, size=n)
@@ -332,7 +332,7 @@ def test_angles_go_around():
 def test_with_two_sources_the_one_that_fits_is_found():
     transfer = bound(METHODS["two sources"]())
     show(transfer, f.walk(TWO, 200))
-    assert set(transfer._prior.copies.source[transfer._prior.choice.copies].ravel().tolist()) == {1}
+    assert set(transfer.source_prior.copies.source[transfer.source_prior.choice.copies].ravel().tolist()) == {1}
 
 
 def test_asking_leaves_no_trace():

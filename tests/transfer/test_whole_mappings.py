@@ -36,7 +36,7 @@ def test_every_state_gets_the_whole_mapping_with_the_highest_mean_compliance(n_n
     for transition in seen:
         show(method, transition)
     choices, n_chosen = choices_of(method).reshape(2, -1), 0
-    exact = method._selector.select(np.repeat(POINTS, 2, axis=0), np.tile(np.arange(2), len(POINTS)), np.zeros(60))
+    exact = method._instances.selector.select(np.repeat(POINTS, 2, axis=0), np.tile(np.arange(2), len(POINTS)), np.zeros(60))
     for point, state in enumerate(POINTS):
         expected = mean_compliance(seen, sources, sets, state, n_neighbors)
         best = max(mean for mean, _, _ in expected)

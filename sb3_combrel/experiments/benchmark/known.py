@@ -121,4 +121,4 @@ def _observed(pair: Pair, transfer: object, transitions: SourceInstances) -> Sou
         )
         for row in rows:
             bound.observe(*row)
-    return bound._prior
+    return bound.source_prior

@@ -115,7 +115,7 @@ class TestKnownMappings:
             bound = FittedRMax(env, transfer=METHODS["oracle"].make(source, pair), seed=0).agent.transfer
         scaling = bound.task.scaling
         states, after = scaling.to_unit(target.states), scaling.to_unit(target.next_states)
-        predicted = bound._prior.predict(states, target.actions).effect
+        predicted = bound.source_prior.predict(states, target.actions).effect
         naive = ((after - states - predicted) ** 2).sum() / ((after - states) ** 2).sum()
         assert found == pytest.approx(naive, rel=1e-6)
 

@@ -1,71 +1,18 @@
-"""The report of a transfer method that maps a source: which mappings, how sure, what the target contradicted."""
+"""The report of a source as the prior: which mappings, how sure, which would be next, what the target contradicted."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.mappings.factored_mapping import describe_copy
-from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.candidates import Candidate
 from sb3_combrel.transfer.copy_sums import SMALLEST_SCALE
-from sb3_combrel.transfer.placed_errors import PlacedErrors
 from sb3_combrel.transfer.prior_choice import Choice, best_actions
-from sb3_combrel.transfer.report import MappingReport, TransferReport
-from sb3_combrel.transfer.selectors import Confidence
+from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 from sb3_combrel.transfer.source_prior import SourcePrior
 
 # Alternatives are compared on so many of the recorded transitions, at most, evenly spread.
 MAX_TRANSITIONS = 1000
-
-
-# ------------------------------------------------------------------------------ use="instances"
-
-
-def mappings_of_instances(
-    uses: dict[int, int],
-    candidates: Sequence[Candidate],
-    action_names: Sequence[str],
-    confidence: Sequence[Confidence | None],
-    errors: PlacedErrors,
-) -> tuple[MappingReport, ...]:
-    """
-    Report, for each target action, the mapping whose instances were used most.
-
-    :param uses: how often each candidate's instances were used, by its number
-    :param candidates: their parts, in the order of ``uses``
-    :param action_names: names of the target's actions
-    :param confidence: for each target action what the selector says of its choices; None where it chose nothing
-    :param errors: prediction errors
-    """
-    found = []
-    counts = dict(zip(uses, candidates, strict=True))
-    compared, error = errors.of_actions[:, 0], errors.errors()
-    for a, name in enumerate(action_names):
-        of_action = Counter({each: uses[each] for each, parts in counts.items() if parts.target_action == a})
-        figures = dict(error=float(error[a]), n_compared=int(compared[a]))
-        sure = confidence[a]
-        if sure is not None:
-            figures |= dict(zip(_COMPLIANCES, sure[:3], strict=True))
-        if not of_action:
-            nothing = "nothing was transferred" if not compared[a] else "many mappings at once"
-            found.append(MappingReport(name, nothing, n_mappings=0, **figures))  # type: ignore[arg-type]
-            continue
-        ((best, n),) = of_action.most_common(1)
-        parts = counts[best]
-        words = f"{parts.source_action} with {parts.state_mapping}"
-        share = n / of_action.total()
-        found.append(MappingReport(name, words, share=share, n_mappings=len(of_action), **figures))  # type: ignore[arg-type]
-    return tuple(found)
-
-
-_COMPLIANCES = ("compliance", "next_best_compliance", "no_change_compliance")
-
-
-# ---------------------------------------------------------------------------------- use="prior"
 
 
 class _Sample(NamedTuple):
@@ -104,13 +51,13 @@ def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
     :param prior: after one step at least
     """
     names = prior.task.action_names
-    pairs = np.argwhere(~prior.explains)
+    pairs = np.argwhere(~prior.claims.explains)
     choice = prior.choice
     next_division, next_error = _next_division(prior) if choice is not None else ("", np.nan)
     return TransferReport(
         method=method,
         use="prior",
-        sources=describe_sources(prior.copies.sources),
+        sources=describe_sources(prior.sources),
         n_steps=prior.n_observed,
         n_rested=prior.n_claimed,
         mappings=() if choice is None else _mappings_of_prior(prior, choice),
@@ -121,8 +68,8 @@ def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
         n_worse=int(prior.errors.of_actions[:, 3].sum()),
         contradictions=prior.errors.contradictions(),
         not_used=tuple((names[a], prior.task.state_names[v]) for a, v in pairs.tolist()),
-        ends=(prior.outcomes.confirmed, prior.outcomes.contradicted),
-        rewards=(prior.outcomes.rewards_right, prior.outcomes.rewards_wrong),
+        ends=(prior.claims.outcomes.confirmed, prior.claims.outcomes.contradicted),
+        rewards=(prior.claims.outcomes.rewards_right, prior.claims.outcomes.rewards_wrong),
         statistics=prior.statistics(),
     )
 
@@ -131,24 +78,25 @@ def _mappings_of_prior(prior: SourcePrior, choice: Choice) -> tuple[MappingRepor
     sample = _sample(prior)
     fit, still = _fit(prior, choice, sample), _no_change(sample)
     others = [(other, _fit(prior, other, sample)) for other in _alternatives(prior, choice)]
-    uses, in_use = prior.uses(), prior.choices()
+    candidates, uses, in_use = prior.candidates, prior.uses(), prior.choices_by_action()
     placed, compared = prior.errors.errors(), prior.errors.of_actions[:, 0]
     found = []
     for a, name in enumerate(prior.task.action_names):
         rows = sample.actions == a
         compliance, error = fit.of(rows)
-        of_action = {each: n for each, n in uses.items() if prior.candidate(each).target_action == a}
+        of_action = {each: n for each, n in uses.items() if candidates.parts(each).target_action == a}
+        in_words = candidates.describe_action(choice, a)
         next_best, next_compliance, next_error = "", np.nan, np.nan
         for other, its_fit in others:
             its_compliance, its_error = its_fit.of(rows)
-            differs = prior.describe_action(other, a) != prior.describe_action(choice, a)
-            if differs and rows.any() and not its_compliance <= next_compliance:
-                next_best = prior.describe_action(other, a)
+            words = candidates.describe_action(other, a)
+            if words != in_words and rows.any() and not its_compliance <= next_compliance:
+                next_best = words
                 next_compliance, next_error = its_compliance, its_error
         found.append(
             MappingReport(
                 target_action=name,
-                mapping=prior.describe_action(choice, a),
+                mapping=in_words,
                 share=of_action.get(int(in_use[a]), 0) / max(sum(of_action.values()), 1),
                 n_mappings=len(of_action),
                 compliance=compliance,
@@ -159,7 +107,7 @@ def _mappings_of_prior(prior: SourcePrior, choice: Choice) -> tuple[MappingRepor
                 error=error if rows.any() else float(placed[a]),
                 next_best_error=next_error,
                 n_compared=int(rows.sum()) if rows.any() else int(compared[a]),
-                trust=float(prior.trust[a]),
+                trust=float(prior.claims.trust[a]),
             )
         )
     return tuple(found)
@@ -234,12 +182,5 @@ def _next_division(prior: SourcePrior) -> tuple[str, float]:
         other = prior.choose(measured._replace(compliance=compliance))
         its_compliance, its_error = _fit(prior, other, sample).of(everything)
         if its_compliance > best:
-            copies = dict.fromkeys(other.copies[other.copies >= 0].tolist())
-            words = " and ".join(describe_copy(prior.copy_mapping(each)) for each in copies)
-            best, name, error = its_compliance, words or "no copy at all", its_error
+            best, name, error = its_compliance, prior.candidates.describe_copies(other), its_error
     return name, error
-
-
-def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
-    """Name source tasks, and how many instances each has."""
-    return tuple(f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances)" for source in sources)

@@ -1,0 +1,188 @@
+"""Transfer of instances: translated through the mappings that are selected, and checked by what the target then does."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Protocol
+
+import numpy as np
+
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.instances_check import InstancesCheck
+from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.selectors import Ranges, Selector
+from sb3_combrel.transfer.source_use import SourceUse
+from sb3_combrel.transfer.translation import Translator
+
+# Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
+RELEVANCE_GROWTH = 1.2
+MIN_TRANSITIONS_FOR_RELEVANCE = 50
+#: What stands in files that do not say by how many transitions relevance was measured: by all that were used.
+ALL_USED = -1
+
+
+class MeasureRelevance(Protocol):
+    """Writes to ``values`` the relevance of each candidate's instances to the first ``n_used`` recorded transitions."""
+
+    def __call__(self, *, n_used: int, values: np.ndarray) -> None: ...
+
+
+class InstanceTransfer(SourceUse):
+    """
+    Transfers source instances through mappings: a selector chooses the mappings, a translator the instances.
+
+    :param selector: it holds the candidates, the target task and the recorded transitions
+    :param translator: of the candidates' instances
+    :param breadth_decay: factor on the translator's breadth whenever the target's own transitions have contradicted what was
+        transferred (see :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`)
+    :param measure_relevance: used where the translator's instances come in the order of their relevance
+    """
+
+    candidates: Candidates
+
+    def __init__(
+        self, selector: Selector, translator: Translator, *, breadth_decay: float, measure_relevance: MeasureRelevance
+    ):
+        self.task = task = selector.task
+        self.candidates = selector.candidates
+        self.sources = selector.candidates.sources
+        self.transitions = selector.transitions
+        self.selector = selector
+        self.translator = translator
+        self.breadth_decay = breadth_decay
+        self.measure_relevance = measure_relevance
+        self._by_relevance = translator.rules.by_relevance
+        # Recorded transitions that relevance was last measured by.
+        self._n_of_relevance = 0
+        #: Compares what was transferred with what happened, wherever the agent acted on it.
+        self.check = InstancesCheck(self.sources, float(task.exploration_threshold))
+        #: Errors of what was transferred, by place.
+        self.errors = PlacedErrors(task)
+        #: Whether what has been returned for any state of the sample may have changed. Where the selection depends on
+        #: transitions nothing is returned before the first.
+        self.all_changed = not selector.needs_transitions
+        self._last_selected: Ranges = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        self._last_state = np.empty(0)
+        self._uses: Counter[int] = Counter()
+        self._instances_used = 0
+
+    # ------------------------------------------------------------------ asking
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        self._last_selected = self.selector.select(states, actions, own_weight)
+        self._last_state = states[0]
+        return self.translator(states, own_weight, self._last_selected)
+
+    def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        selected = self.selector.select_at_sample(points, actions, own_weight)
+        return self.translator(self.task.sample_states[points], own_weight, selected)
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        if self.all_changed:
+            self.all_changed = False
+            return True
+        return self.selector.changed(known)
+
+    # --------------------------------------------------------------- observing
+
+    def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
+        self.n_observed += 1
+        predicted = self.check.observe(state, action, reward, effect, terminated)
+        if predicted is not None:
+            self.errors.note(state, action, effect, predicted)
+        selector = self.selector
+        selector.before_transition()
+        if (self._by_relevance or selector.needs_transitions) and selector.takes_transitions():
+            selector.add_transition(self.transitions.add(state, action, reward, effect))
+            n_used = selector.n_used()
+            if self._by_relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
+                self._renew_relevance(n_used)
+
+    def end_episode(self, truncated: bool) -> None:
+        """
+        Take in the end of an episode.
+
+        One that reached its time limit narrows the kernel of transferred instances, if the target's own transitions have
+        contradicted them: where they reach the threshold everywhere, wrongly, nothing is optimistic and nothing would ever be
+        explored. A time limit alone says nothing against them.
+        """
+        if self.check.end_episode(truncated) and self.breadth_decay < 1.0:
+            self.translator.set_breadth(self.translator.rules.breadth * self.breadth_decay)
+            self.all_changed = True
+        if self.selector.end_episode() and self._by_relevance:
+            self._renew_relevance(self.selector.n_used())
+
+    def note_use(self, transferred: TransferredInstances) -> None:
+        first, _ = self._last_selected
+        self.check.note_use(self._last_state, transferred, len(first))
+        for candidate, n in zip(first.tolist(), transferred.length[: len(first)].tolist(), strict=True):
+            if n > 0 and self.selector.selects_one:
+                self._uses[candidate] += 1
+            self._instances_used += n
+
+    def _renew_relevance(self, n_used: int) -> None:
+        self.measure_relevance(n_used=n_used, values=self.translator.relevance)
+        self._n_of_relevance = n_used
+        # Another order, for all states: one that is asked for when it is loaded must not differ from the others.
+        self.all_changed = True
+
+    # -------------------------------------------------------------- describing
+
+    @property
+    def makes_choices(self) -> bool:
+        return self.selector.makes_choices
+
+    def choices(self) -> np.ndarray:
+        return self.selector.choices()
+
+    def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        first, last = self.selector.select(states, actions, np.zeros(len(actions)))
+        return np.where(last - first == 1, first, -1)
+
+    def uses(self) -> dict[int, int]:
+        return dict(self._uses)
+
+    def statistics(self) -> dict[str, float]:
+        return {
+            "transfer/instances_used": self._instances_used,
+            "transfer/uses": sum(self._uses.values()),
+            "transfer/mappings_used": len(self._uses),
+            "transfer/prediction_error": self.check.error(),
+            "transfer/breadth": self.translator.rules.breadth,
+            **self.selector.statistics(),
+        }
+
+    # ------------------------------------------------------------------ saving
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        uses = np.zeros(len(self.candidates))
+        uses[list(self._uses)] = list(self._uses.values())
+        return {
+            "transitions": self.transitions.rows(),
+            "breadth": np.array([self.translator.rules.breadth]),
+            "uses": uses,
+            "instances_used": np.array([float(self._instances_used)]),
+            "check": self.check.get_state(),
+            "errors": np.concatenate([[float(self.n_observed)], self.errors.sums.ravel()]),
+            **({"relevance_of": np.array([float(self._n_of_relevance)])} if self._by_relevance else {}),
+            **self.selector.get_state(),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        self.translator.set_breadth(float(state["breadth"][0]))
+        self.transitions.restore(state["transitions"], self.task.n_actions)
+        self.selector.set_state(state)
+        used = np.flatnonzero(state["uses"] >= 1.0)
+        self._uses = Counter(dict(zip(used.tolist(), state["uses"][used].astype(np.int64).tolist(), strict=True)))
+        self._instances_used = int(state["instances_used"][0])
+        self.check.set_state(state["check"])
+        self.n_observed = int(state["errors"][0])
+        self.errors.sums.ravel()[:] = state["errors"][1:]
+        if self._by_relevance:
+            n_used, saved = self.selector.n_used(), int(state["relevance_of"][0])
+            n = n_used if saved == ALL_USED else min(saved, n_used)
+            if n > 0:
+                self._renew_relevance(n)
+        # All pairs of the sample are asked for again with what is restored here.
+        self.all_changed = False

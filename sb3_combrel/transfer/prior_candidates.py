@@ -1,0 +1,129 @@
+"""What target actions are made of through a prior, by number and by name, and for how long each was in use."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sb3_combrel.mappings.factored_mapping import describe_both_sides, describe_copy
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import Candidate, MappedVariables
+from sb3_combrel.transfer.copies import Copies
+from sb3_combrel.transfer.prior_choice import Choice, moved
+
+# Of a choice, for one target action: the copies that it moves, and the source actions by which it does.
+Moves = Sequence[tuple[int, int]]
+
+
+class PriorCandidates:
+    """
+    The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up.
+
+    :param copies: the copies that can be chosen
+    :param task: the target task
+    """
+
+    def __init__(self, copies: Copies, task: TargetTask):
+        self.copies = copies
+        self.task = task
+        self._uses: Counter[tuple[int, ...]] = Counter()
+        self._listed: list[tuple[int, ...]] = []
+
+    def note_use(self, action: int, moves: Moves) -> None:
+        """Take in that a target action that is made of ``moves`` was in use for a transition."""
+        self._uses[self._key(action, moves)] += 1
+
+    def number(self, action: int, moves: Moves) -> int:
+        """Return the number of a target action that is made of ``moves``."""
+        return self._listed.index(self._key(action, moves))
+
+    def _key(self, action: int, moves: Moves) -> tuple[int, ...]:
+        key = (action, *(number for pair in moves for number in pair))
+        if key not in self._uses:
+            self._listed.append(key)
+            self._uses[key] = 0
+        return key
+
+    def _made_of(self, candidate: int) -> tuple[int, Moves]:
+        action, *rest = self._listed[candidate]
+        return action, list(zip(rest[::2], rest[1::2], strict=True))
+
+    def uses(self) -> dict[int, int]:
+        """Return for how many of the target's transitions each candidate was in use."""
+        return {number: self._uses[key] for number, key in enumerate(self._listed) if self._uses[key]}
+
+    # ------------------------------------------------------------------ by name
+
+    def parts(self, candidate: int) -> Candidate:
+        """Return a candidate's parts, by name."""
+        action, moves = self._made_of(candidate)
+        names = " + ".join(self._action_name(copy, used) for copy, used in moves) or "nothing"
+        return Candidate(action, names, " + ".join(describe_copy(self.mapping(copy)) for copy, _ in moves))
+
+    def mapped_variables(self, candidate: int) -> MappedVariables:
+        """Return what a candidate makes of each target variable, in numbers."""
+        action, moves = self._made_of(candidate)
+        found = MappedVariables.none(action, self.task.n_variables)
+        for copy, used in moves:
+            has = self.copies.state[copy] >= 0
+            found.source[has] = self.copies.source[copy]
+            found.variable[has] = self.copies.state[copy, has]
+            found.sign[has] = np.where(self.copies.sign[copy, has] < 0, -1, 1)
+            found.action[has] = used
+        return found
+
+    def describe(self, candidate: int) -> str:
+        """Return target action, source action and pairs of variables of a candidate as text."""
+        parts = self.parts(candidate)
+        return f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
+
+    def source_action_names(self) -> list[str]:
+        """Return the names of the source actions, or of several at once, of all candidates, each name once."""
+        return list(dict.fromkeys(self.parts(number).source_action for number in range(len(self._listed))))
+
+    def describe_choice(self, choice: Choice | None) -> str:
+        """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
+        names = self.task.action_names
+        moves = [[] if choice is None else moved(choice, a) for a in range(self.task.n_actions)]
+        return "; ".join(
+            f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True)
+        )
+
+    def describe_action(self, choice: Choice, action: int) -> str:
+        """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
+        return self._describe_moves(moved(choice, action), describe_copy)
+
+    def _describe_moves(self, moves: Moves, variables_of: Callable[[InterTaskMapping], str]) -> str:
+        words = (f"{self._action_name(copy, used)} on {variables_of(self.mapping(copy))}" for copy, used in moves)
+        return ", ".join(words) if moves else "nothing"
+
+    def describe_copies(self, choice: Choice) -> str:
+        """Name the copies of a choice: "(x, vx) and (y, vy)", or "no copy at all"."""
+        copies = dict.fromkeys(choice.copies[choice.copies >= 0].tolist())
+        return " and ".join(describe_copy(self.mapping(each)) for each in copies) or "no copy at all"
+
+    def mapping(self, copy: int) -> InterTaskMapping:
+        """Return a copy as an inter-task mapping, with names, of which the states alone count."""
+        return self.copies.mapping(copy, self.task, (0,) * self.task.n_actions)
+
+    def _action_name(self, copy: int, used: int) -> str:
+        return self.copies.sources[self.copies.source[copy]].action_names[used]
+
+    # ------------------------------------------------------------------- saving
+
+    def get_state(self) -> np.ndarray:
+        """Return all candidates and their uses, one a row, float64, shape (n, 2 * n_variables + 2)."""
+        d = self.task.n_variables
+        rows = [[self._uses[key], *key, *[-1] * (2 * d + 1 - len(key))] for key in self._listed]
+        return np.array(rows, dtype=np.float64).reshape(-1, 2 * d + 2)
+
+    def set_state(self, rows: np.ndarray) -> None:
+        """Take over what :meth:`get_state` returned."""
+        self._listed, self._uses = [], Counter()
+        for n, *key in rows.astype(np.int64).tolist():
+            kept = tuple(key[: 1 + 2 * sum(number >= 0 for number in key[1::2])])
+            self._listed.append(kept)
+            self._uses[kept] = n
