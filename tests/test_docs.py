@@ -70,9 +70,6 @@ def test_pages_with_python_are_found():
     assert {"fitted_rmax", "timbrel", "combrel", "mappings", "sources", "environments", "your_own_environments"} <= found
 
 
-# ---------------------------------------------------------------------------------------------------- commands
-
-
 @pytest.fixture
 def cli_without_work(monkeypatch):
     """The command line, whose commands check their arguments and do nothing; the list of calls."""
@@ -145,9 +142,6 @@ def test_the_environments_exist():
             gymnasium.spec(env_id)
 
 
-# ------------------------------------------------------------------------------------------------------- links
-
-
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_to_files_and_headings(page):
     text = page.read_text()
@@ -203,9 +197,6 @@ def numbers_of(cell):
         first, _, last = part.strip().partition(" to ")
         found += range(int(first), int(last or first) + 1)
     return found
-
-
-# ------------------------------------------------------------------------------------------------------- pages
 
 
 def test_every_page_is_in_the_contents():

@@ -138,8 +138,6 @@ class FittedRMaxAgent:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _lock=threading.RLock())
 
-    # ------------------------------------------------------------------ acting
-
     def act(
         self,
         state: np.ndarray,
@@ -247,8 +245,6 @@ class FittedRMaxAgent:
 
     def _value_function(self, values: np.ndarray) -> PlainValueFunction:
         return values, self._plain_corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds
-
-    # ---------------------------------------------------------------- learning
 
     def update(
         self,
@@ -372,8 +368,6 @@ class FittedRMaxAgent:
         lowest = min(0.0, high) + LONGEST_PLAN * min(0.0, reward)
         if lowest < low:
             self.planner.bounds = (lowest, high)
-
-    # ------------------------------------------------------------------- state
 
     def get_state(self) -> dict[str, np.ndarray]:
         """

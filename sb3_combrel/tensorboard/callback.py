@@ -139,8 +139,6 @@ class DashboardCallback(BaseCallback):
         for summary in settings_summaries(hyperparameters(self.model), all_settings(self.model), USUALLY_DIFFER, METRICS):
             self._writer._get_file_writer().add_summary(summary)
 
-    # ----------------------------------------------------------------- scalars
-
     def _on_rollout_end(self) -> None:
         """Add scalars to the log that the algorithm writes after this."""
         if self._writer is None:
@@ -206,8 +204,6 @@ class DashboardCallback(BaseCallback):
         self._mark_time()
         now, planning = self._marked
         return (planning - planning_before) / max(now - since, 1e-9)
-
-    # ------------------------------------------------------- pictures and tables
 
     def _on_step(self) -> bool:
         if self._writer is None:

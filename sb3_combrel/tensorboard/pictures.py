@@ -185,9 +185,6 @@ def state_mapping_shares(history: ChoiceHistory, transfer: MappingTransfer) -> t
     return names, counts / np.maximum(counts.sum(axis=0), 1.0)
 
 
-# -------------------------------------------------------------------- drawing
-
-
 def _figure(
     n_rows: int, n_columns: int, row_height: float, title: str, n_legend_lines: int, dpi: int
 ) -> tuple[Figure, list[Axes]]:

@@ -123,8 +123,6 @@ class Claims:
             if ended:
                 self.outcomes.end_episode(ended == seen.TIME_LIMIT)
 
-    # -------------------------------------------------------------------- saving
-
     def get_state(self, prefix: str) -> dict[str, np.ndarray]:
         """Return what was learned, float64 arrays, under names that begin with ``prefix``."""
         return {

@@ -134,8 +134,6 @@ class ComplianceSelector(Selector):
         first, last = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
         self._found_at = np.empty(shape, dtype=np.int64), np.empty(shape), first, last
 
-    # ------------------------------------------------- lines 6-8: record transitions of the first episode, or of all
-
     def before_transition(self) -> None:
         # With each transition, not with each question: a prediction asked for twice is the same, and leaves no trace.
         self._draws_at = self._draws(self.task.n_actions)
@@ -160,8 +158,6 @@ class ComplianceSelector(Selector):
         self.first_episode = False
         return ends_recording
 
-    # ------------------------------------------------------------- lines 9-13: compliance of recorded transitions
-
     def _measure(self, near: np.ndarray) -> None:
         """Compute the compliance with every candidate of those of these transitions that have not been measured yet."""
         near = near[near >= 0]
@@ -173,8 +169,6 @@ class ComplianceSelector(Selector):
             no_change = no_change_compliance(effect, reward, self._rewards, self.options.bandwidths)
             self._cache.required[i] = self.options.min_compliance * no_change
             self._cache.measured[i] = True
-
-    # --------------------------------------------- lines 15-16: for each state and action with too few data of its own
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         n = len(actions)
@@ -201,8 +195,6 @@ class ComplianceSelector(Selector):
         changed.ravel()[self._renew(due)] = True
         return changed
 
-    # ------------------------------------------------------ line 17: the k nearest recorded transitions
-
     def _use(self, i: int) -> None:
         """Make transition ``i`` a neighbour for its action, or for all."""
         if i >= len(self._cache.required):
@@ -220,8 +212,6 @@ class ComplianceSelector(Selector):
         near, distance, due = self._near[action], self._distance[action], self._due[action]
         _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
 
-    # -------------------------------------- lines 19-20: mean compliance of the neighbours, and the best candidate
-
     def _renew(self, pairs: np.ndarray) -> np.ndarray:
         """Renew the choices of pairs of the sample; return those that changed."""
         near = self._near_of_pair
@@ -236,8 +226,6 @@ class ComplianceSelector(Selector):
     def _draws(self, n: int) -> np.ndarray:
         """Draw random numbers for so many choices, if they are drawn."""
         return self.rng.random(n) if self.options.drawn else NO_DRAWS
-
-    # ------------------------------------------------------------------------------ figures, saving
 
     def choices(self) -> np.ndarray:
         return self._choice.copy()

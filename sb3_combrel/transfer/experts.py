@@ -165,8 +165,6 @@ class MappingExperts(Transfer):
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         return False
 
-    # ------------------------------------------------------------------ acting
-
     def action(self, state: np.ndarray) -> int | None:
         playing = self._playing.get(self.environment)
         if playing is not None and playing.state is not None and not np.array_equal(playing.state, state):
@@ -228,8 +226,6 @@ class MappingExperts(Transfer):
             source = int(np.searchsorted(last, number, side="right"))
             self.experts.append(Expert(source, self._sets[source][number - int(last[source])]))
 
-    # --------------------------------------------------------------- observing
-
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         playing = self._playing.get(self.environment)
         if playing is not None:
@@ -241,8 +237,6 @@ class MappingExperts(Transfer):
         playing = self._playing.pop(self.environment, None)
         if playing is not None:
             self._episodes.append((playing.arm, playing.total, playing.steps, playing.acted))
-
-    # --------------------------------------------------------------- describing
 
     def mean_returns(self) -> np.ndarray:
         """Return the mean return of the agent, of the later half of its episodes, and of each expert; NaN before the first."""
@@ -282,8 +276,6 @@ class MappingExperts(Transfer):
             "transfer/agent_return": float(means[AGENT]),
             "transfer/best_return": float(means[best]),
         }
-
-    # -------------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         assert self.task is not None

@@ -67,8 +67,6 @@ class InstanceTransfer(SourceUse):
         self._uses: Counter[int] = Counter()
         self._instances_used = 0
 
-    # ------------------------------------------------------------------ asking
-
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         self._last_selected = self.selector.select(states, actions, own_weight)
         self._last_state = states[0]
@@ -83,8 +81,6 @@ class InstanceTransfer(SourceUse):
             self.all_changed = False
             return True
         return self.selector.changed(known)
-
-    # --------------------------------------------------------------- observing
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         self.n_observed += 1
@@ -127,8 +123,6 @@ class InstanceTransfer(SourceUse):
         # Another order, for all states: one that is asked for when it is loaded must not differ from the others.
         self.all_changed = True
 
-    # -------------------------------------------------------------- describing
-
     @property
     def makes_choices(self) -> bool:
         return self.selector.makes_choices
@@ -152,8 +146,6 @@ class InstanceTransfer(SourceUse):
             "transfer/breadth": self.translator.rules.breadth,
             **self.selector.statistics(),
         }
-
-    # ------------------------------------------------------------------ saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         uses = np.zeros(len(self.candidates))

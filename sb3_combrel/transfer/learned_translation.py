@@ -119,8 +119,6 @@ class LearnedTranslation(Transfer):
         :return: ``instances``, in their order, in target coordinates; they are brought into the target's box afterwards
         """
 
-    # ------------------------------------------------------------------ binding
-
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         name = type(self).__name__
@@ -151,8 +149,6 @@ class LearnedTranslation(Transfer):
     def translated(self) -> SourceInstances | None:
         """All source instances in target coordinates, raw units of the target; None until the mapping has been learned."""
         return self._translated
-
-    # ------------------------------------------------------------------ learning
 
     def action(self, state: np.ndarray) -> int | None:
         """
@@ -215,8 +211,6 @@ class LearnedTranslation(Transfer):
         )
         self._timbrel.bind(task, self.rng)
 
-    # -------------------------------------------------------------------- asking
-
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         if self._timbrel is None:
             return TransferredInstances.empty(len(actions), states.shape[1])
@@ -255,8 +249,6 @@ class LearnedTranslation(Transfer):
         sampled = self._samples[:, : self.task.n_variables].std(axis=0)
         spread = self.task.scaling.to_unit(self._translated.states).std(axis=0)
         return float((spread / np.maximum(sampled, 1e-12))[sampled > 1e-12].mean()) if (sampled > 1e-12).any() else np.nan
-
-    # -------------------------------------------------------------------- saving
 
     def arguments(self) -> dict[str, Any]:
         # Once read, the instances themselves: the file of a saved model must not depend on other files.

@@ -136,8 +136,6 @@ class MappingTransfer(Transfer):
         warn_of_name(name, _RENAMED_ATTRIBUTES[name])
         return getattr(self, _RENAMED_ATTRIBUTES[name])
 
-    # ----------------------------------------------------------------- binding
-
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         sources = load_sources(self.source)
@@ -224,8 +222,6 @@ class MappingTransfer(Transfer):
         assert isinstance(self._source_use, InstanceTransfer)
         return self._source_use
 
-    # ------------------------------------------------------------------ asking
-
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         return self._source_use.transferred(states, actions, own_weight)
 
@@ -244,8 +240,6 @@ class MappingTransfer(Transfer):
     def lowest_reward(self) -> float:
         return min(float(source.rewards.min()) for source in self.sources)
 
-    # --------------------------------------------------------------- observing
-
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
         self._source_use.observe(state, action, reward, effect, terminated)
@@ -255,8 +249,6 @@ class MappingTransfer(Transfer):
 
     def note_use(self, transferred: TransferredInstances) -> None:
         self._source_use.note_use(transferred)
-
-    # --------------------------------------------------------------- describing
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""
@@ -335,8 +327,6 @@ class MappingTransfer(Transfer):
         if self.use == "prior":
             return report_of_prior(repr(self), self.source_prior)
         return report_of_instances(repr(self), self._instances, self.statistics())
-
-    # --------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         return self._source_use.get_state()

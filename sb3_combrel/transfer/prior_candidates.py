@@ -55,8 +55,6 @@ class PriorCandidates:
         """Return for how many of the target's transitions each candidate was in use."""
         return {number: self._uses[key] for number, key in enumerate(self._listed) if self._uses[key]}
 
-    # ------------------------------------------------------------------ by name
-
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""
         action, moves = self._made_of(candidate)
@@ -111,8 +109,6 @@ class PriorCandidates:
 
     def _action_name(self, copy: int, used: int) -> str:
         return self.copies.sources[self.copies.source[copy]].action_names[used]
-
-    # ------------------------------------------------------------------- saving
 
     def get_state(self) -> np.ndarray:
         """Return all candidates and their uses, one a row, float64, shape (n, 2 * n_variables + 2)."""

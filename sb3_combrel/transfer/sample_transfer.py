@@ -130,8 +130,6 @@ class SampleTransfer(MappingTransfer):
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         raise NotImplementedError(f"{type(self).__name__} transfers instances, it has no prior")
 
-    # ---------------------------------------------------------------- observing
-
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         super().observe(state, action, reward, next_state, terminated)
         n = self._tasks.transitions.n
@@ -167,8 +165,6 @@ class SampleTransfer(MappingTransfer):
         instances = self._instances
         instances.translator = self._make_translator(candidates, self.task, instances.translator.rules.breadth)
 
-    # --------------------------------------------------------------- describing
-
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
         """
         Return the compliance of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
@@ -198,8 +194,6 @@ class SampleTransfer(MappingTransfer):
             "transfer/draws": self._n_draws,
             "transfer/steps_to_find_mapping": self.mapping_steps(),
         }
-
-    # -------------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         figures = self._seed, self._n_of_draw, self._n_of_first, self._n_draws

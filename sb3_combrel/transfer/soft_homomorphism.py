@@ -144,8 +144,6 @@ class SoftHomomorphism(Transfer):
         self._fit_due = float(FIRST_RENEWAL)
         self._seconds = 0.0
 
-    # -------------------------------------------------------------------- asking
-
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         return TransferredInstances.empty(len(actions), states.shape[1])
 
@@ -164,8 +162,6 @@ class SoftHomomorphism(Transfer):
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, reward, end, weight = self._mixture.predict(states, actions)
         return self._claims.applied(effect, reward, end, weight, actions)
-
-    # ----------------------------------------------------------------- observing
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         effect = differences(next_state, state, self._periodic)
@@ -187,8 +183,6 @@ class SoftHomomorphism(Transfer):
         if self._logits is not None:
             self._claims.outcomes.end_episode(truncated)
             self._version += self._claims.have_changed()
-
-    # ------------------------------------------------------------------- fitting
 
     def _fit(self) -> None:
         """Fit the mixture to the recorded transitions; what it claims to know is decided anew."""
@@ -244,8 +238,6 @@ class SoftHomomorphism(Transfer):
                 explained = 1.0 - missed[rows].sum(axis=0) / total
                 least[a], explains[a] = explained.min(), explained >= MIN_EXPLAINED
         self._claims.renew(trust_in(least), explains)
-
-    # --------------------------------------------------------------- describing
 
     def _best(self) -> list[tuple[int, ...]]:
         """The most probable mapping and source action of each target action and copy; none before the first fit."""
@@ -316,8 +308,6 @@ class SoftHomomorphism(Transfer):
             "transfer/fit_seconds": self._seconds,
             "transfer/target_transitions": self._n_observed,
         }
-
-    # -------------------------------------------------------------------- saving
 
     def arguments(self) -> dict[str, Any]:
         # Once read, the instances themselves: the file of a saved model must not depend on other files.

@@ -86,8 +86,6 @@ class SourcePrior(SourceUse):
         assert self._choose is not None
         return self._choose(sums)
 
-    # -------------------------------------------------------------------- asking
-
     def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         """
         Predict pairs of the target.
@@ -114,8 +112,6 @@ class SourcePrior(SourceUse):
             self._stored.clear()
         self._stored[asked] = states.copy(), actions.copy(), predicted
         return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
-
-    # ----------------------------------------------------------------- observing
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         """
@@ -165,8 +161,6 @@ class SourcePrior(SourceUse):
         if self.choice is not None:
             self.claims.outcomes.end_episode(truncated)
         self.version += self.claims.have_changed()
-
-    # ------------------------------------------------------------------ choosing
 
     def _renew(self, choose: bool) -> None:
         """Renew choice and trust."""
@@ -240,8 +234,6 @@ class SourcePrior(SourceUse):
         """The copies that a target action moves, and the source actions by which it does."""
         return [] if self.choice is None else moved(self.choice, action)
 
-    # ------------------------------------------------------------------- figures
-
     def error(self) -> float:
         """
         Return the mean squared error of the predicted effects on the target's own transitions, over that of "no change".
@@ -275,8 +267,6 @@ class SourcePrior(SourceUse):
             "transfer/switches": self.n_switches,
             "transfer/target_transitions": self.n_observed,
         }
-
-    # --------------------------------------------------------------- describing
 
     def measured_sums(self) -> CopySums:
         """The sums, with numbers of transitions of those that compliances have been added up of: later ones have none."""
@@ -316,8 +306,6 @@ class SourcePrior(SourceUse):
 
     def uses(self) -> dict[int, int]:
         return self.candidates.uses()
-
-    # -------------------------------------------------------------------- saving
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What was learned, float64 arrays."""

@@ -50,8 +50,6 @@ class SourceUse(ABC):
     #: Grows whenever what :meth:`predict` returns may have changed.
     version: int = 0
 
-    # ------------------------------------------------------------------ asking
-
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         """Return instances for states and actions."""
         return TransferredInstances.empty(len(actions), self.task.n_variables)
@@ -67,8 +65,6 @@ class SourceUse(ABC):
     def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         """Predict states and actions of the target, as its prior."""
         raise NotImplementedError(f"{type(self).__name__} has no prior")
-
-    # --------------------------------------------------------------- observing
 
     @abstractmethod
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
@@ -87,8 +83,6 @@ class SourceUse(ABC):
 
     def note_use(self, transferred: TransferredInstances) -> None:  # noqa: B027 - a prior is not used step by step
         """Take in that the agent acts on the instances last returned by :meth:`transferred`."""
-
-    # -------------------------------------------------------------- describing
 
     @property
     @abstractmethod
@@ -110,8 +104,6 @@ class SourceUse(ABC):
     @abstractmethod
     def statistics(self) -> dict[str, float]:
         """Return figures for the logger, by name."""
-
-    # ------------------------------------------------------------------ saving
 
     @abstractmethod
     def get_state(self) -> dict[str, np.ndarray]:

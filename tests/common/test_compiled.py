@@ -39,9 +39,6 @@ def test_scale_into_box_is_to_unit_moved_into_the_box():
     assert scale_into_box(np.full((1, 3), np.nan), low, ranges, flags, units[:1])
 
 
-# ------------------------------------------------------------- garbage collection
-
-
 @pytest.fixture(params=[True, False])
 def collecting(request):
     """Garbage collection on and off; on again afterwards."""
@@ -73,8 +70,6 @@ def test_garbage_collection_is_as_before_when_the_function_raises(collecting):
         EntryPoint(fail).call()
     assert gc.isenabled() == collecting
 
-
-# ------------------------------------------------------------------ announcement
 
 MESSAGE = "sb3_combrel: compiling"
 

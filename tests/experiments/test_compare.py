@@ -84,9 +84,6 @@ def test_returns_over_steps_are_those_of_the_episode_under_way():
     np.testing.assert_array_equal(found, [[-3, -3, -3, -2, -2, -4], [-5, -5, -5, -5, -5, -1]])
 
 
-# ---------------------------------------------------------------------------------------- sentences
-
-
 def made_up(monkeypatch, returns, **arguments):
     """Compare methods whose episodes have these returns, of 10 steps each; one row a seed."""
     monkeypatch.setattr(module, "carry_out", lambda run: RunResult(tuple(returns[run.method][run.seed]), (10.0,) * 12, None))
@@ -153,8 +150,6 @@ def test_the_smallest_p_value_is_that_of_the_most_extreme_groups(n_first, n_seco
     assert smallest_p_value(1, 5, 1) == 1.0
 
 
-# ------------------------------------------------------------------------------------------- checks
-
 GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
 
 
@@ -209,9 +204,6 @@ def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
 def test_a_run_that_is_too_short_for_an_episode_is_named():
     with pytest.raises(ValueError, match="steps=3 is too few: no episode ended in the run of none, seed 0"):
         compare(**{**GOOD, "steps": 3})
-
-
-# ---------------------------------------------------------------------------------------- processes
 
 
 @pytest.mark.integration

@@ -24,9 +24,6 @@ def degree(request):
     return request.param
 
 
-# ---------------------------------------------------------------------- learning
-
-
 def test_the_agent_learns_the_shortest_plan(degree):
     agent = square_agent(degree=degree)
     lengths = [len(actions) for actions in learn(agent, 25)]
@@ -69,9 +66,6 @@ def test_an_agent_of_unknown_actions_tries_each_of_them(degree):
     assert {agent.act(START) for _ in range(20)} == {2}, "the optimistic action comes first"
     assert agent.sample_action(START) == 2
     assert agent.act(START, explore=False) != 2, "and an evaluation does not try it"
-
-
-# ------------------------------------------------------------------------- state
 
 
 # Without those whose random draws or order of relevance are renewed after loading (see FittedRMax.save).
@@ -122,9 +116,6 @@ def test_a_copied_agent_learns_as_the_original_and_apart_from_it(method, copied,
     assert_same_state(agent, before)
 
 
-# ------------------------------------------------------- predictions leave no trace
-
-
 def test_predictions_in_between_change_nothing_that_is_learned_bit_for_bit(method, degree):
     agent, interrupted = square_agent(method, degree=degree), square_agent(method, degree=degree)
     memory, others = EpisodeMemory(), np.random.default_rng(5)
@@ -150,9 +141,6 @@ def test_sampled_actions_are_optimistic_first_and_random_among_the_best():
     assert {agent.sample_action(START) for _ in range(100)} == {0, 1, 2, 3}
     agent.update(START, 2, -1.0, START, False)
     assert {agent.sample_action(START) for _ in range(100)} == {0, 1, 3}
-
-
-# -------------------------------------------------------------------- statistics
 
 
 def test_statistics_are_those_of_model_and_planner(method, degree):

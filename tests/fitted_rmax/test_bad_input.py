@@ -39,9 +39,6 @@ class Scripted(gym.Env):
         return observation, reward, bool(self.at[0] >= 0.99), self.steps >= 12, {}
 
 
-# ------------------------------------------------------------------ environments
-
-
 @pytest.mark.parametrize("actions", [spaces.Box(-1.0, 1.0, (1,)), spaces.MultiDiscrete([2, 2]), spaces.MultiBinary(2)])
 def test_fitted_rmax_refuses_actions_that_are_not_discrete(actions):
     with pytest.raises(ValueError, match="Discrete"):
@@ -126,8 +123,6 @@ def test_rewards_that_are_not_finite_are_refused(value):
     assert model.agent.model.n_instances == 4, "what came before is kept"
     assert np.isfinite(model.agent.planner.values).all()
 
-
-# --------------------------------------------------------------------- arguments
 
 BAD_ARGUMENTS = [
     ("model_breadth", 0.0),
@@ -250,9 +245,6 @@ def test_returns_above_max_value_give_one_warning(reward, max_value, warns):
     assert len(about) == int(warns)
     if warns:
         assert f"max_value={max_value:g}" in str(about[0].message)
-
-
-# ------------------------------------------------------------------------- files
 
 
 @pytest.fixture

@@ -52,8 +52,6 @@ def test_steps_in_different_cells_are_no_loop():
     assert set(modes([(n, -50.0, -1.0) for n in range(1000)], 1.0)) == {EXPLOIT}
 
 
-# ------------------------------------------------------------------ through predict
-
 HERE = np.array([0.3])
 
 

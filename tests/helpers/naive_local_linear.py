@@ -80,8 +80,6 @@ class NaiveLocalLinear:
         self.rewards, self.has_ended = [], False
         self.narrowing = 1.0
 
-    # ---------------------------------------------------------------- the prior
-
     def prior_at(self, state, action):
         return (np.zeros(self.d), 0.0, 0.0, False) if self.prior is None else self.prior(state, action)
 
@@ -94,8 +92,6 @@ class NaiveLocalLinear:
         if self.prior is not None:
             effects += [self.prior_at(point, action)[0] for point in self.points]
         return (np.min(effects, axis=0), np.max(effects, axis=0)) if effects else None
-
-    # ---------------------------------------------------------------- any state
 
     def distances(self, at, action):
         """(squared distance, number) of all instances of an action, the nearest first; of equal ones the lower number."""
@@ -147,8 +143,6 @@ class NaiveLocalLinear:
         counted = [entry for entry in self.distances(state, action) if entry[0] <= self.full_reach][: self.n_neighbors]
         full = len(counted) == self.n_neighbors
         return self.predicted(state, action, counted, self.narrowed(counted[-1][0]) if full else self.breadth)
-
-    # ----------------------------------------------------------------- the grid
 
     def claimed(self, action, point):
         return self.prior_at(self.points[point], action)[3]
@@ -238,8 +232,6 @@ class NaiveLocalLinear:
                 change += slope * side * self.grid.cells[j] * away[j]
         return change
 
-    # ------------------------------------------------------------ what is known
-
     def informed(self):
         """Whether an outcome has told states apart: an end, or rewards that differ."""
         return self.has_ended or len(set(self.rewards)) > 1
@@ -277,8 +269,6 @@ class NaiveLocalLinear:
         if checked and not self.informed() and self.known.sum() >= EXPLORED * self.known.size:
             self.decide_by(2.0 * self.narrowing)
             self.known &= self.total >= self.needed_on_grid()
-
-    # ----------------------------------------------------------------- learning
 
     def add(self, state, action, reward, next_state, terminated):
         """Add an instance; the kernels of pairs that have too many by it narrow."""

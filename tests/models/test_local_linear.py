@@ -36,9 +36,6 @@ def problem_learned(problem, **kwargs):
     return model, naive
 
 
-# -------------------------------------------------------------------- exact states
-
-
 @slow_and_repeatable
 @given(problems, st.lists(st.floats(-0.2, 1.2), min_size=3, max_size=3))
 def test_the_prediction_at_any_state_is_that_of_the_definition(problem, at):
@@ -108,9 +105,6 @@ def test_predicted_effects_stay_within_the_range_of_those_seen():
         model.add(np.array([at]), 0, -1.0, np.array([at + 0.4 * at]), False)
     prediction, _ = model.predict_at(np.array([0.8]))
     assert prediction.effect[0, 0, 0] == pytest.approx(0.2), "the line goes on to 0.32"
-
-
-# ------------------------------------------------------------------------ the grid
 
 
 @slow_and_repeatable
@@ -200,9 +194,6 @@ def test_pairs_that_are_accepted_are_known_from_what_they_have_if_they_have_anyt
     finish_episode(model)
     naive.known.flat[newly_known] = True
     assert_same_fits(model, naive)
-
-
-# ---------------------------------------------------------------- within an episode
 
 
 @slow_and_repeatable

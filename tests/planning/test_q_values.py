@@ -197,8 +197,6 @@ def test_q_does_not_depend_on_the_states_asked_for_before():
         np.testing.assert_array_equal(copy.deepcopy(untouched).q_values(queries[number], values), first[number])
 
 
-# ------------------------------------------------------------- what is done with Q
-
 HERE, ELSEWHERE = np.array([0.3]), np.array([0.7])
 
 

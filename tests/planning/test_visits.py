@@ -54,8 +54,6 @@ def test_a_state_on_a_grid_point_is_a_visit_to_that_point_alone():
     assert found[-1].tolist() == [2] and counts.tolist() == [0, 0, ENOUGH_VISITS, 0, 0]
 
 
-# ------------------------------------------------------------------------- the agent
-
 STATE = np.array([0.5625, 0.5])
 
 

@@ -170,9 +170,6 @@ def test_a_description_of_transfer_with_wrong_arguments_is_refused_or_makes_a_mo
     assert n_refused(tmp_path, parts, cases) > 0.5 * len(cases) > 100
 
 
-# -------------------------------------------------------------------- parameters
-
-
 @pytest.fixture(scope="module")
 def learned():
     return small(transfer=METHODS["COMBREL"]()).learn(60)

@@ -17,8 +17,6 @@ from sb3_combrel import FittedRMax
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
-# --------------------------------------------------------------------- safe to load
-
 PICKLED_BY_SB3 = {
     "policy_class",
     "observation_space",
@@ -103,9 +101,6 @@ def test_a_description_of_transfer_that_makes_no_sense_is_an_error(arguments, tm
         FittedRMax.load(tmp_path / "model")
 
 
-# ----------------------------------------------------------- missing, damaged, foreign
-
-
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         FittedRMax.load(tmp_path / "nowhere")
@@ -184,9 +179,6 @@ def test_parameters_that_do_not_fit_are_an_error_in_a_sentence(file_of_a_model, 
         assert "\n" not in str(error.value)
 
 
-# -------------------------------------------------------------- complete or not at all
-
-
 def test_a_file_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch):
     path = tmp_path / "model.zip"
     model = small().learn(20)
@@ -223,9 +215,6 @@ def _umask():
     umask = os.umask(0)
     os.umask(umask)
     return umask
-
-
-# ------------------------------------------------------------------------------ size
 
 
 class Untouched(Env):

@@ -16,8 +16,6 @@ from sb3_combrel import COMBREL, FittedRMax
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
 
-# ----------------------------------------------------- what it finds by itself
-
 
 @cache
 def mountain_car(n, seed, n_axes=1):
@@ -121,9 +119,6 @@ def test_each_action_of_the_larger_car_gets_the_axis_that_it_drives():
         by_number = Counter((choice[1], choice[3]) for choice in row).most_common(2)
         assert {way for way, _ in by_number} == fitting[action]
         assert sum(n for _, n in by_number) > 0.6 * len(row)
-
-
-# --------------------------------------------------------------------- learning
 
 
 def noise(seed, n=500):

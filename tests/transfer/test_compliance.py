@@ -178,9 +178,6 @@ def test_one_transition_and_many_go_through_the_same_equations():
         np.testing.assert_array_equal(one, tables[i])
 
 
-# ------------------------------------------------------------------- bandwidths
-
-
 @settings(max_examples=30, deadline=None)
 @given(seeds, st.integers(1, 80), st.integers(1, 3))
 def test_default_bandwidths_are_what_they_are_said_to_be(seed, n, n_actions):
@@ -218,9 +215,6 @@ def test_default_bandwidths_are_usable_whatever_the_source(source):
     transition = naive.Transition(source.states[0], 0, float(source.rewards[0]), source.next_states[0])
     [[table]] = tables_of([transition], [source], [MappingSet.from_list([InterTaskMapping([0], [0])])], bandwidths)
     assert 0.0 < table[0] <= 1.0
-
-
-# -------------------------------------------------------------------- relevance
 
 
 def relevances(source, source_action, mapping, action, transitions, bandwidths, mu):

@@ -34,9 +34,6 @@ def play(method, total, steps=1, environment=0, truncated=False):
     return decided, method._episodes[-1][0]
 
 
-# ------------------------------------------------------------- the source's policy
-
-
 def test_values_of_the_walk_are_those_of_walking_to_the_goal():
     """The walk's length from each place is known: V = -(1 - gamma^n) / (1 - gamma)."""
     gamma = 0.95
@@ -96,9 +93,6 @@ def test_without_data_an_action_has_no_value():
     policy = SourcePolicy(walk_source(), 0.9, 0.05)
     assert (policy.q_values(np.array([0.5, 0.0])) == -np.inf).all()
     assert np.isfinite(policy.q_values(np.array([0.5, 0.5]))).all()
-
-
-# ------------------------------------------------------------------- an expert
 
 
 def experts_of(mappings, source=None, **arguments):
@@ -172,9 +166,6 @@ def test_of_a_larger_set_so_many_different_ones_are_drawn(seed):
     all_of_them = list(MappingSet.injective(2, 3, 3, 4))
     assert [tuple(expert) for expert in method.experts] == [(n // 486, all_of_them[n % 486]) for n in numbers]
     assert len({(source, mapping.state, mapping.action) for source, mapping in method.experts}) == 7
-
-
-# --------------------------------------------------------------------- who acts
 
 
 def naive_ucb1(returns, exploration):
@@ -290,9 +281,6 @@ def test_episodes_of_several_environments_are_told_apart():
     assert [(arm, total) for arm, total, *_ in method._episodes] == [(0, -2.0), (0, -2.0), (1, -8.0), (2, -8.0)]
 
 
-# ------------------------------------------------------------------- in learning
-
-
 def returns_of(model):
     return [info["r"] for info in model.ep_info_buffer]
 
@@ -386,9 +374,6 @@ def test_its_figures_are_logged(tmp_path):
     [*_, last] = events.Scalars("transfer/expert_steps")
     assert last.value > 0.0
     assert {"transfer/steps_to_find_mapping", "transfer/best_expert"} <= set(events.Tags()["scalars"])
-
-
-# --------------------------------------------------------------------- bad input
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,6 @@ def random_transitions(n, d, n_actions, seed=0):
     return rng.random((n, d)), rng.integers(n_actions, size=n), 0.1 * rng.normal(size=(n, d))
 
 
-# ------------------------------------------------------------------- what they share
-
-
 def test_triplets_and_columns_are_each_other():
     states, actions, effects = random_transitions(9, 2, 4)
     columns = Triplets(states, actions, effects).columns(4)
@@ -239,8 +236,6 @@ def test_it_learns_with_instances_translated_by_the_right_mapping():
     assert models[1].agent.statistics()["model/transferred"] == 0.0
 
 
-# ------------------------------------------------------------------------- bad input
-
 BAD_ARGUMENTS = [
     ("n_random_steps", 9),
     ("n_random_steps", 1e3),
@@ -287,9 +282,6 @@ def test_a_sample_in_which_nothing_happens_is_no_error(method):
     observe(made, (np.full((20, 2), 0.5), np.zeros(20, int), np.zeros((20, 2))))
     np.testing.assert_allclose(made.translated.states, 0.5, atol=0.01)
     np.testing.assert_array_equal(made.translated.states, made.translated.next_states)
-
-
-# -------------------------------------------------------------------- sparse coding
 
 
 def test_codes_are_the_best_for_their_dictionary():

@@ -182,9 +182,6 @@ def test_the_first_actions_are_those_of_the_seeded_generator():
     assert agent.transfer.action(np.full(3, 0.5)) is None
 
 
-# ------------------------------------------------------------------- in learning
-
-
 class Permuted(gym.Wrapper):
     """MountainCar-v0 with its variables exchanged and its actions renamed: right, left, none."""
 
@@ -267,9 +264,6 @@ def test_it_is_shown_on_the_dashboard(use, tmp_path):
     found = [event.value for event in events.Scalars("transfer/mapping_found")]
     assert found[0] == 0.0 and found[-1] == 1.0
     assert events.Scalars("transfer/steps_to_find_mapping")[-1].value == 90.0
-
-
-# --------------------------------------------------------------------- bad input
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.5, None, True, "many"], ids=repr)

@@ -29,9 +29,6 @@ def shown(transfer, transitions):
     return transfer
 
 
-# ------------------------------------------------------------------------------------------- prior
-
-
 @pytest.fixture(scope="module")
 def factored():
     """COMBREL after transitions of a target that is two copies of a noisy source, and these transitions."""
@@ -126,9 +123,6 @@ def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
     np.testing.assert_allclose(prior.errors.sums, errors.sums, rtol=1e-6, atol=1e-12)
 
 
-# --------------------------------------------------------------------------------------- instances
-
-
 def test_errors_by_place_are_those_of_a_loop():
     rng, task = np.random.default_rng(0), f.target_task(2, 3)
     errors, rows = PlacedErrors(task), []
@@ -204,8 +198,6 @@ def test_the_confidence_of_combrel_is_that_of_its_choices_and_they_are_the_best(
     assert report.mappings[1].share == max(of_action.values()) / sum(of_action.values())
     assert report.mappings[1].n_mappings == len(of_action)
 
-
-# ------------------------------------------------------------------------------------- all methods
 
 SOURCE = walk_source()
 ALL = {

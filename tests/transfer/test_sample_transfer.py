@@ -267,9 +267,6 @@ def test_more_is_drawn_from_the_source_that_complies_and_through_the_mapping_tha
     assert compliances[0] == max(compliances) > 1.5 * max(compliances[1:])
 
 
-# ------------------------------------------------------------------- in learning
-
-
 def test_it_helps_on_the_walk():
     steps = {}
     for name, transfer in (("none", None), ("drawn", SampleTransfer(walk_source(), "all", min_transitions=10))):
@@ -307,9 +304,6 @@ def test_several_environments_are_observed_together():
     model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=SampleTransfer(walk_source(), min_transitions=20)).learn(120)
     assert model.policy.transfer.mapping_steps() == 20
     assert "SampleTransfer" in str(model.policy.transfer.report())
-
-
-# --------------------------------------------------------------------- bad input
 
 
 @pytest.mark.parametrize(

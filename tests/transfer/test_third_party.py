@@ -52,9 +52,6 @@ def test_it_is_shown_on_the_dashboard(tmp_path):
     assert last.value > 0.0
 
 
-# ------------------------------------------------------------------- the contract
-
-
 def one_row(**changes):
     row = TransferredInstances(
         np.ones(1, dtype=np.int64), np.ones((1, 2)), np.zeros((1, 2, 3)), np.zeros((1, 2)), np.zeros((1, 2), dtype=np.bool_)

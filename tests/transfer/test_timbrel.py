@@ -110,9 +110,6 @@ def test_uses_are_counted_by_name_where_the_agent_acts_and_not_where_it_predicts
     assert method.mapping_counts() == [("a0<-a1 with s0<-s0, s2<-s1", 4), ("a1<-a0 with s0<-s0, s2<-s1", 3)]
 
 
-# ------------------------------------------------------------------- in learning
-
-
 def mountain_car(transfer, seed=0, **kwargs):
     env = make_vec_env("combrel/MountainCar2D-v0", seed=seed, env_kwargs=dict(max_episode_steps=200))
     return FittedRMax(env, transfer=transfer, model_breadth=1 / 16, resolution=4, seed=seed, **kwargs)
