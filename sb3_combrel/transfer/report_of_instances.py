@@ -42,10 +42,10 @@ def _mappings(transfer: InstanceTransfer) -> tuple[MappingReport, ...]:
     """Report, for each target action, the mapping whose instances were used most."""
     found = []
     uses = transfer.uses()
-    counts = {candidate: transfer.candidates.parts(candidate) for candidate in uses}
+    parts_of = {candidate: transfer.candidates.parts(candidate) for candidate in uses}
     compared, error = transfer.errors.of_actions[:, 0], transfer.errors.errors()
     for a, name in enumerate(transfer.task.action_names):
-        of_action = Counter({each: uses[each] for each, parts in counts.items() if parts.target_action == a})
+        of_action = Counter({each: uses[each] for each, parts in parts_of.items() if parts.target_action == a})
         figures = dict(error=float(error[a]), n_compared=int(compared[a]))
         sure = transfer.selector.confidence(a)
         if sure is not None:
@@ -55,7 +55,7 @@ def _mappings(transfer: InstanceTransfer) -> tuple[MappingReport, ...]:
             found.append(MappingReport(name, nothing, n_mappings=0, **figures))  # type: ignore[arg-type]
             continue
         ((best, n),) = of_action.most_common(1)
-        parts = counts[best]
+        parts = parts_of[best]
         words = f"{parts.source_action} with {parts.state_mapping}"
         share = n / of_action.total()
         found.append(MappingReport(name, words, share=share, n_mappings=len(of_action), **figures))  # type: ignore[arg-type]

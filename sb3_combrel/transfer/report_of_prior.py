@@ -178,7 +178,8 @@ def _next_division(prior: SourcePrior) -> tuple[str, float]:
     best, name, error = -1.0, "", np.nan
     for copy in np.unique(prior.choice.copies[prior.choice.copies >= 0]).tolist():
         compliance = measured.compliance.copy()
-        compliance[copy] = 0.0
+        # Below what no change has, so that it cannot be chosen.
+        compliance[copy] = -1.0 - measured.n[:, None]
         other = prior.choose(measured._replace(compliance=compliance))
         its_compliance, its_error = _fit(prior, other, sample).of(everything)
         if its_compliance > best:

@@ -34,6 +34,8 @@ from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 #: Minutes that the paper gives for 200 episodes (Table 5).
 PAPERS_MINUTES = {m.NO_TRANSFER: 24.0, m.TIMBREL_INTUITIVE: 28.1, m.COMBREL_PLAIN: 40.9}
 EAST = "East"
+#: Figures of learning curves, each with the tests of what its methods show.
+CURVES = ("fig2", "fig3", "fig5")
 
 
 def write_report(
@@ -124,13 +126,11 @@ def _sample_of(domain: Domain, setting: str) -> tuple[np.ndarray, StateScaling]:
 
 def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]]) -> list[Table]:
     if target.name == "table6":
-        steps = {name: steps_by_method(of_domain) for name, of_domain in results.items()}
-        papers, controls = judge(steps, PAPERS), judge(steps, CONTROL)
-        tables = [verdict_table(papers, f"Table 6: what the paper claims, in setting {setting!r}")]
-        tables.append(verdict_table(controls, f"Controls, in setting {setting!r}"))
-        return [*tables, summary_table(steps), uses_table(results)]
+        return _verdict_tables(results, setting)
     (name, of_domain), *_ = results.items()
     have = [result for result in of_domain if result.method in target.methods[name]]
+    if target.name in CURVES:
+        return _verdict_tables({name: have}, setting)
     variables, actions = target_names(DOMAINS[name])
     if target.name == "table2":
         return [
@@ -147,6 +147,14 @@ def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]
     if target.name == "table5":
         return [running_times_table(have)]
     return []
+
+
+def _verdict_tables(results: Mapping[str, Sequence[Result]], setting: str) -> list[Table]:
+    """Table 6 for all methods there are; for a figure of learning curves, for its own methods alone."""
+    steps = {name: steps_by_method(of_domain) for name, of_domain in results.items()}
+    papers = verdict_table(judge(steps, PAPERS), f"Table 6: what the paper claims, in setting {setting!r}")
+    controls = verdict_table(judge(steps, CONTROL), f"Controls, in setting {setting!r}")
+    return [papers, controls, summary_table(steps), uses_table(results)]
 
 
 def uses_table(results: Mapping[str, Sequence[Result]]) -> Table:
