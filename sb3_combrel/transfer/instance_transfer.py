@@ -77,10 +77,12 @@ class InstanceTransfer(SourceUse):
         return self.translator(self.task.sample_states[points], own_weight, selected)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        # The selector selects anew here, so it is asked in any case.
+        of_selector = self.selector.changed(known)
         if self.all_changed:
             self.all_changed = False
             return True
-        return self.selector.changed(known)
+        return of_selector
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         self.n_observed += 1

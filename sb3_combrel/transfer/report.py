@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_combrel.sources.source_instances import SourceInstances
+if TYPE_CHECKING:
+    # What an agent imports goes without Stable-Baselines3, which sources use.
+    from sb3_combrel.sources.source_instances import SourceInstances
 
 
 class NotBoundError(ValueError, AttributeError):
