@@ -91,7 +91,9 @@ def _try_out(run: ComparedRun) -> None:
     try:
         model = run.make_model()
     except (ValueError, TypeError, OSError) as error:
-        raise type(error)(f"{run.method}: {error}") from error
+        # Subclasses may ask for more than a message.
+        kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
+        raise kind(f"{run.method}: {error}") from error
     assert model.env is not None
     model.env.close()
 

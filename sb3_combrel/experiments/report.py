@@ -39,7 +39,8 @@ class Table(NamedTuple):
     def as_markdown(self) -> str:
         """Return the table in GitHub's Markdown."""
         lines = [self.header, ("---", *["---:"] * (len(self.header) - 1)), *self.rows]
-        return f"**{self.title}**\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+        cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+        return f"**{self.title}**\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in cells) + "\n"
 
 
 def episodes_table(steps: Mapping[str, np.ndarray]) -> Table:

@@ -201,6 +201,14 @@ def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
         compare(**{**GOOD, **change})
 
 
+def test_errors_that_take_more_than_a_message_are_passed_on():
+    def undecodable():
+        return bytes([0xFF]).decode("utf-8")
+
+    with pytest.raises(ValueError, match="none: 'utf-8' codec can't decode"):
+        compare(**{**GOOD, "env": undecodable})
+
+
 def test_a_run_that_is_too_short_for_an_episode_is_named():
     with pytest.raises(ValueError, match="steps=3 is too few: no episode ended in the run of none, seed 0"):
         compare(**{**GOOD, "steps": 3})

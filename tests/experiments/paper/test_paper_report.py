@@ -40,6 +40,10 @@ class TestTables:
         assert "\n\n**Second**\n\n| c |\n| --- |\n" in text
 
 
+    def test_a_bar_in_a_cell_ends_no_cell_in_markdown(self):
+        assert "| a\\|b | c |\n" in Table("One", ("x", "y"), [("a|b", "c")]).as_markdown()
+
+
 class TestRunningTimes:
     def test_by_hand(self):
         results = [
