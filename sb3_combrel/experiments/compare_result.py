@@ -13,6 +13,7 @@ from sb3_combrel.experiments.compared_runs import RunResult
 from sb3_combrel.experiments.figures import COLOURS, figure_of
 from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of, returns_over_steps
 from sb3_combrel.experiments.learning_measures import WINDOW, asymptotic_return, counts_within
+from sb3_combrel.experiments.report import markdown_table
 from sb3_combrel.experiments.statistics import ALPHA, fewest_runs, holm_by_name, smallest_p_value
 from sb3_combrel.experiments.transfer_measures import Comparison, TransferMeasures, compare_learning
 from sb3_combrel.transfer.report import TransferReport
@@ -56,9 +57,7 @@ class CompareResult:
     def table(self) -> str:
         """Taylor & Stone's measures, as Markdown."""
         header = ("measure", "method", self.baseline, "with", "difference", "95% interval", "p")
-        lines = [f"| {' | '.join(header)} |", "| --- | --- |" + " ---: |" * (len(header) - 2)]
-        lines += [f"| {' | '.join(row)} |" for method in self.measures for row in self._rows(method)]
-        return "\n".join(lines)
+        return markdown_table(header, [row for method in self.measures for row in self._rows(method)], n_names=2)
 
     def figure(self) -> Figure:
         """

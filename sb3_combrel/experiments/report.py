@@ -38,9 +38,19 @@ class Table(NamedTuple):
 
     def as_markdown(self) -> str:
         """Return the table in GitHub's Markdown."""
-        lines = [self.header, ("---", *["---:"] * (len(self.header) - 1)), *self.rows]
-        cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
-        return f"**{self.title}**\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in cells) + "\n"
+        return f"**{self.title}**\n\n{markdown_table(self.header, self.rows)}\n"
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], n_names: int = 1) -> str:
+    """
+    Return a table in GitHub's Markdown, without a line's end after it.
+
+    :param header: names of the columns
+    :param rows: their cells; bars in them are escaped
+    :param n_names: so many columns at the left hold names; the others hold numbers, which are aligned at the right
+    """
+    lines = [header, ["---"] * n_names + ["---:"] * (len(header) - n_names), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def episodes_table(steps: Mapping[str, np.ndarray]) -> Table:

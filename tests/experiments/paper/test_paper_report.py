@@ -39,7 +39,6 @@ class TestTables:
         assert "**First, with a comma**\n\n| a | b |\n| --- | ---: |\n| 1,000 | x |\n" in text
         assert "\n\n**Second**\n\n| c |\n| --- |\n" in text
 
-
     def test_a_bar_in_a_cell_ends_no_cell_in_markdown(self):
         assert "| a\\|b | c |\n" in Table("One", ("x", "y"), [("a|b", "c")]).as_markdown()
 
