@@ -1,4 +1,4 @@
-"""Screenshots of TensorBoard with three runs on one page, by a headless Chromium: the pictures of the README."""
+"""Screenshots of TensorBoard with runs of several methods on one page, by a headless Chromium: the pictures of docs/usage.md."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pathlib import Path
 TABS = {
     "scalars": ("scalars", (1300, 1100)),
     "custom_scalars": ("custom_scalars", (1300, 1150)),
-    "images": ("images", (1000, 620)),
+    "images": ("images", (1000, 720)),
     "text": ("text", (1200, 720)),
     "hparams": ("hparams", (1500, 400)),
 }
@@ -87,9 +87,9 @@ def _photograph(browser: str, address: str, path: Path, size: tuple[int, int]) -
     return path
 
 
-def learn_three_ways(logs: Path, total_timesteps: int) -> None:
+def learn_with_each_method(logs: Path, total_timesteps: int) -> None:
     """
-    Learn without transfer, with TIMBREL and with COMBREL, and log the three runs in one folder.
+    Learn with each method of the demo, and log the runs in one folder.
 
     :param logs: folder for the logs
     :param total_timesteps: environment steps of each run
@@ -116,7 +116,7 @@ def main() -> None:
     else:
         with tempfile.TemporaryDirectory() as folder:
             logs = Path(folder) / "logs"
-            learn_three_ways(logs, total_timesteps=5000)
+            learn_with_each_method(logs, total_timesteps=5000)
             files = take_screenshots(logs, output)
     print("\n".join(map(str, files)))
 

@@ -9,7 +9,7 @@ def _chart(*tags: str) -> list[object]:
 
 # Every chart of the first page has one curve for each run, so that runs of different methods can be compared.
 LAYOUT: dict[str, dict[str, list[object]]] = {
-    "No transfer, TIMBREL, COMBREL": {
+    "Learning": {
         "return of an episode": _chart("rollout/ep_rew_mean"),
         "steps of an episode": _chart("rollout/ep_len_mean"),
         "pairs known from own data (share)": _chart("model/known"),
