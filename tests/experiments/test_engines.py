@@ -201,9 +201,9 @@ except KeyboardInterrupt:
         start_new_session=True,
     )
     try:
-        pids = [Job(f"long{number}", tmp_path).wait_for_attempt(40) for number in range(2)]
+        pids = [Job(f"long{number}", tmp_path).wait_for_attempt() for number in range(2)]
         os.killpg(program.pid, signal.SIGINT)
-        output, errors = program.communicate(timeout=15)
+        output, errors = program.communicate(timeout=60)
     finally:
         program.kill()
     assert (output, errors) == ("interrupted\n", "")

@@ -15,7 +15,7 @@ import psutil
 
 ROOT = Path(__file__).resolve().parents[2]
 HOST = "127.0.0.1"
-SECONDS_TO_START = 40
+SECONDS_TO_START = 120
 
 
 @contextmanager

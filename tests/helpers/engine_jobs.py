@@ -32,7 +32,7 @@ class Job:
         unfinished.rename(self.folder / f"{self.name}.attempt{before}.pid")
         return before
 
-    def wait_for_attempt(self, seconds=20):
+    def wait_for_attempt(self, seconds=120):
         """Wait until it has been begun; return the id of its first process."""
         end = time.monotonic() + seconds
         while not self.attempts():
