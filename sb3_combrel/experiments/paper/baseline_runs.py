@@ -156,6 +156,20 @@ def baselines_table(results: Mapping[str, Sequence[Result]]) -> Table:
     return Table("Baselines: greedy policy, five episodes at ten numbers of steps", header, rows)
 
 
+def evaluation_rows(results: Mapping[str, Sequence[Result]]) -> list[tuple[object, ...]]:
+    """
+    Return what the baselines' evaluations were, a row each, below a header: what figure and table are made of.
+
+    :param results: by domain, of the baselines' runs
+    """
+    rows: list[tuple[object, ...]] = [("domain", "algorithm", "seed", "steps", "greedy_return", "fraction_reached")]
+    for domain, of_domain in results.items():
+        for algorithm in ALGORITHMS:
+            for run in sorted((each for each in of_domain if each.method == algorithm), key=lambda each: each.seed):
+                rows += [(domain, algorithm, run.seed, int(n), *measured) for n, *measured in run.evaluations]
+    return rows
+
+
 def draw_baselines(results: Mapping[str, Sequence[Result]], methods: Sequence[str], title: str, path: Path) -> list[Path]:
     """
     Draw returns against environment steps, on a logarithmic axis.

@@ -12,7 +12,7 @@ from sb3_combrel import FittedRMax
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments.paper import methods as m
-from sb3_combrel.experiments.paper.baseline_runs import baselines_table, draw_baselines
+from sb3_combrel.experiments.paper.baseline_runs import baselines_table, draw_baselines, evaluation_rows
 from sb3_combrel.experiments.paper.curves import draw_curves, draw_selection, draw_times
 from sb3_combrel.experiments.paper.diagnosis import diagnosis_table, draw_diagnosis
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
@@ -66,7 +66,10 @@ def write_report(
                 made += _draw(target, DOMAINS[name], setting, have, output)
         if target.name == BASELINES:
             drawn = (m.NO_TRANSFER, m.COMBREL_PLAIN)
-            made += draw_baselines({name: results[name] for name in target.methods}, drawn, target.title, output / target.name)
+            of_baselines = {name: results[name] for name in target.methods}
+            made += draw_baselines(of_baselines, drawn, target.title, output / target.name)
+            made.append(output / "evaluations.csv")
+            write_whole(made[-1], csv_text(evaluation_rows(of_baselines)).encode())
         of_others = target.name in (BASELINES, DIAGNOSIS)
         tables = _tables(target, setting, {name: (results if of_others else own)[name] for name in target.methods})
         if tables:

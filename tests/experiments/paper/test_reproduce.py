@@ -19,6 +19,7 @@ from helpers.paper_results import made_up
 from imageio.v3 import imread
 
 from sb3_combrel.experiments import carrying_out
+from sb3_combrel.experiments.baselines import ALGORITHMS
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper import reproduce
 from sb3_combrel.experiments.paper.domains import DOMAINS
@@ -118,6 +119,7 @@ def test_all_of_the_best_setting(output, short_episodes):
         check_figure(output, name)
     for name, number in {"table5": 1, "table6": 4, "measures": 2, "baselines": 1}.items():
         check_tables(output, name, number)
+    assert {line.split(",")[1] for line in (output / "evaluations.csv").read_text().splitlines()[1:]} == set(ALGORITHMS)
     for name in ("fig3", "fig4", "table2", "table4", "diagnosis"):
         assert not list(output.glob(f"{name}*"))
 
