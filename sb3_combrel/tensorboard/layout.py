@@ -1,4 +1,4 @@
-"""The page of TensorBoard's Custom Scalars tab on which runs without transfer, with TIMBREL and with COMBREL are compared."""
+"""The page of TensorBoard's Custom Scalars tab on which runs of several methods are compared."""
 
 from __future__ import annotations
 
