@@ -58,7 +58,7 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
 }
 #: What the networks are given lies between these. Of the type of the observations: with Python's floats Gymnasium warns.
 OBSERVATION_RANGE = (np.float32(-1.0), np.float32(1.0))
-# "fused": Adam in one pass over all weights, which takes a third off a gradient step of so small a network. QR-DQN sets the
+# "fused": Adam in one pass over all weights, which takes a sixth off a gradient step of so small a network. QR-DQN sets the
 # arguments of its optimizer itself.
 NETWORK: dict[str, Any] = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 QUANTILE_NETWORK: dict[str, Any] = {"net_arch": [64, 64], "n_quantiles": 25}
