@@ -117,7 +117,10 @@ def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Met
 
 
 def note_of(name: str, cell: Cell) -> str:
-    """What the table says of a method besides numbers: why it does not fit, which runs failed, whose runs they are."""
+    """
+    What the table says of a method besides numbers: why it does not fit, which runs failed, whose runs they are, and whether
+    they differ at all: where nothing is drawn at random, all seeds are the same run, and intervals and tests say less.
+    """
     notes = []
     if cell.misfit:
         notes.append(f"does not fit: {cell.misfit}")
@@ -126,6 +129,8 @@ def note_of(name: str, cell: Cell) -> str:
         notes.append(f"failed (seed {', '.join(seeds)}): {error}")
     if cell.run_as != name:
         notes.append(f"the same as {cell.run_as}")
+    if len(cell.outcomes) > 1 and len({(*each.steps, *each.returns) for each in cell.outcomes}) == 1:
+        notes.append("all runs alike")
     # In Markdown a bar would end the cell.
     return "; ".join(notes).replace("|", "\\|")
 

@@ -110,9 +110,19 @@ class TestRanks:
         pair, methods = pair_of(), [method_of(NONE), method_of("b", same_as="c")]
         jobs = jobs_of([pair], methods, range(5), {pair.name: ()})
         assert [job.method.name for job in jobs[:2]] == [NONE, "b"]
-        outcomes = [job.outcome(returns=[1.0], steps=[1], terminated=[True]) for job in jobs]
+        outcomes = [job.outcome(returns=[1.0], steps=[1 + job.seed], terminated=[True]) for job in jobs]
         cells = cells_of(pair, methods, outcomes, range(5))
         assert len(cells["b"].outcomes) == 5 and note_of("b", cells["b"]) == ""
+
+    def test_the_table_says_where_seeds_make_no_difference(self):
+        pair, methods = pair_of(), [method_of(NONE), method_of("a")]
+        same = [outcome(pair.name, "a", seed, [1.0, 2.0]) for seed in range(3)]
+        differs = outcome(pair.name, "a", 3, [2.0, 1.0])
+        notes = {}
+        for runs in (same[:1], same, [*same, differs]):
+            cells = cells_of(pair, methods, runs, range(4))
+            notes[len(runs)] = note_of("a", cells["a"])
+        assert notes == {1: "", 3: "all runs alike", 4: ""}
 
     def test_mean_ranks_are_those_of_a_naive_computation(self):
         levels = {"one": {"a": 0.0, "b": 0.2, "c": 0.4}, "two": {"a": 0.3, "b": 0.0, "c": 0.2}}
