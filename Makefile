@@ -1,5 +1,5 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
-# make test    all tests, the slow ones too    make test-fast    unit tests, in a minute
+# make test    all tests, the slow ones too    make test-fast    all but the slow ones
 # make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
 # make build   wheel and source distribution in dist/   make smoke   install the wheel into an empty environment, and try it
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
