@@ -2,68 +2,110 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_combrel.experiments.benchmark.methods import NONE
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS, Cell, MethodScores
 from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.figures import COLOURS, moving_average, panels_of, save
+from sb3_combrel.experiments.figures import COLOURS, figure_of, moving_average, save
 from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of
+from sb3_combrel.experiments.statistics import ALPHA, Estimate
 
 #: Moving average over so many episodes.
 WINDOW = 5
-_COLOURS = (*COLOURS, "#56B4E9", "#E69F00", "#000000", "#8C564B", "#999933")
-_LINES = ("-", "--", ":")
+#: No transfer, which all others are compared with; and the method of a panel.
+_COLOUR_NONE, _COLOUR = COLOURS[:2]
+_PANELS_IN_A_ROW = 4
 #: A curve over environment steps has so many points.
 _N_POINTS = 100
 
 
-def style_of(number: int) -> tuple[str, str]:
-    """Colour and line of the method with this number; the first thirty differ."""
-    return _COLOURS[number % len(_COLOURS)], _LINES[number // len(_COLOURS) % len(_LINES)]
-
-
 def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, MethodScores], path: Path) -> list[Path]:
     """
-    Draw the learning curves of a pair, interquartile means with 95% bootstrap bands, and the performance of its methods.
+    Draw the learning curves of a pair, each method's in a panel beside no transfer's, and the performance of all methods.
+
+    Curves are interquartile means with 95% bootstrap bands. The marker of a method that differs from no transfer is full.
 
     :param pair: the pair
-    :param cells: by method, in the order of colours
+    :param cells: by method, in the order of panels
     :param compared: what was computed of those that have runs
     :param path: file to write, without its suffix
     :return: the PNG and the SVG file
     """
-    figure, (left, right) = panels_of(2, f"{pair.name}: {pair.budget}", sharey=False)
     # Methods whose runs are the same are drawn once.
     names = [name for name in compared if cells[name].run_as == name or cells[name].run_as not in compared]
-    numbers = {name: number for number, name in enumerate(cells)}
-    for name in names:
-        curves = curves_of(cells[name].outcomes)
-        where, values = _by_episodes(curves) if pair.n_steps is None else _by_steps(curves)
-        colour, line = style_of(numbers[name])
-        band = bootstrap_band(values, "iqm")
-        left.plot(where, band.mean, line, color=colour, label=f"{name} ({len(values)})")
-        if len(values) >= FEWEST_RUNS:
-            left.fill_between(where, band.low, band.high, color=colour, alpha=0.12, linewidth=0)
-    left.set_xlabel("episode" if pair.n_steps is None else "environment steps")
-    left.set_ylabel(f"return (mean of {WINDOW} episodes)")
-    left.grid(alpha=0.3)
-    for place, name in enumerate(reversed(names)):
-        estimate, colour = compared[name].estimate, style_of(numbers[name])[0]
-        if np.isfinite(estimate.low):
-            right.plot([estimate.low, estimate.high], [place, place], "-", color=colour)
-        right.plot([estimate.mean], [place], "o", color=colour)
-    right.set_yticks(range(len(names)), list(reversed(names)))
-    right.set_xlabel("mean return of an episode" + ("" if pair.n_steps is None else ", over steps"))
-    right.grid(alpha=0.3, axis="x")
+    drawn = [name for name in names if name != NONE] or names
+    n_rows = max(1, -(-len(drawn) // _PANELS_IN_A_ROW))
+    figure = figure_of(12.4, 1.6 + 1.7 * max(2, n_rows))
+    figure.suptitle(f"{pair.name}: {pair.budget} (grey: no transfer)")
+    parts: Any = figure.subfigures(1, 2, width_ratios=(2.2, 1.0))
+    of_curves, of_performance = parts
     if names:
-        left.legend(frameon=False, fontsize="x-small")
+        _draw_curves(of_curves, pair, {name: _curve_of(pair, cells[name]) for name in names}, drawn, n_rows)
+        _draw_performance(of_performance.subplots(), pair, {name: compared[name] for name in names})
     else:
-        left.text(0.5, 0.5, "no run has succeeded", transform=left.transAxes, ha="center")
+        of_curves.text(0.5, 0.5, "no run has succeeded", ha="center")
     return save(figure, path)
+
+
+def _draw_curves(part: Any, pair: Pair, curves: Mapping[str, _Curve], drawn: Sequence[str], n_rows: int) -> None:
+    """A panel for each method that is ``drawn``, with no transfer's curve behind its own."""
+    panels = part.subplots(n_rows, _PANELS_IN_A_ROW, sharex=True, sharey=True, squeeze=False).ravel()
+    for panel, name in zip(panels, drawn, strict=False):
+        panel.set_title(f"{name} ({curves[name].n_runs})", fontsize="small")
+        panel.grid(alpha=0.3)
+        panel.tick_params(labelsize="small")
+        for each in dict.fromkeys((NONE, name)):
+            if each not in curves:
+                continue
+            where, band, n_runs = curves[each]
+            colour = _COLOUR_NONE if each == NONE else _COLOUR
+            panel.plot(where, band.mean, color=colour, linewidth=1.2)
+            if n_runs >= FEWEST_RUNS:
+                panel.fill_between(where, band.low, band.high, color=colour, alpha=0.2, linewidth=0)
+    for empty in panels[len(drawn) :]:
+        empty.set_visible(False)
+    # Of each column the last, which need not be in the last row.
+    for panel in panels[max(0, len(drawn) - _PANELS_IN_A_ROW) : len(drawn)]:
+        panel.tick_params(labelbottom=True)
+    part.supxlabel("episode" if pair.n_steps is None else "environment steps", fontsize="medium")
+    part.supylabel(f"return (mean of {WINDOW} episodes)", fontsize="medium")
+
+
+def _draw_performance(axes: Any, pair: Pair, compared: Mapping[str, MethodScores]) -> None:
+    """The performance of each method with its interval; a line at that of no transfer."""
+    names = list(compared)[::-1]
+    for place, name in enumerate(names):
+        estimate, differs = compared[name].estimate, compared[name].p_value < ALPHA
+        colour = _COLOUR_NONE if name == NONE else _COLOUR
+        if np.isfinite(estimate.low):
+            axes.plot([estimate.low, estimate.high], [place, place], "-", color=colour)
+        axes.plot([estimate.mean], [place], "o", color=colour, markerfacecolor=colour if differs else "white")
+    if NONE in compared:
+        axes.axvline(float(compared[NONE].estimate.mean), color=_COLOUR_NONE, linewidth=0.8, linestyle="--", zorder=0)
+    axes.set_yticks(range(len(names)), names)
+    over = "" if pair.n_steps is None else ", over steps"
+    axes.set_xlabel(f"mean return{over}\n(full: differs from none)")
+    axes.grid(alpha=0.3, axis="x")
+
+
+class _Curve(NamedTuple):
+    """Where a curve has points, its values with their band, and the number of runs."""
+
+    where: np.ndarray
+    band: Estimate
+    n_runs: int
+
+
+def _curve_of(pair: Pair, cell: Cell) -> _Curve:
+    curves = curves_of(cell.outcomes)
+    where, values = _by_episodes(curves) if pair.n_steps is None else _by_steps(curves)
+    return _Curve(where, bootstrap_band(values, "iqm"), len(values))
 
 
 def _by_episodes(curves: LearningCurves) -> tuple[np.ndarray, np.ndarray]:

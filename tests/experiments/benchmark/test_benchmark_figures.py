@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from sb3_combrel.experiments.benchmark.figures import WINDOW, _by_episodes, _by_steps, style_of
+from sb3_combrel.experiments.benchmark.figures import WINDOW, _by_episodes, _by_steps, draw_pair
+from sb3_combrel.experiments.benchmark.methods import NONE, Method
+from sb3_combrel.experiments.benchmark.pair import Pair
+from sb3_combrel.experiments.benchmark.runs import Outcome
+from sb3_combrel.experiments.benchmark.scores import cells_of, compare
+from sb3_combrel.experiments.suite_tasks import Source
 from sb3_combrel.experiments.transfer_measures import LearningCurves
 
 
@@ -33,5 +38,50 @@ def test_over_episodes_it_is_the_moving_average_as_far_as_all_runs_go(curves):
     np.testing.assert_allclose(values[:, 0], [np.mean(row[:4]) for row in curves.returns])
 
 
-def test_styles_differ():
-    assert len({style_of(number) for number in range(30)}) == 30
+def drawn_of(names, tmp_path, monkeypatch, n_seeds=4):
+    """The panels of a pair's picture by title, and the axes with the performance of its methods."""
+    figures = []
+    monkeypatch.setattr(f"{draw_pair.__module__}.save", lambda figure, path: figures.append(figure) or [path])
+    pair = Pair("made-up", "Made up.", (Source("nothing", None),), "CartPole-v1", n_steps=60)
+    rng = np.random.default_rng(0)
+    outcomes = [
+        Outcome("run", pair.name, name, seed, [10] * 6, rng.normal(10.0 * number, 1.0, 6).tolist(), [True] * 6)
+        for number, name in enumerate(names)
+        for seed in range(n_seeds)
+    ]
+    cells = cells_of(pair, [Method(name, "", None) for name in names], outcomes, range(n_seeds))
+    draw_pair(pair, cells, compare(pair, cells), tmp_path / "picture")
+    of_curves, of_performance = figures[0].subfigs
+    panels = {axes.get_title(): axes for axes in of_curves.axes if axes.get_visible()}
+    return panels, of_performance.axes[0] if of_performance.axes else None
+
+
+def test_each_method_has_a_panel_beside_no_transfer(tmp_path, monkeypatch):
+    names = [NONE, *(f"method-{number}" for number in range(5))]
+    panels, performance = drawn_of(names, tmp_path, monkeypatch)
+    assert list(panels) == [f"{name} (4)" for name in names[1:]]
+    for panel in panels.values():
+        assert len(panel.lines) == 2 and len(panel.collections) == 2
+    assert [label.get_text() for label in performance.get_yticklabels()] == names[::-1]
+
+
+def test_markers_of_methods_that_differ_are_full(tmp_path, monkeypatch):
+    _, performance = drawn_of([NONE, "a"], tmp_path, monkeypatch, n_seeds=8)
+    markers = [line for line in performance.lines if line.get_marker() == "o"]
+    # From below: the method, which is far better, and no transfer.
+    assert [line.get_markerfacecolor() == "white" for line in markers] == [False, True]
+
+
+def test_with_few_runs_there_are_no_bands(tmp_path, monkeypatch):
+    panels, _ = drawn_of([NONE, "a"], tmp_path, monkeypatch, n_seeds=2)
+    assert [len(panel.collections) for panel in panels.values()] == [0]
+
+
+def test_no_transfer_alone_has_a_panel(tmp_path, monkeypatch):
+    panels, _ = drawn_of([NONE], tmp_path, monkeypatch)
+    assert list(panels) == [f"{NONE} (4)"] and len(panels[f"{NONE} (4)"].lines) == 1
+
+
+def test_without_any_run_the_picture_says_so(tmp_path, monkeypatch):
+    panels, performance = drawn_of([], tmp_path, monkeypatch)
+    assert not panels and performance is None
