@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,22 +41,23 @@ def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Meth
     # Methods whose runs are the same are drawn once.
     names = [name for name in compared if cells[name].run_as == name or cells[name].run_as not in compared]
     drawn = [name for name in names if name != NONE] or names
-    n_rows = max(1, -(-len(drawn) // _PANELS_IN_A_ROW))
+    n_rows = math.ceil(len(drawn) / _PANELS_IN_A_ROW)
     figure = figure_of(12.4, 1.6 + 1.7 * max(2, n_rows))
     figure.suptitle(f"{pair.name}: {pair.budget} (grey: no transfer)")
-    parts: Any = figure.subfigures(1, 2, width_ratios=(2.2, 1.0))
-    of_curves, of_performance = parts
+    of_curves, of_performance = figure.subfigures(1, 2, squeeze=False, width_ratios=(2.2, 1.0))[0]
     if names:
-        _draw_curves(of_curves, pair, {name: _curve_of(pair, cells[name]) for name in names}, drawn, n_rows)
+        panels = of_curves.subplots(n_rows, _PANELS_IN_A_ROW, sharex=True, sharey=True, squeeze=False).ravel()
+        _draw_curves(panels, {name: _curve_of(pair, cells[name]) for name in names}, drawn)
+        of_curves.supxlabel("episode" if pair.n_steps is None else "environment steps", fontsize="medium")
+        of_curves.supylabel(f"return (mean of {WINDOW} episodes)", fontsize="medium")
         _draw_performance(of_performance.subplots(), pair, {name: compared[name] for name in names})
     else:
         of_curves.text(0.5, 0.5, "no run has succeeded", ha="center")
     return save(figure, path)
 
 
-def _draw_curves(part: Any, pair: Pair, curves: Mapping[str, _Curve], drawn: Sequence[str], n_rows: int) -> None:
+def _draw_curves(panels: Sequence[Any], curves: Mapping[str, _Curve], drawn: Sequence[str]) -> None:
     """A panel for each method that is ``drawn``, with no transfer's curve behind its own."""
-    panels = part.subplots(n_rows, _PANELS_IN_A_ROW, sharex=True, sharey=True, squeeze=False).ravel()
     for panel, name in zip(panels, drawn, strict=False):
         panel.set_title(f"{name} ({curves[name].n_runs})", fontsize="small")
         panel.grid(alpha=0.3)
@@ -73,8 +75,6 @@ def _draw_curves(part: Any, pair: Pair, curves: Mapping[str, _Curve], drawn: Seq
     # Of each column the last, which need not be in the last row.
     for panel in panels[max(0, len(drawn) - _PANELS_IN_A_ROW) : len(drawn)]:
         panel.tick_params(labelbottom=True)
-    part.supxlabel("episode" if pair.n_steps is None else "environment steps", fontsize="medium")
-    part.supylabel(f"return (mean of {WINDOW} episodes)", fontsize="medium")
 
 
 def _draw_performance(axes: Any, pair: Pair, compared: Mapping[str, MethodScores]) -> None:

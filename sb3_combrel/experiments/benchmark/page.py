@@ -9,15 +9,15 @@ from sb3_combrel.experiments.benchmark.command import OUTPUT
 from sb3_combrel.experiments.benchmark.report import PAGE
 from sb3_combrel.experiments.pages import include
 
-#: What is copied. Runs, sources and SVG figures stay where they are.
-COPIED = ("*.md", "*.csv", "*.png")
+#: What is copied. Runs, sources and SVG figures stay where they are, and tables as Markdown, which the page has all of.
+COPIED = (f"{PAGE}.md", "*.csv", "*.png")
 DOCS = Path("docs/results/benchmark")
 DOCS_PAGE = Path("docs/benchmark.md")
 
 
 def copy_results(output: Path, docs: Path) -> list[Path]:
     """
-    Copy tables and pictures.
+    Copy page, tables and pictures.
 
     :param output: folder of the command
     :param docs: folder to copy to

@@ -152,7 +152,10 @@ class TestThePage:
             text = page.read_text()
             assert text.startswith("before\n") and text.endswith("<!-- end of results -->\nafter\n") and "former" not in text
             assert "![two-walks](results/b/two-walks.png)" in text
-            assert (tmp_path / "results" / "b" / "two-walks.png").exists()
+            copied = {path.name for path in (tmp_path / "results" / "b").iterdir()}
+            assert {"benchmark.md", "two-walks.png", "two-walks.csv"} <= copied
+            # The page has it.
+            assert "two-walks.md" not in copied
         assert include(page) == 1
         assert not (tmp_path / "results" / "b" / RESULTS).exists()
 
