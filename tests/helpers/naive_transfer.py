@@ -105,10 +105,13 @@ def phi(x, delta):
     return math.exp(-(x**2) / delta)
 
 
-def translated(source, mapping, action, state):
-    """The virtual source task's instances with a target action (Section 5.1), seen from ``state``."""
+def translated(source, mapping, action, state, numbers=None):
+    """The virtual source task's instances with a target action (Section 5.1), seen from ``state``.
+
+    :param numbers: of the only instances that are looked at; None for all
+    """
     found = []
-    for j in range(len(source)):
+    for j in range(len(source)) if numbers is None else numbers:
         if mapping.action[action] == source.actions[j]:
             start, end = (
                 mapping.source_to_target((raw - source.low) / (source.high - source.low), state)
@@ -143,7 +146,7 @@ def relevance(source, j, mapping, action, transitions, bandwidths, mu):
     seen = []
     for transition in transitions:
         if transition.action == action:
-            [one] = [o for o in translated(source, mapping, action, transition.state) if o.number == j]
+            [one] = translated(source, mapping, action, transition.state, [j])
             apart = distance(transition.state, one.start)
             seen.append((phi(apart, bandwidths.start), apart, transition, one))
     total = sum(weight for weight, *_ in seen)
@@ -170,7 +173,7 @@ def near_relevances(source, mapping, action, transitions, bandwidths):
         weights, of_transitions, of_rewards = [], [], []
         for s, a, r, s_next in transitions:
             if a == action:
-                [one] = [o for o in translated(source, mapping, action, s) if o.number == j]
+                [one] = translated(source, mapping, action, s, [j])
                 weights.append(phi(distance(s, one.start), bandwidths.start))
                 of_transitions.append(phi(distance(s_next, s + (one.end - one.start)), bandwidths.outcome))
                 of_rewards.append(phi(abs(r - one.reward), bandwidths.reward))
