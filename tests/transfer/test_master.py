@@ -1,5 +1,7 @@
 """MASTER: random actions first, then the mapping of least mean squared error, as plain loops find it."""
 
+import functools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -35,12 +37,12 @@ def show(method, transitions):
     return method
 
 
-def naive_error(source, mapping, transitions, model):
+def naive_error(source, mapping, transitions, predict):
     """Mean squared error of the effects that the source predicts through a mapping that uses all its variables."""
     errors = []
     for state, action, _, next_state in transitions:
         seen = mapping.target_to_source(state, source.n_variables)
-        predicted = model.predict(seen[None], np.array([mapping.action[action]])).effect[0]
+        predicted = predict(tuple(seen), mapping.action[action])
         for moved, expected in zip(next_state - state, mapping.displacement_to_target(predicted), strict=True):
             errors.append((moved - expected) ** 2)
     return sum(errors) / len(errors)
@@ -48,7 +50,13 @@ def naive_error(source, mapping, transitions, model):
 
 def naive_errors(source, mappings, transitions):
     model = SourceModel(stacked_instances([source]), 0.2)
-    return [naive_error(source, mapping, transitions, model) for mapping in mappings]
+
+    # Hundreds of mappings see the source in the same few states.
+    @functools.cache
+    def predict(seen, source_action):
+        return model.predict(np.array([seen]), np.array([source_action])).effect[0]
+
+    return [naive_error(source, mapping, transitions, predict) for mapping in mappings]
 
 
 def parts(mapping):
