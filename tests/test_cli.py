@@ -16,7 +16,7 @@ from imageio.v3 import imread
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import FittedRMax, SourceInstances
 from sb3_combrel.experiments import demo
-from sb3_combrel.experiments.demo import OUTPUTS
+from sb3_combrel.experiments.demo import OUTPUTS, SETTINGS, SOURCE
 
 TINY = ("--seeds", "2", "--episodes", "2", "--max-episode-steps", "60")
 METHODS = ("no_transfer", "random_mapping", "timbrel", "combrel")
@@ -45,6 +45,16 @@ def first_call(tmp_path_factory):
 def folder(first_call, tmp_path):
     """What the first call has left, to do something with."""
     return shutil.copytree(first_call[0], tmp_path / "output")
+
+
+@pytest.fixture()
+def folder_with_source(first_call, tmp_path):
+    """A folder in which the source task has been learned, and nothing else done."""
+    folder = tmp_path / "output"
+    folder.mkdir()
+    for name in (SETTINGS, SOURCE):
+        shutil.copyfile(first_call[0] / name, folder / name)
+    return folder
 
 
 @pytest.fixture()
@@ -155,8 +165,8 @@ class TestDemo:
         assert "must be at least 1, got 0" in written
         assert not (tmp_path / "new").exists()
 
-    def test_without_opengl_the_demo_names_what_to_install_and_does_all_the_rest(self, tmp_path):
-        folder = tmp_path / "output"
+    def test_without_opengl_the_demo_names_what_to_install_and_does_all_the_rest(self, folder_with_source):
+        folder = folder_with_source
         command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--seeds", "1"]
         environment = {**os.environ, "MUJOCO_GL": "disable"}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
@@ -165,9 +175,9 @@ class TestDemo:
         assert sorted(path.name for path in folder.iterdir()) == sorted(set(OUTPUTS) - {"car.mp4"})
 
     @pytest.mark.skipif(sys.platform == "win32", reason="no process groups")
-    def test_an_interrupted_demo_continues_where_it_stopped(self, tmp_path):
-        folder = tmp_path / "output"
-        command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--episodes", "20"]
+    def test_an_interrupted_demo_continues_where_it_stopped(self, folder_with_source, no_film):
+        folder = folder_with_source
+        command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--episodes", "10"]
         process = subprocess.Popen(
             [*command, "--workers", "2"],
             stdout=subprocess.PIPE,
@@ -187,7 +197,7 @@ class TestDemo:
         assert "goes on from here" in written
         finished = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*.zip")}
         assert 0 < len(finished) < 6
-        status, written = run_tiny_demo(folder, "--episodes", "20")
+        status, written = run_tiny_demo(folder, "--episodes", "10")
         assert status == 0
         assert "of 8 runs were complete already" in written
         assert finished.items() <= {path: path.stat().st_mtime_ns for path in folder.glob("runs/*.zip")}.items()
