@@ -1,5 +1,6 @@
 """What a user writes passes a strict type check."""
 
+import os
 import re
 import subprocess
 import sys
@@ -27,16 +28,18 @@ def test_the_lines_of_the_readme_and_the_results_pass_mypy_strict(tmp_path):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
     file = tmp_path / "users_code.py"
     file.write_text("\n".join([*blocks, "from sb3_combrel import COMBREL, InterTaskMapping\n", MORE]))
-    # Only what a user writes is judged, against the types that this package declares.
+    # Only what a user writes is judged, against the types that this package declares; none of these lines names one of
+    # PyTorch's, which take half of the time to read.
+    config = tmp_path / "mypy.ini"
+    config.write_text("[mypy]\n[mypy-torch.*]\nfollow_imports = skip\n")
     command = [
         sys.executable,
         "-m",
         "mypy",
         "--strict",
         "--follow-imports=silent",
-        "--config-file=",
-        "--cache-dir",
-        str(tmp_path / "cache"),
+        f"--config-file={config}",
+        f"--cache-dir={os.devnull}",
         str(file),
     ]
     done = subprocess.run(command, cwd=tmp_path, env=_with_package(), capture_output=True, text=True, timeout=300)
@@ -44,6 +47,4 @@ def test_the_lines_of_the_readme_and_the_results_pass_mypy_strict(tmp_path):
 
 
 def _with_package():
-    import os
-
     return {**os.environ, "MYPYPATH": f"{ROOT}:{ROOT / 'envs'}"}
