@@ -13,7 +13,7 @@ from sb3_combrel.experiments.paper.sources import prepare_sources
 from sb3_combrel.experiments.source_files import FOLDER
 
 #: Enough for COMBREL to select mappings in the second episode, too few to reach a goal.
-SHORT = 120
+SHORT = 60
 
 
 @pytest.fixture(scope="session")

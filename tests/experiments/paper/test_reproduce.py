@@ -178,14 +178,14 @@ class TestResume:
         fewer = runs / "mountain_car_combrel_with_relevance_seed5000.json"
         content = json.loads(fewer.read_text())
         fewer.write_text(json.dumps({**content, "steps": content["steps"][:1], "returns": content["returns"][:1]}) + "\n")
-        (times / "mountain_car_timbrel_with_relevance_seed5001.json").write_text("")
+        (times / "mountain_car_combrel_with_relevance_seed5001.json").write_text("")
         untouched = {path: path.stat().st_mtime_ns for path in runs.iterdir()}
         done, _ = again(copied)
         assert done == [
             ("COMBREL", "5001"),
             ("COMBREL with relevance", "5000"),
+            ("COMBREL with relevance", "5001"),
             ("TIMBREL", "5000"),
-            ("TIMBREL with relevance", "5001"),
             ("no transfer", "5000"),
         ]
         assert all_but_times(copied) == all_but_times(complete)
