@@ -162,7 +162,7 @@ def prediction_moved(fits, pair, action, at, tolerance):
     """Put what the fit predicts into ``fits.row`` if that differs from before by more than ``tolerance``; whether it does."""
     d = len(at)
     row, outcome = fits.row[pair], fits.outcome[pair]
-    reward, end = mean_outcome(outcome, fits.prior[pair], fits.claimed[pair])
+    reward, end = mean_outcome(outcome, fits.prior[pair], fits.claimed[pair] and not fits.known[pair])
     moved = abs(reward - row[d]) > tolerance * abs(reward) or abs(end - row[d + 1]) > tolerance
     for k in range(d):
         apart = abs(mean_effect(fits, pair, action, at, k) - row[k])
@@ -176,10 +176,13 @@ def prediction_moved(fits, pair, action, at, tolerance):
 
 
 @inlined
-def mean_outcome(outcome, prior, claimed):
-    """Reward and probability of termination from the narrower sums, and from the prior if it claims to know them."""
+def mean_outcome(outcome, prior, with_prior):
+    """Reward and probability of termination from the narrower sums, and from the prior where these do not suffice.
+
+    :param with_prior: the prior claims to know them, and the target's own instances make nothing known
+    """
     d = len(prior) - 2
-    weight = PRIOR_OUTCOME_WEIGHT if claimed else 0.0
+    weight = PRIOR_OUTCOME_WEIGHT if with_prior else 0.0
     total = outcome[0] + weight
     return (outcome[1] + weight * prior[d]) / total, (outcome[2] + weight * prior[d + 1]) / total
 

@@ -135,15 +135,15 @@ def fit_nearest(instances, target, action, state, kernel, near):
 
 
 @inlined
-def enter_mean(prediction, action, near, state, prior, claimed, effect_range):
+def enter_mean(prediction, action, near, state, prior, claimed, known, effect_range):
     """Enter what is predicted of an action: reward, end, and the mean of its successors, within the range of effects.
 
     :param prior: float64, shape (n_variables + 2,): effect, reward and end that the prior predicts
-    :param claimed: whether the prior suffices for a model
+    :param claimed: whether the prior suffices for a model; ``known``: whether the instances do
     """
     d = len(state)
     if near.length[action] > 0:
-        reward, end = mean_outcome(near.outcome, prior, claimed)
+        reward, end = mean_outcome(near.outcome, prior, claimed and not known)
         share = near.products[0, 0] / (near.products[0, 0] + (PRIOR_WEIGHT if claimed else 0.0))
     else:
         reward, end, share = prior[d], prior[d + 1], 0.0
@@ -180,7 +180,8 @@ def predict_own(instances, of_model, state, kernel, threshold, near, prediction)
         if n > 0:
             total = fit_nearest(instances, target, action, state, kernel, near)
         if n > 0 or claimed[action]:
-            enter_mean(prediction, action, near, state, prior[action], claimed[action], effect_range)
+            known = total >= threshold
+            enter_mean(prediction, action, near, state, prior[action], claimed[action], known, effect_range)
         prediction.weight[action] = total
         prediction.modelled[action] = total >= threshold or claimed[action]
         least = min(least, total)

@@ -15,6 +15,7 @@ from sb3_combrel.models.fit_arrays import FitScratch, Kernel, LinearFits
 from sb3_combrel.models.fit_updates import LEAST_SCALE, enter_plain, leave, recount_pairs, recount_totals, refit_changed
 from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
 from sb3_combrel.models.linear_rows import update_rows_plain
+from sb3_combrel.models.prior_effects import interpolate_prior_plain
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
 
@@ -33,7 +34,7 @@ MAX_NARROWING = 2.0**20
 _enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
 _update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
 _refit_changed, _recount_totals = EntryPoint(refit_changed), EntryPoint(recount_totals)
-_join_transferred = EntryPoint(join_transferred_plain)
+_join_transferred, _interpolate_prior = EntryPoint(join_transferred_plain), EntryPoint(interpolate_prior_plain)
 
 
 class LocalLinear(CompiledModel):
@@ -58,7 +59,8 @@ class LocalLinear(CompiledModel):
     of the same action is replaced; a pair that has less than half of ``n_neighbors`` left by that gets a broader kernel again.
 
     With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and pairs
-    that it claims to know are modelled before their own instances suffice.
+    that it claims to know are modelled before their own instances suffice. The prior's effects are those at the grid points,
+    interpolated between them; its rewards and ends count until the own instances suffice.
 
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
@@ -119,6 +121,7 @@ class LocalLinear(CompiledModel):
             full_reach=np.full(n_points, self._kernel.reach),
         )
         self._plain_scratch = tuple(self._scratch)
+        self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
         # The range of effects when rows were last brought in line with it.
         self._range_before = self.fits.effect_range[:2].copy()
         self._planned = self.mdp.gamma, settings.max_model_steps, self._prior is not None
@@ -166,7 +169,7 @@ class LocalLinear(CompiledModel):
             self._plain_kernel,
             (self._threshold_on_grid(), min_change),
             (action, slot, state, next_state, reward, terminated),
-            self._prior_at(state[None], np.array([action]))[0][0],
+            self._prior_effects(state[None], np.array([action]))[0],
             self._plain_scratch,
         )
         changed = self._scratch.point[:n_changed] + action * self.grid.n_points
@@ -200,6 +203,18 @@ class LocalLinear(CompiledModel):
         given = self._prior.prior(states, actions)
         return np.column_stack([given.effect, given.reward, given.end]), given.weight >= self.settings.exploration_threshold
 
+    def _prior_effects(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The prior's effects, multilinear between the grid points: shape (n, n_variables); without a prior, rows of zeros.
+
+        So the prior is nowhere finer than the grid on which values are computed. Instances at a wall would else confirm it
+        where they are, and change nothing at the grid points beside, which lead through the wall.
+        """
+        if self._prior is None:
+            return self._no_prior[0]
+        found = np.empty((len(actions), self.grid.n_variables))
+        _interpolate_prior.call(self.fits.prior, self.grid.plain, states, actions, self._corners, found)
+        return found
+
     def renew_prior(self) -> np.ndarray:
         if self._prior is None or self._prior.prior_version() == self._prior_version:
             return NO_PAIRS
@@ -215,7 +230,7 @@ class LocalLinear(CompiledModel):
 
     def _renew_targets(self) -> None:
         """Compute what the prior leaves over of each instance's effect, and the range of effects."""
-        fits, instances, d = self.fits, self.instances, self.grid.n_variables
+        fits, instances = self.fits, self.instances
         for action, size in enumerate(instances.size.tolist()):
             effects = instances.effect[action, :size]
             fits.target[action, :size] = effects
@@ -224,7 +239,7 @@ class LocalLinear(CompiledModel):
             mean_size = fits.effect_range[2, action] / max(1, size)
             fits.effect_scale[action] = np.maximum(2.0 * mean_size, LEAST_SCALE / self.grid.arrays.cells)
             if self._prior is not None and size:
-                fits.target[action, :size] -= self._prior_at(instances.state[action, :size], np.full(size, action))[0][:, :d]
+                fits.target[action, :size] -= self._prior_effects(instances.state[action, :size], np.full(size, action))
             self._renew_range(action, effects)
 
     def _renew_range(self, action: int, effects: np.ndarray) -> None:
@@ -266,7 +281,12 @@ class LocalLinear(CompiledModel):
         self._recount_totals()
         forgotten = np.flatnonzero(self.known & (self.own_weight < self._threshold_on_grid()))
         self.known[forgotten] = False
+        self._refit_claimed(forgotten)
         return forgotten
+
+    def _refit_claimed(self, pairs: np.ndarray) -> None:
+        """Have pairs that the prior claims fitted anew: with what is known changes what the prior is used for."""
+        self.fits.unexplained[pairs[self.fits.claimed[pairs]]] = np.inf
 
     def _set_narrowing(self, narrowing: float) -> None:
         """Let known be decided by a kernel whose squared breadth is so many times smaller."""
@@ -281,6 +301,7 @@ class LocalLinear(CompiledModel):
         self.exploration_threshold = threshold
         newly_known = np.flatnonzero(~self.known & (self.own_weight >= self._threshold_on_grid()))
         self.known[newly_known] = True
+        self._refit_claimed(newly_known)
         return newly_known
 
     def end_episode(self) -> np.ndarray:
@@ -312,7 +333,9 @@ class LocalLinear(CompiledModel):
         if self._prior is None:
             prior, claimed = self._no_prior
         else:
-            prior, claimed = self._prior_at(np.repeat(state[None], self.n_actions, axis=0), self._all_actions)
+            states = np.repeat(state[None], self.n_actions, axis=0)
+            prior, claimed = self._prior_at(states, self._all_actions)
+            prior[:, : self.grid.n_variables] = self._prior_effects(states, self._all_actions)
         of_model = self.fits.target, self.fits.effect_range, prior, claimed
         near, prediction = self._plain_near, self._plain_prediction
         threshold = self.exploration_threshold

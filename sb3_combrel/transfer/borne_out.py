@@ -17,6 +17,10 @@ STEPS_OF_A_VISIT = 10
 # So many episodes that ran into their time limit, and never an end where one is predicted.
 EPISODES_IN_VAIN = 3
 MIN_REWARDS = 10
+# So many visits to where an end is predicted, and none has come yet. One or two may be a car that comes near and falls back.
+MIN_ABSENT = 3
+# What is counted, in the order in which it is saved.
+COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "in_vain", "steps_of_visit")
 # Transitions from which on predictions worse than "no change" are warned of.
 TRANSITIONS_BEFORE_WARNING = 300
 
@@ -47,25 +51,36 @@ class Outcomes:
     *Rewards.* Each transition confirms or contradicts the predicted reward, by whether it is off by more than half a standard
     deviation of the source's rewards plus a tenth of their mean size.
 
-    Both are :attr:`doubted` once contradictions outnumber confirmations, for as long as they do. Ends that were never
-    confirmed nor contradicted are believed by half: a transition that may end is worth a visit, which settles it, so what the
-    source says of it is not taken for known; that others do not end is. That alone could go on for ever, where the source is
-    wrong about what leads to an end. So if ``EPISODES_IN_VAIN`` episodes have run into their time limit, never an end was
-    confirmed, and all rewards were alike, so that nothing but an end tells good states from bad ones, they are doubted.
+    Both are :attr:`doubted` while ends that were not predicted outnumber those that were by two, or wrong rewards right ones,
+    and while no predicted end has come but ``MIN_ABSENT`` have failed to. After the first that came, others that do not come
+    say that the target ends in fewer states than the source, and no more: ends are not :attr:`ends_believed` while these
+    outnumber those that came.
+
+    Ends that were never confirmed nor contradicted are believed by half: a transition that may end is worth a visit, which
+    settles it, so what the source says of it is not taken for known; that others do not end is. That alone could go on for
+    ever, where the source is wrong about what leads to an end. So if ``EPISODES_IN_VAIN`` episodes have run into their time
+    limit, never an end was confirmed, and all rewards were alike, so that nothing but an end tells good states from bad ones,
+    they are doubted.
 
     :param rewards: of the source's instances, shape (n,)
     :param threshold: weight from which on the source has data
+    :param no_end: weight from which on it says that there is no end; None: the same. Where data are few, ends, which are
+        averaged with a narrower kernel, may be those of another place
     """
 
-    def __init__(self, rewards: np.ndarray, threshold: float):
+    def __init__(self, rewards: np.ndarray, threshold: float, no_end: float | None = None):
         self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
         self.threshold = threshold
+        self.no_end = threshold if no_end is None else no_end
         self.forget()
 
     def forget(self) -> None:
         """Forget all transitions."""
         self.confirmed = 0
-        self.contradicted = 0
+        #: Ends that were not predicted.
+        self.unpredicted = 0
+        #: Visits to where an end is predicted that have left without one, or lasted for long.
+        self.absent = 0
         self.rewards_right = 0
         self.rewards_wrong = 0
         self.in_vain = 0
@@ -90,12 +105,12 @@ class Outcomes:
         if terminated:
             if end >= GOES_ON or self.steps_of_visit:
                 self.confirmed += 1
-            elif founded:
-                self.contradicted += 1
+            elif weight >= self.no_end:
+                self.unpredicted += 1
             self.steps_of_visit = 0
         elif (founded and end > ENDS) or (self.steps_of_visit and end >= GOES_ON):
             self.steps_of_visit += 1
-            self.contradicted += self.steps_of_visit % STEPS_OF_A_VISIT == 0
+            self.absent += self.steps_of_visit % STEPS_OF_A_VISIT == 0
         else:
             self._leave()
 
@@ -106,8 +121,18 @@ class Outcomes:
             self.in_vain += self.confirmed == 0
 
     def _leave(self) -> None:
-        self.contradicted += 0 < self.steps_of_visit < STEPS_OF_A_VISIT
+        self.absent += 0 < self.steps_of_visit < STEPS_OF_A_VISIT
         self.steps_of_visit = 0
+
+    @property
+    def contradicted(self) -> int:
+        """How often a predicted end did not come, or one came that was not predicted."""
+        return self.unpredicted + self.absent
+
+    @property
+    def ends_believed(self) -> bool:
+        """Whether predicted ends come more often than not, as far as has been seen."""
+        return self.confirmed > 0 and self.absent <= self.confirmed
 
     @property
     def doubted(self) -> bool:
@@ -116,18 +141,19 @@ class Outcomes:
         nothing_found = self.confirmed == 0 and self.in_vain >= EPISODES_IN_VAIN and not high - low > 1e-9
         rewards = self.rewards_right + self.rewards_wrong
         return (
-            self.contradicted > self.confirmed
+            self.unpredicted > self.confirmed + 1
+            or (self.confirmed == 0 and self.absent >= MIN_ABSENT)
             or (rewards >= MIN_REWARDS and self.rewards_wrong > self.rewards_right)
             or nothing_found
         )
 
     def get_state(self) -> np.ndarray:
-        """What was counted, float64, shape (8,)."""
-        counts = self.confirmed, self.contradicted, self.rewards_right, self.rewards_wrong, self.in_vain, self.steps_of_visit
+        """What was counted, float64, shape (9,)."""
+        counts = [getattr(self, name) for name in COUNTS]
         return np.array([*counts, *np.clip(self.reward_range, -1e300, 1e300)], dtype=np.float64)
 
     def set_state(self, state: np.ndarray) -> None:
         """Take over what :meth:`get_state` returned."""
-        counts = [int(value) for value in state[:6]]
-        self.confirmed, self.contradicted, self.rewards_right, self.rewards_wrong, self.in_vain, self.steps_of_visit = counts
-        self.reward_range = float(state[6]), float(state[7])
+        for name, value in zip(COUNTS, state.tolist(), strict=False):
+            setattr(self, name, int(value))
+        self.reward_range = float(state[-2]), float(state[-1])

@@ -15,11 +15,9 @@ from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.copy_predictions import CopyTable, UsePredictions, Uses, join_many_plain, predict_pairs_plain
-from sb3_combrel.transfer.copy_sums import CopyScratch, CopySums, follow_plain, measure_plain
+from sb3_combrel.transfer.copy_sums import LEAST_EFFECT, CopyScratch, CopySums, follow_plain, measure_plain
 from sb3_combrel.transfer.source_model import SourceModel
 
-# Errors are compared with effects of at least this fraction of a typical one of the source.
-LEAST_EFFECT = 0.25
 # From so many pairs on the different states of each copy are predicted once.
 MANY = 256
 
@@ -34,7 +32,9 @@ class Copies:
     Copies of sources in the target: each makes some target variables variables of a source.
 
     A copy that leaves out source variables is predicted by a local linear model of the others: their effects are fitted to
-    them alone, over all that the instances have in those that are left out.
+    them alone, over all that the instances have in those that are left out. Where an end depends on these, its probability is
+    an average over them, and small everywhere; so it is in parts of the largest that the model predicts of the instances which
+    have ended an episode.
 
     :param sources: instances of each source task
     :param source: number of each copy's source, int64, shape (n_copies,)
@@ -61,24 +61,28 @@ class Copies:
         used = [tuple(np.unique(row[row >= 0]).tolist()) for row in state]
         first: dict[tuple[int, tuple[int, ...]], int] = {}
         n_actions = 0
-        for key in zip(source.tolist(), used, strict=True):
+        keys = list(zip(source.tolist(), used, strict=True))
+        for key in keys:
             if key not in first:
                 first[key] = n_actions
                 n_actions += sources[key[0]].n_actions
         self.model = SourceModel(_seen_through(sources, list(first)), breadth)
         n_variables = self.model.n_variables
+        end_scales = {key: self._end_scale(*key, first[key]) for key in first}
         count = (state[:, :, None] == np.arange(n_variables)).sum(axis=1)
         self.table = CopyTable(
             variable=np.ascontiguousarray(state, dtype=np.int64),
             sign=np.ascontiguousarray(sign, dtype=np.float64),
             share=1.0 / np.maximum(count, 1),
-            least=(LEAST_EFFECT * self._typical_effects()) ** 2,
-            first=np.array([first[key] for key in zip(source.tolist(), used, strict=True)], dtype=np.int64),
+            least=(LEAST_EFFECT * self._typical_effects(by_action=False)) ** 2,
+            most=(LEAST_EFFECT * self._typical_effects(by_action=True)) ** 2,
+            end_scale=np.array([end_scales[key] for key in keys]),
+            first=np.array([first[key] for key in keys], dtype=np.int64),
             n_actions=np.array([sources[s].n_actions for s in source], dtype=np.int64),
         )
         self._plain_table = tuple(self.table)
         d = state.shape[1]
-        self._scratch = tuple(CopyScratch(np.empty(n_variables), np.empty(n_variables), np.empty(d)))
+        self._scratch = tuple(CopyScratch(np.empty(n_variables), np.empty(n_variables), np.empty(d), np.empty(d)))
 
     def __len__(self) -> int:
         return len(self.source)
@@ -194,22 +198,52 @@ class Copies:
         mapping = InterTaskMapping(state, action, sign)
         return mapping.with_names(source.state_names, task.state_names, source.action_names, task.action_names)
 
-    def _typical_effects(self) -> np.ndarray:
+    def _end_scale(self, number: int, used: tuple[int, ...], first: int) -> float:
+        """
+        One over the largest probability of termination at the instances of a source that have ended an episode.
+
+        :param number: of the source; ``used``: those of its variables that a copy has
+        :param first: the model's number of the source's first action
+        :return: 1 for all variables of a source, or if no instance has ended an episode
+        """
+        source = self.sources[number]
+        ended = np.flatnonzero(source.terminated)
+        if len(used) == source.n_variables or len(ended) == 0:
+            return 1.0
+        states = np.zeros((len(ended), self.model.n_variables))
+        states[:, list(used)] = source.scaling.to_unit(source.states[ended])[:, list(used)]
+        largest = float(self.model.predict(states, first + source.actions[ended]).end.max())
+        return 1.0 / largest if largest > 0.0 else 1.0
+
+    def _typical_effects(self, by_action: bool) -> np.ndarray:
         """How much each source moves what a copy makes of it.
 
+        Over all actions, the noise of those that leave a variable alone may be typical of it. But what the action does that
+        moves it most is typical only of a target that moves as much: one that hardly moves would seem to be explained by any
+        action that moves nothing.
+
+        :param by_action: of the action for which it is most; or of all actions together
         :return: median size of the effects (or their mean, if most are 0) on the source variable of each target variable, unit
             coordinates, shape (n_copies, n_target_variables); 0 for variables that are not in the copy
         """
-        typical = []
-        for source in self.sources:
-            to_unit = source.scaling.to_unit
-            size = np.abs(differences(to_unit(source.next_states), to_unit(source.states), np.array(source.periodic)))
-            median = np.median(size, axis=0)
-            typical.append(np.where(median > 0.0, median, size.mean(axis=0)))
+        typical = [_typical_effects_of(source, by_action) for source in self.sources]
         found = np.zeros(self.state.shape)
         for copy, (number, row) in enumerate(zip(self.source.tolist(), self.state, strict=True)):
             found[copy, row >= 0] = typical[number][row[row >= 0]]
         return found
+
+
+def _typical_effects_of(source: SourceInstances, by_action: bool) -> np.ndarray:
+    """Median size of the effects, or their mean if most are 0: the largest of all actions', or over all; (n_variables,)."""
+    to_unit = source.scaling.to_unit
+    size = np.abs(differences(to_unit(source.next_states), to_unit(source.states), np.array(source.periodic)))
+    largest = np.zeros(source.n_variables)
+    groups = source.actions if by_action else np.zeros_like(source.actions)
+    for action in np.unique(groups):
+        of_action = size[groups == action]
+        median = np.median(of_action, axis=0)
+        largest = np.maximum(largest, np.where(median > 0.0, median, of_action.mean(axis=0)))
+    return largest
 
 
 def distinct_rows(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,9 @@ class CopyTable(NamedTuple):
     :param variable: int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
     :param sign: float64, same shape: -1 where it is mirrored
     :param share: float64, shape (n_copies, n_source_variables): 1 / number of target variables that a variable of the copy has
-    :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least
+    :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least;
+        ``most``: same shape: what that may grow to where the target itself moves so much
+    :param end_scale: float64, shape (n_copies,): factor on probabilities of termination, which are 1 at most
     :param first: int64, shape (n_copies,): the model's number of the source's first action; ``n_actions``: same shape
     """
 
@@ -27,6 +29,8 @@ class CopyTable(NamedTuple):
     sign: np.ndarray
     share: np.ndarray
     least: np.ndarray
+    most: np.ndarray
+    end_scale: np.ndarray
     first: np.ndarray
     n_actions: np.ndarray
 
@@ -119,7 +123,7 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
             continue
         n += 1
         total += outcomes[use, 0]
-        ends *= outcomes[use, 1]
+        ends *= min(1.0, table.end_scale[uses.copy[use]] * outcomes[use, 1])
         least = min(least, outcomes[use, 2])
         for v in range(effect.shape[1]):
             k = table.variable[uses.copy[use], v]

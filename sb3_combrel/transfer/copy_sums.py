@@ -15,6 +15,8 @@ from sb3_combrel.transfer.source_model import predict_source
 
 # The smallest scale that compliance is measured by, squared unit coordinates: a variable that never moves.
 SMALLEST_SCALE = 1e-12
+# Errors are compared with effects of at least this fraction of a typical one.
+LEAST_EFFECT = 0.25
 # Squared errors count as at most this many times the squared effect: a bound of 1 would find noise to explain something.
 LARGEST_MISS = 2.0
 
@@ -25,7 +27,6 @@ class CopySums(NamedTuple):
     :param n: float64, shape (n_target_actions,): transitions
     :param size: float64, shape (n_target_actions, n_target_variables): sizes of effects
     :param effect: float64, same shape: squared effects
-    :param moved: float64, same shape: transitions in which the variable moved at all
     :param stay: float64, same shape: compliances of each variable with "it stays as it is"
     :param compliance: float64, shape (n_copies, n_target_actions, most source actions): compliances of each copy
     :param error: float64, shape (n_copies, n_target_actions, most source actions, n_target_variables): squared errors
@@ -37,7 +38,6 @@ class CopySums(NamedTuple):
     n: np.ndarray
     size: np.ndarray
     effect: np.ndarray
-    moved: np.ndarray
     stay: np.ndarray
     compliance: np.ndarray
     error: np.ndarray
@@ -51,7 +51,6 @@ class CopySums(NamedTuple):
             n=np.zeros(n_actions),
             size=np.zeros((n_actions, n_variables)),
             effect=np.zeros((n_actions, n_variables)),
-            moved=np.zeros((n_actions, n_variables)),
             stay=np.zeros((n_actions, n_variables)),
             compliance=np.zeros((n_copies, n_actions, n_source_actions)),
             error=np.zeros((n_copies, n_actions, n_source_actions, n_variables)),
@@ -65,11 +64,22 @@ class CopyScratch(NamedTuple):
 
     :param at: float64, shape (n_source_variables,): a state as the copy has it; ``effect``: what the source predicts there
     :param scale: float64, shape (n_target_variables,): what squared errors are compared with in compliance
+    :param motion: float64, same shape: see :func:`squared_motion`
     """
 
     at: np.ndarray
     effect: np.ndarray
     scale: np.ndarray
+    motion: np.ndarray
+
+
+@inlined
+def squared_motion(sums, v):
+    """The square of ``LEAST_EFFECT`` of how much a variable moves under the action that moves it most, in the mean."""
+    largest = 0.0
+    for action in range(len(sums.n)):
+        largest = max(largest, sums.size[action, v] / max(1.0, sums.n[action]))
+    return (LEAST_EFFECT * largest) ** 2
 
 
 @inlined
@@ -79,20 +89,19 @@ def add_effect(sums, action, effect):
     for v in range(len(effect)):
         sums.size[action, v] += abs(effect[v])
         sums.effect[action, v] += effect[v] * effect[v]
-        if effect[v] * effect[v] > SMALLEST_SCALE:
-            sums.moved[action, v] += 1.0
 
 
 @inlined
-def add_error(table, sums, at, effect, predicted, founded):
+def add_error(table, sums, at, effect, predicted, founded, motion):
     """Add the error of one variable to the sums; its square.
 
     :param at: (copy, target action, source action, target variable)
+    :param motion: of the variable, see :func:`squared_motion`
     """
     copy, action, u, v = at
     error = (effect - predicted) ** 2
     sums.error[copy, action, u, v] += error
-    compared = max(effect * effect, table.least[copy, v])
+    compared = max(effect * effect, min(max(motion, table.least[copy, v]), table.most[copy, v]))
     sums.missed[copy, action, u, v] += founded * min(LARGEST_MISS, error / max(compared, 1e-300))
     return error
 
@@ -120,6 +129,7 @@ def measure_plain(source, table, rules, transition, sums, scratch):
     for v in range(n_variables):
         scratch.scale[v] = max(SMALLEST_SCALE, (sums.size[:, v].sum() / n) ** 2)
         sums.stay[action, v] += np.exp(-effect[v] * effect[v] / scratch.scale[v])
+        scratch.motion[v] = squared_motion(sums, v)
     for copy in range(len(table.first)):
         see_state(table, copy, state, scratch.at)
         for u in range(table.n_actions[copy]):
@@ -132,7 +142,8 @@ def measure_plain(source, table, rules, transition, sums, scratch):
                 k = table.variable[copy, v]
                 if k >= 0:
                     predicted = table.sign[copy, v] * scratch.effect[k]
-                    error = add_error(table, sums, (copy, action, u, v), effect[v], predicted, founded)
+                    at = copy, action, u, v
+                    error = add_error(table, sums, at, effect[v], predicted, founded, scratch.motion[v])
                     missed += error / scratch.scale[v]
                 elif whole:
                     missed += effect[v] * effect[v] / scratch.scale[v]
@@ -156,4 +167,5 @@ def follow_plain(table, uses, transition, sums):
             sums.founded[copy, action, u] += founded
             for v in range(len(effect)):
                 if table.variable[copy, v] >= 0:
-                    add_error(table, sums, (copy, action, u, v), effect[v], predicted[v], founded)
+                    motion = squared_motion(sums, v)
+                    add_error(table, sums, (copy, action, u, v), effect[v], predicted[v], founded, motion)

@@ -43,7 +43,7 @@ class MappingReport:
     :param error: prediction error of what was transferred
     :param next_best_error: prediction error of the next best
     :param n_compared: transitions that ``error`` is of
-    :param trust: with ``use="prior"``, which part of the source's data counts as known, from 0 to 1; else NaN
+    :param trust: with ``use="prior"``, how far what the source claims to know is believed, from 0 to 1; else NaN
     """
 
     target_action: str
@@ -200,7 +200,7 @@ _EXPLANATIONS = {
     "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and "
     'of "no change".',
     "error": 'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.',
-    "trust": "Trust: which part of the source's data counts as known.",
+    "trust": "Trust: how far what the source claims to know is believed, 0: not at all.",
 }
 
 

@@ -13,8 +13,8 @@ from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
-from sb3_combrel.transfer.claims import FIRST_RENEWAL, MIN_EXPLAINED, MIN_TRANSITIONS, RENEWAL_GROWTH, Claims, trust_in
-from sb3_combrel.transfer.copy_sums import LARGEST_MISS
+from sb3_combrel.transfer.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
+from sb3_combrel.transfer.copy_sums import LARGEST_MISS, LEAST_EFFECT
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.soft_mapping import (
     FitData,
@@ -37,8 +37,6 @@ MAX_FITTED = 500
 # The prediction of a copy is the mean over its most probable mappings and source actions: as many as have this probability
 # together, at most so many.
 MASS, MAX_TERMS = 0.98, 12
-# Errors are compared with effects of at least this fraction of the mean size of a variable's effects.
-LEAST_EFFECT = 0.25
 
 
 class SoftHomomorphism(Transfer):
@@ -64,9 +62,9 @@ class SoftHomomorphism(Transfer):
     action can also come out as the mean of others that it equals, such as no push as half a push to either side.
 
     What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.claims.Claims`:
-    the weight of the source's data times the part of the target's effects that the mixture explains, of the variable of which
-    it explains least, from 10 transitions of an action on; nothing of what it explains less than half, and no end before one
-    has been confirmed. Effects on variables of which it explains less than half under an action are predicted as 0.
+    by the weight of the source's data, and by the part of the target's effects that the mixture explains, of the variable of
+    which it explains least; nothing of what it explains less than half, and no end before one has been confirmed. Effects on
+    variables of which it explains less than half under an action, of ten or more transitions, are predicted as 0.
 
     Cost: no steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. MountainCar2D to 4D
     (48 mappings, two copies): about 1 s for each of the 16 fits in a run of 12 episodes. It needs ``FittedRMax(degree=1)``.
@@ -198,7 +196,7 @@ class SoftHomomorphism(Transfer):
         if self._state_mappings() != found:
             self._steps_to_find = self._n_observed
         predicted = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
-        self._judge(predicted, size)
+        self._judge(predicted)
         self._claims.replay(seen, *predicted[1:])
         self._n_fits += 1
         self._version += 1
@@ -222,22 +220,18 @@ class SoftHomomorphism(Transfer):
             found[:, :, b] = brought_back(effects, readings.variable, readings.sign, d)
         return found
 
-    def _judge(self, predicted: Predicted, size: np.ndarray) -> None:
+    def _judge(self, predicted: Predicted) -> None:
         """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
         assert self.task is not None
         effects, actions = self._transitions.effects[: self._transitions.n], self._transitions.actions[: self._transitions.n]
         effect, _, _, weight = predicted
-        least, explains = np.zeros(self.task.n_actions), np.ones((self.task.n_actions, len(size)), dtype=np.bool_)
-        founded = np.minimum(1.0, weight / self.task.exploration_threshold)
+        taken = np.arange(self.task.n_actions)[:, None] == actions
+        size = (taken @ np.abs(effects) / np.maximum(taken.sum(axis=1), 1)[:, None]).max(axis=0)
+        each = np.minimum(1.0, weight / self.task.exploration_threshold)
         compared = np.maximum(effects**2, np.maximum((LEAST_EFFECT * size) ** 2, 1e-300))
-        missed = founded[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared)
-        for a in range(self.task.n_actions):
-            rows = actions == a
-            total = founded[rows].sum()
-            if total >= MIN_TRANSITIONS:
-                explained = 1.0 - missed[rows].sum(axis=0) / total
-                least[a], explains[a] = explained.min(), explained >= MIN_EXPLAINED
-        self._claims.renew(trust_in(least), explains)
+        missed = taken @ (each[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared))
+        founded = np.repeat((taken @ each)[:, None], len(size), axis=1)
+        self._claims.renew(missed, founded)
 
     def _best(self) -> list[tuple[int, ...]]:
         """The most probable mapping and source action of each target action and copy; none before the first fit."""

@@ -7,7 +7,7 @@ import numpy as np
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
-from sb3_combrel.transfer.claims import FIRST_RENEWAL, MIN_EXPLAINED, MIN_TRANSITIONS, RENEWAL_GROWTH, Claims, trust_in
+from sb3_combrel.transfer.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.placed_errors import PlacedErrors
@@ -16,6 +16,8 @@ from sb3_combrel.transfer.prior_choice import Choice, Chooser, moved
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.source_use import SourceUse
 
+# A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
+SMALLEST_MOVE = 0.005
 # So many transitions are compared with what all copies predict; later ones one in so many, which suffices to notice a change.
 ALL_MEASURED, MEASURED_LATER = 500, 5
 
@@ -25,8 +27,7 @@ class SourcePrior(SourceUse):
     What a source predicts of the target, through a mapping that is given or chosen by compliance.
 
     What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.claims.Claims`. The weight of
-    the source's data is the least of all copies'. What is explained is said in :meth:`explained`; of a mapping that is given,
-    what is explained of all actions together stands in for an action with too few transitions.
+    the source's data is the least of all copies'. What is explained is said in :meth:`explained`.
 
     :param copies: the copies that can be chosen
     :param task: the target task
@@ -171,10 +172,7 @@ class SourcePrior(SourceUse):
                 self._set_choice(choice)
                 self._replay()
                 self.version += 1
-        trust = trust_in(self.explained())
-        missed, founded = self._missed()
-        explains = (founded < MIN_TRANSITIONS) | (missed <= (1.0 - MIN_EXPLAINED) * founded) | ~self._in_copies()
-        self.version += self.claims.renew(trust, explains)
+        self.version += self.claims.renew(*self._missed(), self._in_copies())
 
     def _set_choice(self, choice: Choice) -> None:
         self.choice = choice
@@ -197,24 +195,17 @@ class SourcePrior(SourceUse):
 
         Of a transition and variable, 1 less squared error over squared effect, within bounds: so a few large effects, such as
         those of a car that hits the wall, count no more than others. Of a variable in a copy, over the transitions where the
-        source has data; of one that stays, over all: 0 where it moved.
+        source has data; of one that stays, over all: how much it moves, in parts of what the action that moves it most does.
 
-        :return: shape (n_target_actions,); 1 for an exact source, 0 or less for one no better than "nothing changes", 0 for an
-            action with too few transitions
+        :return: shape (n_target_actions,), see :func:`~sb3_combrel.transfer.claims.part_explained`
         """
-        missed, founded = self._missed()
-        explained = np.zeros(self.task.n_actions)
-        together = founded.sum(axis=0)
-        if self._choose is None and together.min() >= MIN_TRANSITIONS:
-            explained[:] = 1.0 - (missed.sum(axis=0) / together).max()
-        enough = founded.min(axis=1) >= MIN_TRANSITIONS
-        explained[enough] = 1.0 - (missed[enough] / founded[enough]).max(axis=1)
-        return explained
+        return part_explained(*self._missed())
 
     def _missed(self) -> tuple[np.ndarray, np.ndarray]:
         """What is not explained of the effects of each target action and variable, and over how many transitions."""
-        missed = self.sums.moved.copy()
         founded = np.repeat(self.sums.n[:, None], self.task.n_variables, axis=1)
+        mean = self.sums.effect / np.maximum(founded, 1.0)
+        missed = founded * np.sqrt(mean / np.maximum(mean.max(axis=0), SMALLEST_MOVE**2))
         for a in range(self.task.n_actions):
             for copy, used in self._moved(a):
                 has = self.copies.state[copy] >= 0

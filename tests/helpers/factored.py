@@ -161,3 +161,24 @@ def predicted_by(copies, copy, source_action, states):
         for k, value in zip(used, effect, strict=True):
             found[i, list(row).index(k)] = value
     return found
+
+
+def bound(transfer, d=4, n_actions=5, seed=0):
+    transfer.bind(target_task(d, n_actions), np.random.default_rng(seed))
+    return transfer
+
+
+def show(transfer, transitions, rewards=None, ends=None):
+    """Let it observe transitions; the version after each."""
+    states, actions, effects = transitions
+    versions = []
+    for i, (state, action, effect) in enumerate(zip(states, actions.tolist(), effects, strict=True)):
+        reward = -1.0 if rewards is None else float(rewards[i])
+        transfer.observe(state, action, reward, state + effect, False if ends is None else bool(ends[i]))
+        versions.append(transfer.prior_version())
+    return versions
+
+
+def inside(n, d, n_actions, seed=9):
+    rng = np.random.default_rng(seed)
+    return 0.25 + 0.5 * rng.random((n, d)), rng.integers(n_actions, size=n)

@@ -83,8 +83,15 @@ class NaiveLocalLinear:
     def prior_at(self, state, action):
         return (np.zeros(self.d), 0.0, 0.0, False) if self.prior is None else self.prior(state, action)
 
+    def prior_effect(self, state, action):
+        """The prior's effect, multilinear between those at the grid points."""
+        if self.prior is None:
+            return np.zeros(self.d)
+        corners = self.grid.corners(state).items()
+        return sum(part * self.prior_at(self.points[point], action)[0] for point, part in corners)
+
     def target(self, instance):
-        return instance.effect - self.prior_at(instance.state, instance.action)[0]
+        return instance.effect - self.prior_effect(instance.state, instance.action)
 
     def effect_range(self, action):
         """Least and largest effects: those of the instances, and those that the prior predicts on the grid."""
@@ -103,14 +110,16 @@ class NaiveLocalLinear:
             return self.breadth
         return min(self.breadth, max(NARROWEST * self.breadth, math.sqrt(farthest / -math.log(LAST_WEIGHT))))
 
-    def predicted(self, at, action, counted, breadth):
+    def predicted(self, at, action, counted, breadth, known=None):
         """
         Predict from the instances that count.
 
         :param counted: (squared distance, number) of these
         :param breadth: of the kernel of the fit
+        :param known: whether the instances suffice; by their weight if None
         """
-        of_prior, prior_reward, prior_end, claimed = self.prior_at(at, action)
+        _, prior_reward, prior_end, claimed = self.prior_at(at, action)
+        of_prior = self.prior_effect(at, action)
         low, high = self.effect_range(action) or (-np.inf, np.inf)
         if not counted:
             return Predicted(np.clip(of_prior, low, high), prior_reward, prior_end, 0.0)
@@ -124,14 +133,16 @@ class NaiveLocalLinear:
         left_over = near @ (targets - intercept - states @ slopes) / (near.sum() + EXPLAINED_WEIGHT)
         share = weights.sum() / (weights.sum() + PRIOR_WEIGHT) if claimed else 1.0
         effect = np.clip(of_prior + share * (intercept + at @ slopes + left_over), low, high)
-        reward, end = self.outcome(squared, instances, prior_reward, prior_end, claimed)
-        return Predicted(effect, reward, end, float(np.exp(-squared * self.narrowing / self.breadth**2).sum()))
+        weight = float(np.exp(-squared * self.narrowing / self.breadth**2).sum())
+        suffice = weight >= self.threshold if known is None else known
+        reward, end = self.outcome(squared, instances, prior_reward, prior_end, claimed and not suffice)
+        return Predicted(effect, reward, end, weight)
 
-    def outcome(self, squared, instances, prior_reward, prior_end, claimed):
+    def outcome(self, squared, instances, prior_reward, prior_end, with_prior):
         """Averages by the narrower kernel, seen from the nearest instance, where weights would be too small for a quotient."""
         near = np.exp(-(squared - squared.min()) / self.outcome_breadth**2)
         rewards, ends = np.array([i.reward for i in instances]), np.array([float(i.terminated) for i in instances])
-        if claimed:
+        if with_prior:
             closest = math.exp(-squared.min() / self.outcome_breadth**2)
             total = closest * near.sum() + PRIOR_OUTCOME_WEIGHT
             reward = (closest * near @ rewards + PRIOR_OUTCOME_WEIGHT * prior_reward) / total
@@ -153,7 +164,7 @@ class NaiveLocalLinear:
 
     def at_pair(self, action, point):
         counted, breadth = self.counted(action, point), self.narrowed(self.reach[action, point])
-        return self.predicted(self.points[point], action, counted, breadth)
+        return self.predicted(self.points[point], action, counted, breadth, self.known[action, point])
 
     def sums(self, action, point):
         """Of a pair: the weighted sums of 1, x, x x^T, e, x e^T; and of narrower weights, of these times reward, end, x, e."""

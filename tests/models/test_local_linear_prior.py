@@ -43,6 +43,13 @@ def nothing(state, action):
     return False
 
 
+class CurvedDynamics(LinearDynamics):
+    """Effects that are not linear between the points of a grid."""
+
+    def effect(self, state, action):
+        return super().effect(state, action) + 0.05 * np.sin(9.0 * state[::-1] + action)
+
+
 def renew(model, prior):
     prior.version += 1
     changed = model.renew_prior()
@@ -61,11 +68,11 @@ def model_with_prior(prior, grid=GRID, kernel=KERNEL, **kwargs):
 def test_sums_fits_and_rows_are_those_of_the_definition_whatever_the_prior_claims_by_and_by(problem, all_claims):
     grid, kernel, seed, n, threshold = problem
     d = len(grid[0])
-    prior = StubPrior(LinearDynamics(seed, d).effect, all_claims[0], reward=0.7, end=0.2)
+    prior = StubPrior(CurvedDynamics(seed, d).effect, all_claims[0], reward=0.7, end=0.2)
     model, naive = linear_model_and_definition(grid, kernel, threshold=threshold, prior=prior)
     transitions = random_transitions(seed, d, n * len(all_claims))
     for part, claims in enumerate(all_claims):
-        prior.claims, prior.effect = claims, LinearDynamics(seed + part, d).effect
+        prior.claims, prior.effect = claims, CurvedDynamics(seed + part, d).effect
         renew(model, prior)
         learn_linear(model, naive, transitions[part * n : (part + 1) * n])
         np.testing.assert_array_equal(model.known.reshape(naive.known.shape), naive.known)
@@ -80,7 +87,7 @@ def test_sums_fits_and_rows_are_those_of_the_definition_whatever_the_prior_claim
 def test_the_prediction_at_any_state_is_that_of_the_definition(problem, at):
     grid, kernel, seed, n, threshold = problem
     d = len(grid[0])
-    prior = StubPrior(LinearDynamics(seed, d).effect, left_half, reward=0.7, end=0.2)
+    prior = StubPrior(CurvedDynamics(seed, d).effect, left_half, reward=0.7, end=0.2)
     model, naive = linear_model_and_definition(grid, kernel, threshold=threshold, prior=prior)
     renew(model, prior)
     learn_linear(model, naive, random_transitions(seed, d, n))
@@ -141,12 +148,13 @@ def test_an_exact_prior_that_claims_nothing_leaves_pairs_optimistic_and_makes_th
 def test_own_instances_take_over_from_a_wrong_prior_in_proportion_to_their_weight():
     own, wrong = np.array([0.1, 0.05]), np.array([-0.1, 0.0])
     prior = StubPrior(lambda state, action: wrong, reward=-5.0, end=0.5)
-    model = model_with_prior(prior, n_actions=1)
+    model = model_with_prior(prior, n_actions=1, threshold=5.5)
     state, point = np.array([0.5, 0.5]), 12  # which is the same place
     for n in range(1, 15):
         learn(model, [(state, 0, -1.0, state + own, False)])
         finish_episode(model)
-        share, share_of_outcome = n / (n + PRIOR_WEIGHT), n / (n + PRIOR_OUTCOME_WEIGHT)
+        # Its reward and end count until the instances make the pair known.
+        share, share_of_outcome = n / (n + PRIOR_WEIGHT), 1.0 if n >= 6 else n / (n + PRIOR_OUTCOME_WEIGHT)
         expected = wrong + share * (own - wrong)
         expected_reward = -5.0 + share_of_outcome * 4.0
         prediction, _ = model.predict_at(state)
@@ -154,8 +162,35 @@ def test_own_instances_take_over_from_a_wrong_prior_in_proportion_to_their_weigh
             np.testing.assert_allclose(prediction.effect[0, 0], expected, atol=1e-9)
             assert prediction.reward[0] == pytest.approx(expected_reward)
             assert prediction.probability[0, 0] == pytest.approx(1.0 - 0.5 * (1.0 - share_of_outcome))
+        assert model.known[point] == (n >= 6)
         np.testing.assert_allclose(model.fits.row[point, :2], expected, atol=1e-9)
         np.testing.assert_allclose(model.fits.row[point, 2:], [expected_reward, 0.5 * (1.0 - share_of_outcome)], atol=1e-9)
+
+
+def test_a_lower_threshold_ends_what_the_prior_says_of_rewards():
+    prior = StubPrior(lambda state, action: np.zeros(2), reward=-5.0, end=0.5)
+    model = model_with_prior(prior, n_actions=1, threshold=4.0)
+    state, point = np.array([0.5, 0.5]), 12
+    learn(model, [(state, 0, -1.0, state, False)] * 3)
+    finish_episode(model)
+    assert model.fits.row[point, 2] == pytest.approx((-3.0 - 5.0 * PRIOR_OUTCOME_WEIGHT) / (3.0 + PRIOR_OUTCOME_WEIGHT))
+    model.update_rows(model.lower_threshold(2.0))
+    np.testing.assert_allclose(model.fits.row[point, 2:], [-1.0, 0.0], atol=1e-12)
+
+
+def test_the_prior_is_no_finer_than_the_grid():
+    """A step of its effects between two grid points is a slope from one to the other."""
+
+    def effect(state, action):
+        return np.array([0.1 if state[0] < 0.6 else 0.0, 0.0])
+
+    model = model_with_prior(StubPrior(effect), n_actions=1)  # points at 0, 0.25, 0.5, ...
+    learn(model, [(np.array([0.55, 0.3]), 0, -1.0, np.array([0.65, 0.3]), False)])
+    np.testing.assert_allclose(model.fits.target[0, 0], [0.1 - 0.1 * 0.8, 0.0], atol=1e-12)
+    far = np.array([0.7, 0.95])
+    expected = 0.1 * 0.2 + (0.1 - 0.1 * 0.8) * 1.0 / (1.0 + PRIOR_WEIGHT)
+    assert 0.0 < model.predict_at(far)[0].effect[0, 0, 0] < expected
+    np.testing.assert_allclose(model_with_prior(StubPrior(effect), n_actions=1).predict_at(far)[0].effect[0, 0, 0], 0.02)
 
 
 def test_a_wrong_prior_is_forgotten_where_there_are_many_instances():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_combrel.transfer.borne_out import EPISODES_IN_VAIN, STEPS_OF_A_VISIT, Outcomes
+from sb3_combrel.transfer.borne_out import EPISODES_IN_VAIN, MIN_ABSENT, STEPS_OF_A_VISIT, Outcomes
 
 SURE, NONE = 0.9, 0.0
 
@@ -39,7 +39,7 @@ def test_visits_count_once(ends, terminated, confirmed, contradicted):
     made = outcomes()
     note(made, ends, terminated)
     assert (made.confirmed, made.contradicted) == (confirmed, contradicted)
-    assert made.doubted == (contradicted > confirmed)
+    assert made.doubted == (made.absent >= MIN_ABSENT)
 
 
 def test_where_the_source_has_no_data_nothing_is_contradicted():
@@ -50,9 +50,41 @@ def test_where_the_source_has_no_data_nothing_is_contradicted():
     assert made.contradicted == made.rewards_wrong == 0 and not made.doubted
 
 
+def test_after_an_end_has_come_ends_that_do_not_are_doubted_and_nothing_else():
+    made = outcomes()
+    note(made, [SURE], terminated=True)
+    assert made.ends_believed and not made.doubted
+    note(made, [SURE, NONE])
+    assert made.ends_believed
+    note(made, [SURE, NONE])
+    assert (made.absent, made.unpredicted) == (2, 0) and not made.ends_believed and not made.doubted
+    note(made, [SURE], terminated=True)
+    assert made.ends_believed
+    note(made, [NONE], terminated=True)
+    note(made, [NONE], terminated=True)
+    note(made, [NONE], terminated=True)
+    assert not made.doubted
+    note(made, [NONE], terminated=True)
+    assert (made.absent, made.unpredicted) == (2, 4) and made.doubted and made.contradicted == 6
+
+
+def test_ends_that_few_data_do_not_predict_contradict_nothing():
+    made = Outcomes(np.full(10, -1.0), threshold=1.0, no_end=3.0)
+    note(made, [NONE], terminated=True, weight=2.9)
+    assert made.unpredicted == 0 and not made.doubted
+    note(made, [NONE, SURE, NONE], weight=1.0)
+    assert made.absent == 1
+    note(made, [NONE], terminated=True, weight=3.0)
+    assert made.unpredicted == 1 and not made.doubted
+    note(made, [NONE], terminated=True, weight=3.0)
+    assert made.unpredicted == 2 and made.doubted
+
+
 def test_doubt_ends_when_confirmations_make_up_for_it():
     made = outcomes()
-    note(made, [SURE, NONE])
+    for _ in range(MIN_ABSENT):
+        assert not made.doubted
+        note(made, [SURE, NONE])
     assert made.doubted
     note(made, [SURE], terminated=True)
     assert not made.doubted
@@ -62,7 +94,7 @@ def test_an_episode_cut_off_in_the_middle_of_a_visit_contradicts_the_end():
     made = outcomes()
     note(made, [NONE, SURE])
     made.end_episode(truncated=True)
-    assert made.contradicted == 1 and made.doubted
+    assert made.contradicted == 1
 
 
 def test_ends_that_are_never_reached_are_doubted_if_rewards_tell_nothing():

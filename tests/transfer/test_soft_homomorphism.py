@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import factored as f
+from helpers.factored import bound, inside, show
 from helpers.naive_transfer import random_source
 from helpers.ring import Ring
 from helpers.walk import Walk, same_parameters, small, walk_source
@@ -17,25 +18,6 @@ SWAPPED = f.copies_mapping(1, (1, 0))
 def lopsided(states, actions):
     """Effects that are not those of the mirrored source, unlike those of the oscillator."""
     return (states - [0.2, 0.6]) @ f.SLOPES.T + 2.0 * np.abs(f.PUSH[actions])
-
-
-def bound(transfer, d, n_actions, seed=0):
-    transfer.bind(f.target_task(d, n_actions), np.random.default_rng(seed))
-    return transfer
-
-
-def show(transfer, transitions, ends=None):
-    """Let it observe transitions; the version after each."""
-    versions = []
-    for i, (state, action, effect) in enumerate(zip(*transitions, strict=True)):
-        transfer.observe(state, int(action), -1.0, state + effect, ends is not None and bool(ends[i]))
-        versions.append(transfer.prior_version())
-    return versions
-
-
-def inside(n, d, n_actions, seed=9):
-    rng = np.random.default_rng(seed)
-    return 0.25 + 0.5 * rng.random((n, d)), rng.integers(n_actions, size=n)
 
 
 def test_swapped_variables_are_found_from_a_few_transitions():
@@ -124,6 +106,19 @@ def test_a_target_that_has_nothing_in_common_is_not_claimed_to_be_known():
     assert method.prior(*inside(50, 2, 3)).weight.max() == 0.0
 
 
+def test_noise_in_a_variable_that_an_action_leaves_alone_takes_no_trust():
+    def effects(states, actions):
+        return 0.05 * np.column_stack([actions == 1, actions == 2])
+
+    rng = np.random.default_rng(0)
+    states, actions = rng.random((200, 2)), rng.integers(3, size=200)
+    moved = effects(states, actions)
+    moved = np.where(moved == 0.0, 0.004 * rng.normal(size=moved.shape), moved)
+    method = bound(SoftHomomorphism(f.oscillator_source(effects=effects), mirrored=False), 2, 3)
+    show(method, (states, actions, moved))
+    assert method._claims.trust.min() >= 0.7
+
+
 def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doubted():
     source = f.oscillator_source(1500)
     method = bound(SoftHomomorphism(source, mirrored=False), 2, 3)
@@ -141,6 +136,12 @@ def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doub
         # It stays for an episode where an end is predicted.
         method.observe(at_end[0], 0, -1.0, at_end[0] + f.target_effects(SWAPPED, at_end, actions)[0], False)
         method.end_episode(truncated=True)
+    # Ends are believed no more, and nothing else is doubted.
+    assert method.statistics()["transfer/prior_doubted"] == 0.0
+    assert method.prior(at_end, actions).weight[0] == 0.0 and method.prior(*inside(5, 2, 3)).weight.min() > 0.0
+    for state in inside(3, 2, 3)[0]:
+        method.observe(state, 0, -1.0, state + f.target_effects(SWAPPED, state[None], actions)[0], True)
+        method.end_episode(truncated=False)
     assert method.statistics()["transfer/prior_doubted"] == 1.0
     assert method.prior(*inside(5, 2, 3)).weight.max() == 0.0
 
