@@ -106,6 +106,8 @@ class FittedRMaxAgent:
             action_names=tuple(self.task.action_names),
             periodic=self.periodic,
             takes_prior=self.model_class.takes_prior,
+            gamma=self.settings.gamma,
+            max_value=float(self.settings.max_value),
         )
         transfer.bind(target, self.rng)
         return target
@@ -227,7 +229,7 @@ class FittedRMaxAgent:
 
     def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
         """
-        Compute the action values at an exact state; optimistic actions have ``max_value``.
+        Compute the action values at an exact state; optimistic actions have ``max_value``, or what a prior bounds it by.
 
         :param state: unit coordinates, shape (n_variables,)
         :param values: at the grid points; by default the planner's, optimistic ones
@@ -244,7 +246,7 @@ class FittedRMaxAgent:
         return prediction
 
     def _value_function(self, values: np.ndarray) -> PlainValueFunction:
-        return values, self._plain_corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds
+        return values, self._plain_corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.upper
 
     def update(
         self,
@@ -334,6 +336,8 @@ class FittedRMaxAgent:
         changed = NO_PAIRS if self.transfer is None else self._changed_by(self.transfer)
         if self.transfer is not None and self.transfer.use == "prior":
             changed = self.model.renew_prior()
+            if len(changed):
+                self.planner.set_upper(self.transfer.value_bound())
         passes = 0
         if len(changed):
             self._outdated.append(changed)
@@ -400,6 +404,8 @@ class FittedRMaxAgent:
             self.model.lower_threshold(self._lowered_threshold())
             self.model.set_state(state)
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
+            if self.transfer is not None and self.transfer.use == "prior":
+                self.planner.set_upper(self.transfer.value_bound())
             self.planner.restore(state["values"])
             self._set_corrections(CorrectionArrays.of_rows(state["corrections"]))
             self.visits.counts[:] = np.clip(state["visits"], 0, np.iinfo(np.int32).max)

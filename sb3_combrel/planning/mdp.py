@@ -1,7 +1,7 @@
 """The finite MDP over the grid points: reward and successors of each state-action pair that has a model.
 
 A model writes it pair by pair, the planner reads it. State-action pair ``action * n_points + point`` is action ``action`` at
-grid point ``point``. A pair without a model is optimistic: its value is ``max_value``, and it has no successors.
+grid point ``point``. A pair without a model is optimistic: its value is the planner's upper bound, and it has no successors.
 """
 
 from typing import Any, NamedTuple

@@ -7,7 +7,7 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.planning.corrections import CorrectionArrays, ValueScratch, corrected_value, visit
-from sb3_combrel.planning.grid import GridArrays
+from sb3_combrel.planning.grid import GridArrays, corners_of
 
 NEVER_LEAVES = 1e-9
 
@@ -50,7 +50,8 @@ class ValueFunction(NamedTuple):
     :param corrections: caps on what is interpolated between them
     :param grid: the grid
     :param gamma: discount factor
-    :param bounds: (min_value, max_value); an optimistic action has the latter
+    :param bounds: (min_value, max_value)
+    :param upper: float64, shape (n_points,): value of an optimistic action at the grid points
     """
 
     values: np.ndarray
@@ -58,10 +59,11 @@ class ValueFunction(NamedTuple):
     grid: GridArrays
     gamma: float
     bounds: tuple[float, float]
+    upper: np.ndarray
 
 
 # The same as plain tuples (see ``common.compiled``).
-PlainValueFunction = tuple[np.ndarray, tuple[Any, ...], tuple[Any, ...], float, tuple[float, float]]
+PlainValueFunction = tuple[np.ndarray, tuple[Any, ...], tuple[Any, ...], float, tuple[float, float], np.ndarray]
 
 
 @inlined
@@ -90,9 +92,10 @@ def q_values(prediction, state, function, q, scratch):
     :param function: a ValueFunction
     :param q: receives the values, shape (n_actions,)
     """
+    n_optimistic = 0
     for action in range(len(q)):
         if not prediction.modelled[action]:
-            q[action] = function.bounds[1]
+            n_optimistic += 1
             continue
         after = 0.0
         stay = 0.0
@@ -111,6 +114,22 @@ def q_values(prediction, state, function, q, scratch):
         else:
             value = np.inf * reward
         q[action] = min(max(value, function.bounds[0]), function.bounds[1])
+    if n_optimistic > 0:
+        upper = optimistic_value(state, function, scratch)
+        for action in range(len(q)):
+            if not prediction.modelled[action]:
+                q[action] = upper
+
+
+@inlined
+def optimistic_value(state, function, scratch):
+    """The value of an action without a model at ``state``: exactly ``max_value`` where that is the bound all around."""
+    for k in range(len(state)):
+        scratch.position[k] = state[k] * function.grid.cells[k] + function.grid.margin[k]
+    value = function.bounds[1]
+    for c in range(corners_of(scratch.position, function.grid, scratch.corner_index, scratch.corner_weight)):
+        value += scratch.corner_weight[c] * (function.upper[scratch.corner_index[c]] - function.bounds[1])
+    return value
 
 
 @part
@@ -139,8 +158,8 @@ def evaluate_actions(prediction, state, function, q, visitor, scratch):
 @compiled
 def evaluate_actions_plain(prediction, state, function, q, visitor, scratch):
     """:func:`evaluate_actions` for callers from Python, with plain tuples."""
-    values, corrections, grid, gamma, bounds = function
-    function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds)
+    values, corrections, grid, gamma, bounds, upper = function
+    function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds, upper)
     return evaluate_actions(Prediction(*prediction), state, function, q, visitor, ValueScratch(*scratch))
 
 

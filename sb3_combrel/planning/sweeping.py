@@ -25,6 +25,7 @@ class SweepQueue(NamedTuple):
     :param greedy: int16, shape (n_points,): the action that gave the point its value, -1 if none did
     :param q: float64, shape (n_points, n_actions): Q of each pair when it was last computed
     :param slack: float64, same shape: how far Q may have moved since, besides ``priority``; inf: by any amount
+    :param upper: float64, shape (n_points,): upper bound of each point's value, and its value while an action is optimistic
     """
 
     ring: np.ndarray
@@ -35,14 +36,16 @@ class SweepQueue(NamedTuple):
     greedy: np.ndarray
     q: np.ndarray
     slack: np.ndarray
+    upper: np.ndarray
 
     @classmethod
-    def empty(cls, values: np.ndarray, n_actions: int) -> "SweepQueue":
+    def empty(cls, values: np.ndarray, n_actions: int, upper: np.ndarray) -> "SweepQueue":
         """
         Make a queue of no points.
 
         :param values: at the grid points; they count as propagated
         :param n_actions: number of actions
+        :param upper: upper bounds; not copied
         """
         n_points = len(values)
         return cls(
@@ -54,6 +57,7 @@ class SweepQueue(NamedTuple):
             greedy=np.full(n_points, -1, dtype=np.int16),
             q=np.zeros((n_points, n_actions)),
             slack=np.full((n_points, n_actions), np.inf),
+            upper=upper,
         )
 
 
@@ -93,7 +97,7 @@ def compute_q(values, mdp, queue, point, action):
 
 @inlined
 def bellman_backup(values, mdp, queue, point, bounds, tolerance):
-    """V(point) = max over a of Q(point, a), Fitted R-Max's backup; ``max_value`` while an action is optimistic.
+    """V(point) = max over a of Q(point, a), Fitted R-Max's backup; the upper bound while an action is optimistic.
 
     Starts with the action that was best. Of the others, only those are computed that can have become better: rows lie all
     over the memory, and to read them takes most of the time of planning.
@@ -103,7 +107,7 @@ def bellman_backup(values, mdp, queue, point, bounds, tolerance):
     queue.priority[point] = 0.0
     queue.greedy[point] = -1
     if mdp.n_optimistic[point] > 0:
-        values[point] = bounds[1]
+        values[point] = queue.upper[point]
         return
     best = bounds[0]
     if greedy >= 0:
@@ -122,7 +126,7 @@ def bellman_backup(values, mdp, queue, point, bounds, tolerance):
         if q > best:
             best = q
             queue.greedy[point] = action
-    values[point] = min(best, bounds[1])
+    values[point] = min(best, queue.upper[point])
 
 
 @part
@@ -135,7 +139,7 @@ def backup_after_change(values, mdp, queue, pair, bounds, tolerance):
     if greedy < 0 or greedy == action or mdp.n_optimistic[point] > 0:
         bellman_backup(values, mdp, queue, point, bounds, tolerance)
     elif compute_q(values, mdp, queue, point, action) >= values[point]:
-        values[point] = min(queue.q[point, action], bounds[1])
+        values[point] = min(queue.q[point, action], queue.upper[point])
         queue.greedy[point] = action
 
 
@@ -195,7 +199,7 @@ def sweep(values, mdp, queue, grid, limits, changed, around, scratch):
         point = pop(queue)
         if point < 0:
             break
-        if mdp.n_optimistic[point] > 0 and values[point] == bounds[1]:
+        if mdp.n_optimistic[point] > 0 and values[point] == queue.upper[point]:
             continue
         bellman_backup(values, mdp, queue, point, bounds, tolerance)
         backups += 1
@@ -228,7 +232,7 @@ def sweep_all(values, mdp, queue, bounds, tolerance, max_passes):
         for step in range(n_points):
             point = step if n % 2 == 0 else n_points - 1 - step
             before = values[point]
-            if mdp.n_optimistic[point] == 0 or before != bounds[1]:
+            if mdp.n_optimistic[point] == 0 or before != queue.upper[point]:
                 queue.slack[point] = np.inf
                 bellman_backup(values, mdp, queue, point, bounds, tolerance)
                 largest = max(largest, abs(values[point] - before))
@@ -254,7 +258,7 @@ class Planner:
     The value function at the grid points, kept near the fixed point of the MDP's Bellman backups.
 
     :param mdp: the finite MDP; pairs whose rows change are given to :meth:`update`
-    :param max_value: value of an optimistic pair, and upper bound of all values
+    :param max_value: value of an optimistic pair, and upper bound of all values; lower ones: see :meth:`set_upper`
     :param min_value: lower bound of all values, reached only by states that lead nowhere
     :param tolerance: changes up to this are not propagated
     """
@@ -263,8 +267,10 @@ class Planner:
         self.mdp = mdp
         self.tolerance = float(tolerance)
         self.bounds = (float(min_value), float(max_value))
-        self.values = np.full(mdp.grid.n_points, float(max_value))
-        self._set_queue(SweepQueue.empty(self.values, mdp.n_actions))
+        #: Upper bound of the value of each grid point, and its value while an action is optimistic.
+        self.upper = np.full(mdp.grid.n_points, float(max_value))
+        self.values = self.upper.copy()
+        self._set_queue(SweepQueue.empty(self.values, mdp.n_actions, self.upper))
         self._exploitation: np.ndarray | None = None
 
     def _set_queue(self, queue: SweepQueue) -> None:
@@ -307,11 +313,23 @@ class Planner:
             self._exploitation = values
         return self._exploitation
 
+    def set_upper(self, upper: np.ndarray | None) -> None:
+        """
+        Bound the values of grid points, and so what is optimistic, by less than ``max_value``; every point is queued.
+
+        :param upper: shape (n_points,), no more than ``max_value`` counts; None: ``max_value`` everywhere
+        """
+        bounded = np.full(len(self.upper), self.bounds[1]) if upper is None else np.clip(upper, *self.bounds)
+        if np.array_equal(bounded, self.upper):
+            return
+        self.upper[:] = bounded
+        self.restore(np.where(self.mdp.arrays.n_optimistic > 0, bounded, self.values))
+
     def restore(self, values: np.ndarray) -> None:
         """Replace the values by saved ones; every point with a model is queued."""
         self._exploitation = None
-        self.values[:] = np.clip(values, *self.bounds)
-        queue = SweepQueue.empty(self.values, self.mdp.n_actions)
+        self.values[:] = np.clip(values, self.bounds[0], self.upper)
+        queue = SweepQueue.empty(self.values, self.mdp.n_actions, self.upper)
         self._set_queue(queue)
         points = np.flatnonzero(self.mdp.arrays.n_optimistic == 0)
         queue.ring[: len(points)] = points

@@ -24,7 +24,7 @@ FOR_THE_ALGORITHM = frozenset(
     (
         *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
         *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "renamed_arguments", "makes_choices"),
-        "informs_model",
+        *("informs_model", "value_bound"),
     )
 )
 
@@ -48,6 +48,8 @@ class TargetTask:
     :param periodic: which state variables are periodic, so that 0 and 1 are the same unit coordinate: one bool for each,
         None for none
     :param takes_prior: whether the target's model takes a prior (``use="prior"``)
+    :param gamma: discount factor
+    :param max_value: upper bound on the return from any state
     """
 
     scaling: StateScaling
@@ -60,6 +62,8 @@ class TargetTask:
     action_names: tuple[str, ...]
     periodic: Sequence[bool] | None = None
     takes_prior: bool = False
+    gamma: float = 1.0
+    max_value: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "periodic", periodic_flags(self.periodic, self.n_variables))
@@ -195,6 +199,18 @@ class Transfer(ABC):
         at every step.
         """
         return 0
+
+    def value_bound(self) -> np.ndarray | None:
+        """
+        Return an upper bound on the return from each state of the sample, the value of what is not known there.
+
+        Asked only if :attr:`use` is "prior", and again whenever :meth:`prior_version` has grown. The lower it is, the less is
+        explored; it must not be too low, or what is best may never be tried (Asmuth, Littman & Zinkov, "Potential-based
+        shaping in model-based reinforcement learning", AAAI 2008).
+
+        :return: raw, shape (n_points,); None: ``task.max_value`` everywhere, which is the default
+        """
+        return None
 
     def check_degree(self, degree: int) -> None:
         """

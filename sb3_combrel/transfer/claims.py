@@ -116,6 +116,10 @@ class Claims:
         self.trust, self.explains = trust, explains
         return changed
 
+    def allow_bound(self) -> bool:
+        """Return whether the source's values may bound the target's: all actions explained, ends and rewards not doubted."""
+        return self.transfer_terminals and bool(self.trust.all()) and not self.outcomes.doubted
+
     def have_changed(self) -> bool:
         """Return whether ends and rewards are doubted, or ends believed, that were not, or no longer, since last asked."""
         before, self._noted = self._noted, self._believed()

@@ -54,6 +54,7 @@ class Copies:
         threshold: float,
     ):
         self.threshold = float(threshold)
+        self.breadth = float(breadth)
         self.sources = sources
         self.source = source
         self.state = state
@@ -167,7 +168,7 @@ class Copies:
             asked = np.flatnonzero((uses.of_action == use).any(axis=1)[actions])
             variables = np.flatnonzero(self.table.variable[copy] >= 0)
             chosen, inverse = distinct_rows(states[np.ix_(asked, variables)])
-            at = self._as_copy(copy, states[asked[chosen]])
+            at = self.as_copy(copy, states[asked[chosen]])
             found = self.model.predict(at, np.full(len(at), action, dtype=np.int64))
             rows[use, asked] = n + inverse
             effects.append(found.effect)
@@ -175,8 +176,14 @@ class Copies:
             n += len(at)
         return rows, np.concatenate(effects), np.concatenate(outcomes)
 
-    def _as_copy(self, copy: int, states: np.ndarray) -> np.ndarray:
-        """Target states as a copy has them, shape (n, n_source_variables)."""
+    def as_copy(self, copy: int, states: np.ndarray) -> np.ndarray:
+        """
+        Return target states as a copy has them.
+
+        :param copy: its number
+        :param states: unit coordinates of the target, shape (n, n_target_variables)
+        :return: unit coordinates of the source, shape (n, most source variables); 0 for those that the copy does not have
+        """
         at = np.zeros((len(states), self.model.n_variables))
         for v in np.flatnonzero(self.table.variable[copy] >= 0):
             k = self.table.variable[copy, v]

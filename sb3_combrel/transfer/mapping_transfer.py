@@ -234,6 +234,9 @@ class MappingTransfer(Transfer):
     def prior_version(self) -> int:
         return self._source_use.version
 
+    def value_bound(self) -> np.ndarray | None:
+        return self._source_use.value_bound()
+
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         return self._source_use.changed(known)
 

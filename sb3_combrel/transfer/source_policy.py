@@ -5,23 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.planning.corrections import CorrectionArrays
-from sb3_combrel.planning.grid import StateGrid, fitting_grid
-from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction, QValues
 from sb3_combrel.planning.sweeping import Planner
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
+from sb3_combrel.transfer.source_mdp import planning_tolerance, source_mdp
 from sb3_combrel.transfer.source_model import SourceModel
 
 # Weight of instances from which on a prediction counts, as by default in Fitted R-Max.
 MIN_WEIGHT = 1.0
-# The finite MDP leads from a grid point until its cell is left, but for no more than so many steps: values that are
-# interpolated at every step would spread over the grid.
-MAX_STEPS = 50
-# What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
-LEAST_WEIGHT_ON_GRID = 0.05
-# Changes of value up to this part of the range of a step's rewards end the planning.
-TOLERANCE = 0.001
 
 
 class SourcePolicy:
@@ -39,45 +31,20 @@ class SourcePolicy:
 
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):
         self.model = SourceModel(stacked_instances([source]), breadth)
-        n, d = source.n_actions, source.n_variables
-        grid = fitting_grid(d, n, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
-        mdp = FiniteMDP(grid, n, gamma)
-        self._write_rows(mdp)
+        mdp = source_mdp(source, self.model, gamma, breadth, MIN_WEIGHT)
         lowest, highest = float(source.rewards.min()), float(source.rewards.max())
         bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
-        tolerance = TOLERANCE * max(highest - lowest, abs(highest), 1e-6)
-        planner = Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=tolerance)
+        planner = Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=planning_tolerance(source))
         # From below: values then come from ways that exist, however few sweeps there are.
         planner.values[:] = bounds[0]
         #: Value of each grid point.
         self.values = planner.exploitation_values()
-        self.grid: StateGrid = grid
-        self._function = self.values, tuple(CorrectionArrays.empty(d)), grid.plain, float(gamma), bounds
+        self.grid = mdp.grid
+        n, d = source.n_actions, source.n_variables
+        self._function = self.values, tuple(CorrectionArrays.empty(d)), self.grid.plain, float(gamma), bounds, planner.upper
         self._q = QValues(n, d)
         self._actions = np.arange(n)
         self._length = np.ones(n, dtype=np.int64)
-
-    def _write_rows(self, mdp: FiniteMDP) -> None:
-        """Write what each action, held until the cell is left, does at each grid point."""
-        n_points, cells = mdp.grid.n_points, mdp.grid.arrays.cells
-        states = np.tile(mdp.grid.points(), (mdp.n_actions, 1))
-        actions = np.repeat(np.arange(mdp.n_actions), n_points)
-        at, reward, weight = states.copy(), np.zeros(len(states)), np.zeros(len(states))
-        # The probability that the episode goes on, discounted for all steps but one, which the MDP discounts itself.
-        goes_on = np.ones(len(states))
-        going = np.arange(len(states))
-        for step in range(MAX_STEPS):
-            goes_on[going] *= 1.0 if step == 0 else mdp.gamma
-            found = self.model.predict(at[going], actions[going])
-            reward[going] += goes_on[going] * found.reward
-            goes_on[going] *= 1.0 - found.end
-            at[going] += found.effect
-            if step == 0:
-                weight[:] = found.weight
-            left = (np.abs(at[going] - states[going]) * cells).max(axis=1) >= 1.0
-            going = going[~left & (goes_on[going] > 0.0)]
-        pairs = np.arange(len(states))
-        mdp.write_rows(pairs, weight >= MIN_WEIGHT, goes_on[:, None], (at - states)[:, None], reward)
 
     def q_values(self, state: np.ndarray) -> np.ndarray:
         """

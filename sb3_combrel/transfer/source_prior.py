@@ -7,7 +7,7 @@ import numpy as np
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
-from sb3_combrel.transfer.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
+from sb3_combrel.transfer.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
 from sb3_combrel.transfer.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.copy_sums import CopySums
 from sb3_combrel.transfer.placed_errors import PlacedErrors
@@ -15,6 +15,7 @@ from sb3_combrel.transfer.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior_choice import Choice, Chooser, moved
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.source_use import SourceUse
+from sb3_combrel.transfer.value_bound import ValueBound
 
 # A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
 SMALLEST_MOVE = 0.005
@@ -56,6 +57,7 @@ class SourcePrior(SourceUse):
         self.sources = copies.sources
         self.copies = copies
         self.candidates = PriorCandidates(copies, task)
+        self._value_bound = ValueBound(copies, task, min_weight=float(task.exploration_threshold) / CLAIMED_WEIGHT)
         self.whole = whole
         self._choose = None if isinstance(choose, Choice) else choose
         self.max_transitions = 0 if self._choose is None else max_transitions
@@ -152,6 +154,17 @@ class SourcePrior(SourceUse):
     def _compare(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray, weight: float) -> None:
         if weight >= self.copies.threshold:
             self.errors.note(state, action, effect, predicted)
+
+    def value_bound(self) -> np.ndarray | None:
+        """
+        Return an upper bound on the return from each state of the sample, shape (n_points,), or None.
+
+        The source's values, see :class:`~sb3_combrel.transfer.value_bound.ValueBound`, while all of the target's actions are
+        explained, and neither ends nor rewards of the source are doubted.
+        """
+        if self.choice is None or not self.claims.allow_bound():
+            return None
+        return self._value_bound.through(self.choice)
 
     def end_episode(self, truncated: bool) -> None:
         """Take in the end of an episode; ``truncated``: by its time limit."""

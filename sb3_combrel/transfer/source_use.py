@@ -66,6 +66,10 @@ class SourceUse(ABC):
         """Predict states and actions of the target, as its prior."""
         raise NotImplementedError(f"{type(self).__name__} has no prior")
 
+    def value_bound(self) -> np.ndarray | None:
+        """Return an upper bound on the return from each state of the sample; None: there is none."""
+        return None
+
     @abstractmethod
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         """

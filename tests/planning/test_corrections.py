@@ -16,7 +16,7 @@ BOUNDS = (-1e6, 1e6)
 
 
 def function_of(values, corrections):
-    return values, tuple(corrections), GRID.plain, 1.0, BOUNDS
+    return values, tuple(corrections), GRID.plain, 1.0, BOUNDS, np.full(GRID.n_points, BOUNDS[1])
 
 
 def visit(values, corrections, state, best_q, episode=0, times=1, tolerance=0.05, max_visits=MAX_VISITS):

@@ -1,0 +1,93 @@
+"""An upper bound on what a target's states are worth: the value of the source's, through a mapping."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_combrel.planning.sweeping import Planner
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.candidates import stacked_instances
+from sb3_combrel.transfer.copies import Copies, distinct_rows
+from sb3_combrel.transfer.prior_choice import Choice
+from sb3_combrel.transfer.source_mdp import MAX_STEPS, planning_tolerance, source_mdp
+from sb3_combrel.transfer.source_model import SourceModel
+
+# Values fall from the upper bound towards the source's with every sweep, and are upper bounds wherever that is ended.
+MAX_SWEEPS = 300
+
+
+class ValueBound:
+    """
+    Bounds the values of the target's states by those of the source's states that they are taken for.
+
+    With them as the value of what is unknown, instead of ``max_value`` everywhere, the agent does not explore what could not
+    be better than what it knows, even if it were as good as the source allows: R-Max with an admissible potential (Asmuth,
+    Littman & Zinkov, "Potential-based shaping in model-based reinforcement learning", AAAI 2008), which here comes from
+    another task through a mapping, as in Mann & Choe, "Directed exploration in reinforcement learning with transferred
+    knowledge", EWRL 2012.
+
+    The source's values are those of Fitted R-Max's planning with the source's local linear model: where the source has too
+    few data, a pair is worth ``max_value``. A target of one copy of the source can do at most what the source can, with any
+    of the source's actions. One of several copies ends when all of them have ended: if every step costs the same, it can be
+    worth no more than any of its copies, and the least of their values bounds it. Otherwise nothing is said of several.
+
+    :param copies: the copies that can be chosen
+    :param task: the target task
+    :param min_weight: weight of the source's data from which on a pair of the source has a model
+    """
+
+    def __init__(self, copies: Copies, task: TargetTask, min_weight: float):
+        self._copies = copies
+        self._task = task
+        self._min_weight = min_weight
+        #: By number of the source: a planner that has its values.
+        self._planners: dict[int, Planner] = {}
+        self._of_copy: dict[int, np.ndarray] = {}
+
+    def through(self, choice: Choice) -> np.ndarray | None:
+        """
+        Bound the values of all states of the target's sample.
+
+        :param choice: what each target action is made of
+        :return: shape (n_points,); None if nothing bounds them: if actions are taken for those of different copies, no copy
+            has all variables of its source, or several copies do not cost the same at every step
+        """
+        used = choice.copies[0][choice.copies[0] >= 0].tolist()
+        if not (choice.copies == choice.copies[0]).all() or (len(used) > 1 and not self._costs_are_alike(used)):
+            return None
+        bounds = [self._bound(copy) for copy in used if self._is_whole(copy)]
+        return np.minimum.reduce(bounds) if bounds else None
+
+    def _costs_are_alike(self, used: list[int]) -> bool:
+        rewards = np.concatenate([self._copies.sources[self._copies.source[copy]].rewards for copy in used])
+        return bool(rewards.max() <= 0.0 and rewards.max() - rewards.min() <= 1e-9)
+
+    def _is_whole(self, copy: int) -> bool:
+        """Whether a copy has all variables of its source."""
+        variables = self._copies.state[copy]
+        return len(np.unique(variables[variables >= 0])) == self._copies.sources[self._copies.source[copy]].n_variables
+
+    def _bound(self, copy: int) -> np.ndarray:
+        """The source's value at the state that each state of the target's sample is in a copy."""
+        if copy not in self._of_copy:
+            number = int(self._copies.source[copy])
+            if number not in self._planners:
+                self._planners[number] = self._plan(number)
+            planner = self._planners[number]
+            grid = planner.mdp.grid
+            at = self._copies.as_copy(copy, self._task.sample_states)[:, : grid.n_variables]
+            different, kind = distinct_rows(at)
+            self._of_copy[copy] = np.array([grid.interpolate(planner.values, at[i]) for i in different])[kind]
+        return self._of_copy[copy]
+
+    def _plan(self, number: int) -> Planner:
+        """Plan in a source, from above."""
+        source, breadth = self._copies.sources[number], self._copies.breadth
+        model = SourceModel(stacked_instances([source]), breadth)
+        mdp = source_mdp(source, model, self._task.gamma, breadth, self._min_weight)
+        highest = self._task.max_value
+        # Lower than so many sweeps can get.
+        lowest = min(0.0, highest) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
+        planner = Planner(mdp, max_value=highest, min_value=lowest, tolerance=planning_tolerance(source))
+        planner.sweep_all(MAX_SWEEPS)
+        return planner
