@@ -318,7 +318,13 @@ class Planner:
         Bound the values of grid points, and so what is optimistic, by less than ``max_value``; every point is queued.
 
         :param upper: shape (n_points,), no more than ``max_value`` counts; None: ``max_value`` everywhere
+        :raises ValueError: if there is not one number for each grid point
         """
+        if upper is not None and (np.shape(upper) != self.upper.shape or not np.isfinite(upper).all()):
+            raise ValueError(
+                f"value_bound() must return None or a finite number for each of the {len(self.upper)} states of the sample, "
+                f"got an array of shape {np.shape(upper)} with {int(np.isfinite(upper).sum())} finite numbers"
+            )
         bounded = np.full(len(self.upper), self.bounds[1]) if upper is None else np.clip(upper, *self.bounds)
         if np.array_equal(bounded, self.upper):
             return

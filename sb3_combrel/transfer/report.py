@@ -106,6 +106,7 @@ class TransferReport:
     :param not_used: pairs of a target action and a variable for which the source explains so little that it is not used
     :param ends: episode ends where the source predicts them (confirmed), and ends predicted or not, wrongly (contradicted)
     :param rewards: transitions whose reward the source predicts rightly, and wrongly
+    :param bounds_values: whether what is unknown counts as worth no more than the source's state that it is taken for
     :param statistics: the figures of the log, by name
     """
 
@@ -124,6 +125,7 @@ class TransferReport:
     not_used: tuple[tuple[str, str], ...] = ()
     ends: tuple[int, int] = (0, 0)
     rewards: tuple[int, int] = (0, 0)
+    bounds_values: bool = False
     statistics: Mapping[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -140,6 +142,8 @@ class TransferReport:
             share = 100 * self.n_rested / max(self.n_steps, 1)
             how = "the source claimed to know the outcome" if self.use == "prior" else "transferred instances predicted it"
             lines.append(f"{self.n_rested:,} of {self.n_steps:,} steps ({share:.0f} %) rested on the source: {how}.")
+        if self.bounds_values:
+            lines.append("The value of what is unknown is bounded by the source's value there.")
         return "\n".join(lines)
 
     def _mappings(self) -> str:

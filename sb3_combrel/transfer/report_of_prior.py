@@ -69,6 +69,7 @@ def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
         contradictions=prior.errors.contradictions(),
         not_used=tuple((names[a], prior.task.state_names[v]) for a, v in pairs.tolist()),
         ends=(prior.claims.outcomes.confirmed, prior.claims.outcomes.contradicted),
+        bounds_values=prior.value_bound() is not None,
         rewards=(prior.claims.outcomes.rewards_right, prior.claims.outcomes.rewards_wrong),
         statistics=prior.statistics(),
     )

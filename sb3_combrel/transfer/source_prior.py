@@ -265,6 +265,7 @@ class SourcePrior(SourceUse):
             "transfer/prediction_error": self.error(),
             "transfer/prior_trust": float(self.claims.trust.mean()),
             "transfer/prior_doubted": float(self.claims.outcomes.doubted),
+            "transfer/values_bounded": float(self.value_bound() is not None),
             "transfer/ends_confirmed": self.claims.outcomes.confirmed,
             "transfer/ends_contradicted": self.claims.outcomes.contradicted,
             "transfer/prior_copies": 0 if self.choice is None else int((self.choice.copies >= 0).sum(axis=1).max(initial=0)),

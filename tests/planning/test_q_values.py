@@ -107,6 +107,19 @@ def test_below_the_threshold_an_action_has_max_value_exactly(line):
     assert (line.q_values(0.5)[1:] == 0.0).all(), "instances of one action do not count for the others"
 
 
+def test_below_the_threshold_an_action_has_the_bound_interpolated_between_grid_points(line):
+    bounds = -np.arange(line.agent.grid.n_points, dtype=float) ** 2
+    line.agent.planner.set_upper(bounds)
+    line.learn(0.5, 0.1)
+    for state in (0.0, 0.125, 0.3, 0.9):
+        expected = np.interp(4.0 * state + 1.0, np.arange(len(bounds)), bounds)
+        np.testing.assert_allclose(line.q_values(state), expected, atol=1e-12)
+    assert line.q(0.5) == pytest.approx(-1.0 - 3.4), "a known action has what it leads to"
+    assert line.q_values(0.5)[1] == pytest.approx(-9.0)
+    line.agent.planner.set_upper(None)
+    assert (line.q_values(0.3) == 0.0).all()
+
+
 def test_an_action_is_known_as_far_as_its_weights_reach_the_threshold(line):
     line.learn(0.5, 0.1, times=2)
     edge = 0.2 * np.sqrt(np.log(2))  # two instances weigh 1 here

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from helpers.kernel_models import N_ACTIONS, make_model
 from helpers.naive_fitted_rmax import NaiveFittedRMax
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sb3_combrel.planning.sweeping import Planner
 
@@ -121,14 +123,16 @@ def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again():
     assert lost > 0
 
 
-def values_of_rows(problem, optimistic=True):
+def values_of_rows(problem, optimistic=True, upper=np.inf):
     """Value iteration on the rows of the finite MDP.
 
     :param optimistic: False: without optimistic pairs; a point that has no other takes the least value of its neighbours
+    :param upper: bounds of the points' values, besides ``max_value``
     """
     arrays, n = problem.model.mdp.arrays, problem.model.grid.n_points
     low, high = problem.planner.bounds
-    values = problem.planner.values.copy() if not optimistic else np.full(n, high)
+    upper = np.minimum(np.broadcast_to(upper, n), high)
+    values = problem.planner.values.copy() if not optimistic else upper.copy()
     for _ in range(2000):
         backed_up = values.copy()
         for point in range(n):
@@ -139,13 +143,54 @@ def values_of_rows(problem, optimistic=True):
                     q.append(arrays.reward[pair] + weight @ values[to])
                 elif optimistic:
                     q.append(np.inf)
-            backed_up[point] = min(max(q), high)
+            backed_up[point] = min(max(q), upper[point])
             if not optimistic and len(q) == 1:
                 backed_up[point] = min(values[neighbour] for neighbour in neighbours_of(point, problem.model.grid))
         if np.abs(backed_up - values).max() < 1e-12:
             return backed_up
         values = backed_up
     raise AssertionError("value iteration did not converge")
+
+
+@settings(deadline=None, derandomize=True, max_examples=20)
+@given(
+    st.integers(0, 10**6), st.integers(0, 60), st.lists(st.sampled_from(["lower", "raise", "none"]), min_size=1, max_size=4)
+)
+def test_values_are_bounded_by_what_is_given_and_optimistic_ones_are_that(seed, n, changes):
+    """However bounds come, fall and rise between transitions: exactly, as from the beginning with the last of them."""
+    rng = np.random.default_rng(seed)
+    problem = Problem((3,), 1, gamma=0.9, max_value=2.0)
+    for k, change in enumerate(changes):
+        for transition in walk(seed + k, n, 1):
+            problem.update(transition)
+        lowest, highest = {"lower": (-6.0, 0.0), "raise": (-2.0, 3.0), "none": (np.inf, np.inf)}[change]
+        upper = None if change == "none" else rng.uniform(lowest, highest, problem.model.grid.n_points)
+        problem.planner.set_upper(upper)
+        problem.plan()
+        np.testing.assert_allclose(problem.planner.values, values_of_rows(problem, upper=np.inf if upper is None else upper))
+        optimistic = problem.model.mdp.arrays.n_optimistic > 0
+        np.testing.assert_array_equal(problem.planner.values[optimistic], problem.planner.upper[optimistic])
+        assert problem.planner.upper.max() <= 2.0
+
+
+def test_the_same_bounds_again_leave_the_queue_alone():
+    problem = Problem((3,), 1, gamma=0.9, max_value=2.0)
+    for transition in walk(0, 60, 1):
+        problem.update(transition)
+    bounds = np.linspace(-3.0, 1.0, problem.model.grid.n_points)
+    problem.planner.set_upper(bounds)
+    assert problem.planner.n_queued > 0
+    problem.plan()
+    problem.planner.set_upper(bounds.copy())
+    assert problem.planner.n_queued == 0
+
+
+@pytest.mark.parametrize("upper", [np.zeros(3), np.zeros((11, 1)), 0.0, np.full(11, np.nan), np.full(11, np.inf)])
+def test_bounds_that_are_not_one_number_a_point_are_refused(upper):
+    problem = Problem((3,), 1, gamma=0.9, max_value=2.0)
+    assert problem.model.grid.n_points == 11
+    with pytest.raises(ValueError, match=r"value_bound\(\) must return None or a finite number for each of the 11 states"):
+        problem.planner.set_upper(upper)
 
 
 def neighbours_of(point, grid):

@@ -1,4 +1,4 @@
-"""What a source as a prior claims to know: how far it is trusted, by what it explains, and which of its ends and rewards count."""
+"""What a source as a prior claims to know: how far it is trusted, and which of its ends and rewards count."""
 
 import numpy as np
 import pytest

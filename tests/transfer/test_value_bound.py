@@ -1,0 +1,162 @@
+"""An upper bound on the values of the target, from the source's: against optimal returns that can be counted."""
+
+import numpy as np
+import pytest
+from helpers import factored as f
+from helpers.factored import bound, show
+
+from sb3_combrel import TIMBREL, SourceInstances
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.copies import Copies
+from sb3_combrel.transfer.prior_choice import Choice
+from sb3_combrel.transfer.value_bound import ValueBound
+
+# A line from 0 to 1: one action goes up, the other down; an episode ends above GOAL.
+STEP, GOAL = 0.05, 0.9
+POINTS = np.linspace(0.0, 1.0, 21)
+
+
+def line_source(low=0.0, high=1.0, reward=-1.0, goal=GOAL, n=400, seed=0):
+    """Transitions from states between ``low`` and ``high``."""
+    rng = np.random.default_rng(seed)
+    states, actions = low + (high - low) * rng.random((n, 1)), rng.integers(2, size=n)
+    after = np.clip(states + np.where(actions == 1, STEP, -STEP)[:, None], 0.0, 1.0)
+    rewards = reward + np.zeros(n)
+    return SourceInstances(states, actions, rewards, after, after[:, 0] > goal, [0.0], [1.0], 2, ("x",), ("down", "up"))
+
+
+def task(n_variables, gamma=1.0, max_value=0.0):
+    """A target whose sample of states is a line along each variable, or along all at once."""
+    states = [np.repeat(POINTS[:, None], n_variables, axis=1)]
+    for v in range(n_variables):
+        states.append(np.full((len(POINTS), n_variables), 0.5))
+        states[-1][:, v] = POINTS
+    scaling = StateScaling(np.zeros(n_variables), np.ones(n_variables))
+    names = tuple(f"s{k}" for k in range(n_variables))
+    return TargetTask(scaling, 2, np.vstack(states), 1.0, 0.01, 0.1, names, ("a", "b"), gamma=gamma, max_value=max_value)
+
+
+def value_bound(sources, target, state, sign=None, source=None):
+    state = np.array(state)
+    sign = np.ones_like(state) if sign is None else np.array(sign)
+    source = np.zeros(len(state), dtype=np.int64) if source is None else np.array(source)
+    return ValueBound(Copies(sources, source, state, sign, 0.1, 1.0), target, min_weight=0.1)
+
+
+def all_of(*copies, n_actions=2):
+    """Each target action moves the same copies."""
+    return Choice(
+        np.tile(np.array(copies, dtype=np.int64), (n_actions, 1)), np.zeros((n_actions, len(copies)), dtype=np.int64)
+    )
+
+
+def best_return(x, gamma=1.0, reward=-1.0, goal=GOAL):
+    """Counted: so many steps up to the goal."""
+    steps = np.maximum(1, np.ceil((goal - x) / STEP + 1e-9))
+    return reward * (steps if gamma == 1.0 else (1.0 - gamma**steps) / (1.0 - gamma))
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.95])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_it_is_the_return_that_is_best_in_the_source(gamma, sign):
+    target = task(2, gamma)
+    found = value_bound([line_source()], target, [[-1, 0]], [[1, sign]]).through(all_of(0))
+    x = target.sample_states[:, 1]
+    expected = best_return(x if sign > 0 else 1.0 - x, gamma)
+    # Where a step is rounded up, and the border of where episodes end is blurred, by a step.
+    np.testing.assert_allclose(found, expected, atol=1.6)
+    assert np.corrcoef(found, expected)[0, 1] > 0.99
+
+
+def test_where_the_source_has_no_data_everything_may_be_beyond():
+    found = value_bound([line_source(high=0.5)], task(1, max_value=3.0), [[0]]).through(all_of(0))[: len(POINTS)]
+    assert (found[POINTS > 0.65] == 3.0).all(), "nothing is known there"
+    # Up to the border of what is known, and 3 beyond it.
+    border = 0.5 + STEP
+    low = POINTS < 0.4
+    assert (found[low] >= 3.0 + best_return(POINTS[low], goal=border + 0.1) - 1.6).all()
+    assert (found[low] <= 3.0 + best_return(POINTS[low], goal=border - 0.1) + 1.6).all()
+
+
+def test_of_several_copies_the_one_that_is_worth_least_bounds_the_target():
+    target = task(2)
+    of_two = value_bound([line_source()], target, [[0, -1], [-1, 0]])
+    found, one, two = (of_two.through(all_of(*copies)) for copies in ((0, 1), (0,), (1,)))
+    np.testing.assert_array_equal(found, np.minimum(one, two))
+    assert (found < one).any() and (found < two).any()
+
+
+def test_of_two_sources_each_bounds_by_its_own_values():
+    target = task(2)
+    sources = [line_source(), line_source(goal=0.6)]
+    of_two = value_bound(sources, target, [[0, -1], [-1, 0]], source=[0, 1])
+    found = of_two.through(all_of(1))
+    np.testing.assert_allclose(found, best_return(target.sample_states[:, 1], goal=0.6), atol=1.6)
+    np.testing.assert_array_equal(of_two.through(all_of(0, 1)), np.minimum(of_two.through(all_of(0)), found))
+
+
+@pytest.mark.parametrize("rewards", [(-1.0, -2.0), (1.0, 1.0), (np.linspace(-1.0, -2.0, 400), -1.0)])
+def test_nothing_bounds_several_copies_whose_steps_do_not_cost_the_same(rewards):
+    sources = [line_source(reward=reward) for reward in rewards]
+    of_two = value_bound(sources, task(2, gamma=0.9, max_value=20.0), [[0, -1], [-1, 0]], source=[0, 1])
+    assert of_two.through(all_of(0, 1)) is None
+    assert of_two.through(all_of(0)) is not None and of_two.through(all_of(1)) is not None
+
+
+def test_nothing_bounds_a_target_whose_actions_are_those_of_different_copies():
+    of_two = value_bound([line_source()], task(2), [[0, -1], [-1, 0]])
+    assert of_two.through(Choice(np.array([[0], [1]]), np.zeros((2, 1), dtype=np.int64))) is None
+    assert of_two.through(all_of(-1)) is None
+
+
+def test_a_copy_that_leaves_out_variables_of_its_source_bounds_nothing():
+    source, states = f.oscillator_source(), np.array([[0, 1, -1, -1], [-1, -1, 0, -1]])
+    target = TargetTask(
+        StateScaling(np.zeros(4), np.ones(4)),
+        5,
+        np.random.default_rng(0).random((50, 4)),
+        1.0,
+        0.01,
+        0.1,
+        tuple("abcd"),
+        tuple("vwxyz"),
+    )
+    parts = value_bound([source], target, states)
+    assert parts.through(all_of(1, n_actions=5)) is None
+    np.testing.assert_array_equal(parts.through(all_of(0, 1, n_actions=5)), parts.through(all_of(0, n_actions=5)))
+
+
+TWO = f.copies_mapping(2, (0, 2, 1, 3))
+
+
+def prior_of(transfer, n, **outcomes):
+    transfer = bound(transfer)
+    show(transfer, f.walk(TWO, n), **outcomes)
+    return transfer.source_prior
+
+
+def test_the_source_bounds_values_once_it_explains_all_actions():
+    transfer = bound(TIMBREL(f.oscillator_source(), TWO, use="prior"))
+    assert transfer.value_bound() is None, "nothing is explained yet"
+    states, actions, effects = f.walk(TWO, 150)
+    versions = []
+    for i in range(150):
+        transfer.observe(states[i], int(actions[i]), -1.0, states[i] + effects[i], False)
+        trusted = bool(transfer.source_prior.claims.trust.all())
+        assert (transfer.value_bound() is not None) == trusted
+        versions.append((trusted, transfer.prior_version()))
+    first = [trusted for trusted, _ in versions].index(True)
+    assert 15 <= first < 150 and versions[first][1] > versions[first - 1][1], "it is asked for again then"
+    assert transfer.statistics()["transfer/values_bounded"] == 1.0
+    assert transfer.report().bounds_values and "bounded by the source's value" in str(transfer.report())
+
+
+def test_a_source_whose_ends_are_not_used_or_whose_rewards_are_doubted_bounds_nothing():
+    source = f.oscillator_source()
+    assert prior_of(TIMBREL(source, TWO, use="prior"), 150).value_bound() is not None
+    without_ends = prior_of(TIMBREL(source, TWO, use="prior", transfer_terminals=False), 150)
+    assert without_ends.claims.trust.all() and without_ends.value_bound() is None
+    doubted = prior_of(TIMBREL(source, TWO, use="prior"), 150, rewards=np.ones(150))
+    assert doubted.claims.trust.all() and doubted.value_bound() is None
+    assert doubted.statistics()["transfer/values_bounded"] == 0.0
