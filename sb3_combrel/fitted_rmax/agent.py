@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.task import Task
-from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory, small_cell
+from sb3_combrel.fitted_rmax.loop_detection import (
+    EXPLOIT,
+    EXPLORE,
+    OPTIMISTIC,
+    ORDER,
+    ORDER_WITH_BOUNDS,
+    EpisodeMemory,
+    small_cell,
+)
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
@@ -154,7 +162,8 @@ class FittedRMaxAgent:
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
             first. Otherwise the best action of those that are known; where none is, of those that are modelled with
-            transferred instances: an evaluation must not depend on trying things out.
+            transferred instances: an evaluation must not depend on trying things out. Where a source bounds the values, the
+            best of all actions, the first of several: what is unknown is then worth no more than the source allows.
         :param episode: in learning, a number that tells the episodes of all environments apart
         :param memory: in evaluation, what is stored of the episode so far; where it is caught in a loop, other actions
             are tried
@@ -208,7 +217,8 @@ class FittedRMaxAgent:
             self._outdated.append(self.model.accept(pairs))
 
     def _exploit(self, state: np.ndarray, memory: EpisodeMemory | None) -> int:
-        mode = EXPLOIT if memory is None else memory.mode
+        order = ORDER_WITH_BOUNDS if self.planner.is_bounded else ORDER
+        mode = order[0 if memory is None else memory.attempt]
         prediction = self._evaluate(state, self.planner.exploitation_values() if mode == EXPLOIT else None)
         q = self._q.q
         eligible = prediction.weight >= self.model.exploration_threshold

@@ -6,7 +6,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory
+from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, ORDER, EpisodeMemory
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.planning.corrections import MAX_VISITS
 
@@ -15,9 +15,9 @@ def modes(steps, gamma):
     """How actions are chosen at each of some (cell, value, reward), and after the last."""
     memory, seen = EpisodeMemory(), []
     for cell, value, reward in steps:
-        seen.append(memory.mode)
+        seen.append(ORDER[memory.attempt])
         memory.note(cell, value, reward, gamma)
-    return [*seen, memory.mode]
+    return [*seen, ORDER[memory.attempt]]
 
 
 @given(st.floats(0.8, 1.0), st.floats(0.01, 100.0), st.integers(1, 7), st.booleans())

@@ -103,3 +103,20 @@ def test_a_model_is_saved_with_the_bounds_of_its_source_and_acts_the_same(made, 
     for one, other in zip(model.predict(states), loaded.predict(states), strict=True):
         if one is not None:
             np.testing.assert_array_equal(one, other)
+
+
+def same_as_in_learning(model):
+    """In which part of the states the frozen policy chooses the action that the agent would choose to learn."""
+    space = model.observation_space
+    states = np.random.default_rng(0).uniform(space.low, space.high, (300, len(space.low))).astype(np.float32)
+    frozen, _ = model.predict(states, deterministic=True)
+    scaling = model.policy.scaling
+    learning = [int(model.agent.q_values(scaling.to_unit(state.astype(np.float64))).argmax()) for state in states]
+    return float((frozen == learning).mean())
+
+
+def test_a_frozen_policy_acts_on_bounded_values_as_in_learning_and_without_bounds_on_what_is_known():
+    bounded = FittedRMax(car(), degree=1, transfer=Bounded(), seed=0).learn(300)
+    unbounded = FittedRMax(car(), degree=1, transfer=Bounded(n_steps=1000), seed=0).learn(300)
+    assert same_as_in_learning(bounded) == 1.0
+    assert same_as_in_learning(unbounded) < 0.9
