@@ -60,8 +60,8 @@ class COMBREL(MappingTransfer):
     target's own instances are fitted to what it leaves over. Compliance is then that of the source's predictions with the
     target's transitions, and one mapping is chosen for all states, or with sets that are not factored one for each target
     action: after 10 transitions, and again whenever there are 1.4 times as many. What the prior claims to know without the
-    target's own instances is said in :class:`~sb3_combrel.transfer.claims.Claims`. It needs
-    ``FittedRMax(degree=1)``.
+    target's own instances is said in :class:`~sb3_combrel.transfer.claims.Claims`, and how the source's values bound those of
+    what is unknown in :class:`~sb3_combrel.transfer.value_bound.ValueBound`. It needs ``FittedRMax(degree=1)``.
 
     ::
 
