@@ -269,7 +269,8 @@ class Planner:
         self.bounds = (float(min_value), float(max_value))
         #: Upper bound of the value of each grid point, and its value while an action is optimistic.
         self.upper = np.full(mdp.grid.n_points, float(max_value))
-        self._is_bounded = False
+        #: Whether the values of some grid points are bounded by less than ``max_value``.
+        self.is_bounded = False
         self.values = self.upper.copy()
         self._set_queue(SweepQueue.empty(self.values, mdp.n_actions, self.upper))
         self._exploitation: np.ndarray | None = None
@@ -314,11 +315,6 @@ class Planner:
             self._exploitation = values
         return self._exploitation
 
-    @property
-    def is_bounded(self) -> bool:
-        """Whether the values of some grid points are bounded by less than ``max_value``."""
-        return self._is_bounded
-
     def set_upper(self, upper: np.ndarray | None) -> None:
         """
         Bound the values of grid points, and so what is optimistic, by less than ``max_value``; every point is queued.
@@ -335,7 +331,7 @@ class Planner:
         if np.array_equal(bounded, self.upper):
             return
         self.upper[:] = bounded
-        self._is_bounded = bool((bounded < self.bounds[1]).any())
+        self.is_bounded = bool((bounded < self.bounds[1]).any())
         self.restore(np.where(self.mdp.arrays.n_optimistic > 0, bounded, self.values))
 
     def restore(self, values: np.ndarray) -> None:
