@@ -10,14 +10,14 @@ from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.tensorboard.explain import explain
-from sb3_combrel.transfer.combrel import COMBREL
-from sb3_combrel.transfer.experts import MappingExperts
-from sb3_combrel.transfer.master import MASTER
-from sb3_combrel.transfer.sample_transfer import SampleTransfer
-from sb3_combrel.transfer.soft_homomorphism import SoftHomomorphism
-from sb3_combrel.transfer.sparse_coding import SparseCodingMapping
-from sb3_combrel.transfer.three_way_rbm import ThreeWayRBM
-from sb3_combrel.transfer.timbrel import TIMBREL
+from sb3_combrel.transfer.methods.combrel import COMBREL
+from sb3_combrel.transfer.methods.experts import MappingExperts
+from sb3_combrel.transfer.methods.master import MASTER
+from sb3_combrel.transfer.methods.sample_transfer import SampleTransfer
+from sb3_combrel.transfer.methods.soft_homomorphism import SoftHomomorphism
+from sb3_combrel.transfer.methods.sparse_coding import SparseCodingMapping
+from sb3_combrel.transfer.methods.three_way_rbm import ThreeWayRBM
+from sb3_combrel.transfer.methods.timbrel import TIMBREL
 
 if TYPE_CHECKING:
     from sb3_combrel.experiments.compare import compare

@@ -74,9 +74,13 @@ def test_the_newest_numba_allowed_is_the_pinned_one():
     assert as_numbers(PINS["numba"])[:2] == (above[0], above[1] - 1)
 
 
-def test_every_layer_of_the_import_contracts_exists_and_every_package_is_a_layer():
-    [layers] = [contract for contract in PROJECT["tool"]["importlinter"]["contracts"] if contract["type"] == "layers"]
-    on_disk = {
-        path.stem for path in (ROOT / "sb3_combrel").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
-    }
-    assert set(layers["layers"]) | set(layers["exhaustive_ignores"]) == on_disk - {"__init__"}
+LAYERS = [contract for contract in PROJECT["tool"]["importlinter"]["contracts"] if contract["type"] == "layers"]
+
+
+@pytest.mark.parametrize("contract", LAYERS, ids=lambda contract: contract["containers"][0])
+def test_every_layer_of_the_import_contracts_exists_and_every_module_is_in_one(contract):
+    [container] = contract["containers"]
+    folder = ROOT / container.replace(".", "/")
+    on_disk = {path.stem for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    named = [name.strip() for layer in contract["layers"] for name in re.split("[|:]", layer)]
+    assert sorted(named + contract.get("exhaustive_ignores", [])) == sorted(on_disk - {"__init__"})

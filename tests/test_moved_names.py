@@ -21,6 +21,8 @@ from sb3_combrel.fitted_rmax.policies import MOVED_TO_AGENT
         ("transfer.source", "SourceInstances", "sources.source_instances"),
         ("transfer.inter_task_mapping", "InterTaskMapping", "mappings.inter_task_mapping"),
         ("transfer.mapping_set", "MappingSet", "mappings.mapping_set"),
+        ("transfer.combrel", "COMBREL", "transfer.methods.combrel"),
+        ("transfer.timbrel", "TIMBREL", "transfer.methods.timbrel"),
         *[
             ("transfer.mappings", name, "mappings")
             for name in (

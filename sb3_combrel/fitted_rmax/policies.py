@@ -24,7 +24,7 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
-from sb3_combrel.transfer.instance_transfer import ALL_USED
+from sb3_combrel.transfer.instances.instance_transfer import ALL_USED
 
 # What was the policy's in version 0.1.0, and where it is in the agent; the old names work for one version.
 MOVED_TO_AGENT = {

@@ -23,7 +23,7 @@ from sb3_combrel.tensorboard.hyperparameters import METRICS, USUALLY_DIFFER, all
 from sb3_combrel.tensorboard.layout import LAYOUT
 from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.tensorboard.plane import Plane, VariablePair
-from sb3_combrel.transfer.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 if TYPE_CHECKING:
     # TensorBoard's writer and matplotlib take a second to import: only where there is a log.

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.tensorboard.plane import Plane, VariablePair, numbered, plane_through
-from sb3_combrel.transfer.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.report import TransferReport
 
 #: Larger than in TensorBoard's cards.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 
-from sb3_combrel.transfer.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 ROWS = 9
 """As many as in the paper; the others are summed."""

@@ -21,7 +21,7 @@ from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.plane import Plane
 from sb3_combrel.tensorboard.readings import action_values
-from sb3_combrel.transfer.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 #: Okabe and Ito's colours, which the colour-blind can distinguish too; they are repeated where there are more actions.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#555555")

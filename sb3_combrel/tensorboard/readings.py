@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.combrel import COMBREL
+from sb3_combrel.transfer.methods.combrel import COMBREL
 
 MAX_POINTS = 500
 """Grid points from which a figure is computed, at most: enough for a curve, and cheap on any grid."""

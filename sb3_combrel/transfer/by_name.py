@@ -85,7 +85,7 @@ def restore_transfer(transfer: Any) -> Any:
     """
     if not isinstance(transfer, dict) or transfer.get(KIND) != SAVED:
         return transfer
-    name, arguments = transfer.get("method"), transfer.get("arguments")
+    name, arguments = _public(str(transfer.get("method"))), transfer.get("arguments")
     found = [method for method in _subclasses(Transfer) if _name(method) == name]
     if not found or arguments is None:
         missing = "is not defined here: import it first, or" if not found else "could not be saved with it:"
@@ -101,7 +101,13 @@ def restore_transfer(transfer: Any) -> Any:
 
 
 def _name(method: type) -> str:
-    return f"{method.__module__}.{method.__qualname__}"
+    return _public(f"{method.__module__}.{method.__qualname__}")
+
+
+def _public(name: str) -> str:
+    """The public name of a method of this package, which stays when modules move: files have had that of the module."""
+    package, _, method = name.rpartition(".")
+    return f"sb3_combrel.{method}" if package.startswith("sb3_combrel.transfer.") else name
 
 
 def _subclasses(method: Any) -> list[type[Transfer]]:

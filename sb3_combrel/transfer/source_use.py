@@ -35,9 +35,9 @@ class SourceUse(ABC):
     """
     What a transfer method that maps a source does with it in a target task, as ``use`` says.
 
-    :class:`~sb3_combrel.transfer.instance_transfer.InstanceTransfer` or
-    :class:`~sb3_combrel.transfer.source_prior.SourcePrior`. Methods that :class:`~sb3_combrel.transfer.base.Transfer` has too
-    mean the same here; unless a class says otherwise no instances are transferred, and there is no prior.
+    :class:`~sb3_combrel.transfer.instances.instance_transfer.InstanceTransfer` or
+    :class:`~sb3_combrel.transfer.prior.source_prior.SourcePrior`. Methods that :class:`~sb3_combrel.transfer.base.Transfer`
+    has too mean the same here; unless a class says otherwise no instances are transferred, and there is no prior.
     """
 
     task: TargetTask

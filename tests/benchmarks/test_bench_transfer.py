@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sb3_combrel import MappingSet, SourceInstances
-from sb3_combrel.transfer.bandwidths import default_bandwidths
+from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
-from sb3_combrel.transfer.compliance import ComplianceScratch, compliance_table
+from sb3_combrel.transfer.instances.compliance import ComplianceScratch, compliance_table
 
 N_TRANSITIONS = 3000
 SETS = {"injective (12 x 243)": (MappingSet.injective, 12), "all (50 x 243)": (MappingSet.all, 50)}

@@ -7,8 +7,8 @@ from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.mappings.state_mappings import copies_of_source
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.copies import Copies
-from sb3_combrel.transfer.copy_sums import CopySums
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.copy_sums import CopySums
 
 # x' = x + SLOPES x + PUSH[u], unit coordinates: an oscillator that is left alone, pushed down or pushed up.
 SLOPES = np.array([[0.0, 0.15], [-0.12, -0.03]])

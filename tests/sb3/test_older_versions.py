@@ -14,7 +14,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.models.kernel_average import KernelAverage
-from sb3_combrel.transfer.instances_check import InstancesCheck
+from sb3_combrel.transfer.instances.instances_check import InstancesCheck
 
 DATA = Path(__file__).parents[1] / "data"
 # Of these predictions no trace is left any more, so that the counts are lower.

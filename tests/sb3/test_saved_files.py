@@ -13,7 +13,7 @@ from helpers.walk import METHODS, Walk, same_parameters, small
 from stable_baselines3 import DQN
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
-from sb3_combrel import FittedRMax
+from sb3_combrel import COMBREL, FittedRMax
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
@@ -73,6 +73,17 @@ def test_the_name_of_a_transfer_method_imports_nothing(tmp_path):
         rewrite(tmp_path / "model.zip", data=json.dumps(data))
         with pytest.raises(ValueError, match=r"transfer method .* is not defined here: import it first"):
             FittedRMax.load(tmp_path / "model")
+
+
+@pytest.mark.parametrize("name", ["sb3_combrel.transfer.combrel.COMBREL", "sb3_combrel.transfer.methods.combrel.COMBREL"])
+def test_a_file_with_the_name_of_a_method_s_module_is_read(name, tmp_path):
+    """As they were written before: modules move."""
+    small(transfer=METHODS["COMBREL"]()).learn(10).save(tmp_path / "model")
+    data = data_of(tmp_path / "model.zip")
+    assert data["transfer"]["method"] == "sb3_combrel.COMBREL"
+    data["transfer"]["method"] = name
+    rewrite(tmp_path / "model.zip", data=json.dumps(data))
+    assert isinstance(FittedRMax.load(tmp_path / "model").transfer, COMBREL)
 
 
 @pytest.mark.parametrize(
@@ -267,6 +278,6 @@ def test_the_policys_own_file_contains_no_class_of_the_package(tmp_path):
     model.policy.save(tmp_path / "policy.pth")
     with zipfile.ZipFile(tmp_path / "policy.pth") as archive:
         pickled = b"".join(archive.read(name) for name in archive.namelist() if name.endswith("data.pkl"))
-    assert b"sb3_combrel.transfer.combrel.COMBREL" in pickled, "its name, as text"
+    assert b"sb3_combrel.COMBREL" in pickled, "its name, as text"
     assert b"csb3_combrel" not in pickled, "no class to be imported"
     assert len(FittedRMaxPolicy.load(tmp_path / "policy.pth").transfer.sources[0]) == 60

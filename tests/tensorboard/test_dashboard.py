@@ -30,7 +30,7 @@ def test_without_a_log_nothing_is_computed_for_one(transfers, monkeypatch):
 
     monkeypatch.setattr("sb3_combrel.fitted_rmax.agent.FittedRMaxAgent.statistics", refuse)
     monkeypatch.setattr("sb3_combrel.tensorboard.callback.DashboardCallback._on_training_start", refuse)
-    monkeypatch.setattr("sb3_combrel.transfer.combrel.COMBREL.choices", refuse)
+    monkeypatch.setattr("sb3_combrel.transfer.methods.combrel.COMBREL.choices", refuse)
     model = walker(transfer=transfers["COMBREL"]).learn(200)
     assert model._episode_num > 4 and model.agent.planning_seconds == 0.0
     monkeypatch.undo()

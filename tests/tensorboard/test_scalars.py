@@ -12,7 +12,7 @@ import combrel_envs  # noqa: F401 - registers the environments
 from sb3_combrel import FittedRMax
 from sb3_combrel.tensorboard.callback import DashboardCallback
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
-from sb3_combrel.transfer.bandwidths import default_bandwidths
+from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -7,7 +7,7 @@ from helpers.factored import bound, inside, show
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping
 from sb3_combrel.transfer.borne_out import GOES_ON
-from sb3_combrel.transfer.claims import PRESUMED, part_explained, trust_in
+from sb3_combrel.transfer.prior.claims import PRESUMED, part_explained, trust_in
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
 

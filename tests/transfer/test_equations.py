@@ -11,9 +11,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
-from sb3_combrel.transfer import compliance as compiled_compliance
+from sb3_combrel.transfer.instances import compliance as compiled_compliance
 from sb3_combrel.transfer import equations
-from sb3_combrel.transfer import relevance as compiled_relevance
+from sb3_combrel.transfer.instances import relevance as compiled_relevance
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
 

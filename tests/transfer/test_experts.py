@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, MappingSet, SourceInstances
 from sb3_combrel.tensorboard.callback import DashboardCallback
-from sb3_combrel.transfer.experts import best_by_ucb1
+from sb3_combrel.transfer.methods.experts import best_by_ucb1
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
 SAME = InterTaskMapping([0, 1], [0, 1])

@@ -9,7 +9,7 @@ from helpers.asking import bound, transferred_at
 
 from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.transfer.instances_check import EPISODES_IN_VAIN, MIN_TRANSITIONS, WINDOW, InstancesCheck
+from sb3_combrel.transfer.instances.instances_check import EPISODES_IN_VAIN, MIN_TRANSITIONS, WINDOW, InstancesCheck
 
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
 STEP = np.array([[0.05, 0.0], [0.0, -0.05]])

@@ -20,8 +20,8 @@ from sb3_combrel import (
     SparseCodingMapping,
     ThreeWayRBM,
 )
-from sb3_combrel.transfer.learned_translation import LearnedTranslation, Standard, Triplets
-from sb3_combrel.transfer.sparse_coding import Regression, nearest_pairs, sparse_codes
+from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.methods.sparse_coding import Regression, nearest_pairs, sparse_codes
 
 METHODS = [SparseCodingMapping, ThreeWayRBM]
 QUICK = {SparseCodingMapping: {"n_atoms": 8}, ThreeWayRBM: {"n_updates": 50, "n_hidden": 4, "n_factors": 4}}

@@ -27,7 +27,7 @@ def check(transfer, kind, arguments):
 @pytest.mark.parametrize("name", METHODS)
 def test_a_dict_names_the_class_with_its_package_its_module_or_alone(name, path):
     module, arguments, _ = METHODS[name]
-    for written in (name, f"sb3_combrel.{name}", f"sb3_combrel.transfer.{module}.{name}"):
+    for written in (name, f"sb3_combrel.{name}", f"sb3_combrel.transfer.methods.{module}.{name}"):
         model = small(transfer={written: {"source": path, **arguments}})
         check(model.policy.transfer, getattr(sb3_combrel, name), arguments)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL
 from sb3_combrel.transfer import equations
-from sb3_combrel.transfer.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
+from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
 
 N_DRAWS = 4000
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)

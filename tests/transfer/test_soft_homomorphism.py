@@ -9,8 +9,8 @@ from helpers.ring import Ring
 from helpers.walk import Walk, same_parameters, small, walk_source
 
 from sb3_combrel import FittedRMax, SoftHomomorphism, SourceInstances
-from sb3_combrel.transfer.soft_homomorphism import MAX_MAPPINGS
-from sb3_combrel.transfer.soft_mapping import count_mappings
+from sb3_combrel.transfer.methods.soft_homomorphism import MAX_MAPPINGS
+from sb3_combrel.transfer.methods.soft_mapping import count_mappings
 
 SWAPPED = f.copies_mapping(1, (1, 0))
 

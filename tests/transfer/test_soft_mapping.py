@@ -7,9 +7,9 @@ import pytest
 import torch as th
 from helpers import factored as f
 
-from sb3_combrel.transfer import soft_mapping as soft
+from sb3_combrel.transfer.methods import soft_mapping as soft
 from sb3_combrel.transfer.candidates import stacked_instances
-from sb3_combrel.transfer.soft_predictions import MixturePredictions
+from sb3_combrel.transfer.methods.soft_predictions import MixturePredictions
 from sb3_combrel.transfer.source_model import SourceModel
 
 SIZES = [(1, 1, True), (2, 2, False), (2, 2, True), (2, 4, True), (3, 2, True), (3, 1, False)]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping
-from sb3_combrel.transfer.claims import MIN_TRANSITIONS
+from sb3_combrel.transfer.prior.claims import MIN_TRANSITIONS
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
 ALONG_FIRST = InterTaskMapping([0, None, 1, None], [0, 1, 2, 0, 0])

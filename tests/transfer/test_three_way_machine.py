@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_combrel.transfer import three_way_machine as machines
+from sb3_combrel.transfer.methods import three_way_machine as machines
 
 SIZES = 3, 4, 2
 N_FACTORS = 5

@@ -13,7 +13,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
-from sb3_combrel.transfer.translation import (
+from sb3_combrel.transfer.instances.translation import (
     CandidateMappings,
     SourceArrays,
     TranslationArrays,

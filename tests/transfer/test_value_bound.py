@@ -8,9 +8,9 @@ from helpers.factored import bound, show
 from sb3_combrel import TIMBREL, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.copies import Copies
-from sb3_combrel.transfer.prior_choice import Choice
-from sb3_combrel.transfer.value_bound import ValueBound
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.prior_choice import Choice
+from sb3_combrel.transfer.prior.value_bound import ValueBound
 
 # A line from 0 to 1: one action goes up, the other down; an episode ends above GOAL.
 STEP, GOAL = 0.05, 0.9

@@ -12,9 +12,9 @@ from sb3_combrel import COMBREL, FactoredMapping, FittedRMax, InterTaskMapping, 
 from sb3_combrel.experiments.benchmark.methods import Sources
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.runs import chosen_on_purpose
-from sb3_combrel.transfer.mapping_transfer import MappingTransfer
-from sb3_combrel.transfer.prior_choice import best_division
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.prior.prior_choice import best_division
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
 class Errors(NamedTuple):

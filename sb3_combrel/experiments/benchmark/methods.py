@@ -23,8 +23,8 @@ from sb3_combrel.experiments.benchmark.oracle import KnownCopies
 from sb3_combrel.experiments.benchmark.pair import Pair, check_name
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.learned_translation import DEFAULT_SAMPLE_STEPS
-from sb3_combrel.transfer.master import DEFAULT_RANDOM_STEPS
+from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS
+from sb3_combrel.transfer.methods.master import DEFAULT_RANDOM_STEPS
 
 #: Instances of a pair's source, or a list of those of several.
 Sources = SourceInstances | list[SourceInstances]

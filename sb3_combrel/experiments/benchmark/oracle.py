@@ -10,9 +10,9 @@ import numpy as np
 from sb3_combrel import TIMBREL, FactoredMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import SourceLike, load_sources
-from sb3_combrel.transfer.copies import Copies
-from sb3_combrel.transfer.prior_choice import Choice
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.prior_choice import Choice
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
 class KnownCopies(TIMBREL):

@@ -19,7 +19,7 @@ from sb3_combrel.experiments.benchmark.renamed import disguise, disguised, mirro
 from sb3_combrel.experiments.benchmark.runs import BenchmarkJob, carry_out, has_mapping, known_share
 from sb3_combrel.experiments.runs import chosen_on_purpose
 from sb3_combrel.transfer.candidates import MappedVariables
-from sb3_combrel.transfer.experts import Playing
+from sb3_combrel.transfer.methods.experts import Playing
 
 
 def random_instances(task, n=300, seed=0, **options):

@@ -8,22 +8,22 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
-from sb3_combrel.transfer.bandwidths import CandidateBandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
-from sb3_combrel.transfer.compliance import DEFAULT_MIN_EVIDENCE
-from sb3_combrel.transfer.compliance_selector import ComplianceSelector, SelectionOptions
-from sb3_combrel.transfer.mapping_transfer import (
+from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
+from sb3_combrel.transfer.instances.compliance_selector import ComplianceSelector, SelectionOptions
+from sb3_combrel.transfer.methods.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_BREADTH_DECAY,
     RENAMED_ARGUMENTS,
     MappingTransfer,
 )
-from sb3_combrel.transfer.prior_sets import is_factored, make_prior
+from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
-from sb3_combrel.transfer.selectors import SelectorParts
+from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 #: Arguments of COMBREL that have a meaning for transferred instances only.
 _OF_INSTANCES = (
@@ -60,8 +60,8 @@ class COMBREL(MappingTransfer):
     target's own instances are fitted to what it leaves over. Compliance is then that of the source's predictions with the
     target's transitions, and one mapping is chosen for all states, or with sets that are not factored one for each target
     action: after 10 transitions, and again whenever there are 1.4 times as many. What the prior claims to know without the
-    target's own instances is said in :class:`~sb3_combrel.transfer.claims.Claims`, and how the source's values bound those of
-    what is unknown in :class:`~sb3_combrel.transfer.value_bound.ValueBound`. It needs ``FittedRMax(degree=1)``.
+    target's own instances is said in :class:`~sb3_combrel.transfer.prior.claims.Claims`, and how the source's values bound
+    those of what is unknown in :class:`~sb3_combrel.transfer.prior.value_bound.ValueBound`. It needs ``FittedRMax(degree=1)``.
 
     ::
 
@@ -111,10 +111,11 @@ class COMBREL(MappingTransfer):
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after new evidence against what
         was transferred (the paper: none, 1): the target's own transitions were predicted worse than by "no change", or ends
         were predicted that never came, or there was nothing left to find out (see
-        :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`). So pairs for which the source is wrong are explored in
-        the end, whatever the source. MountainCar4D with the right source, noise, and five other misleading ones (``degree=0``,
-        breadth 0.1, 12 episodes, 4 seeds) took on average at most as many steps as with a decay at every time limit. Effects
-        alone do not suffice as evidence: with the right dynamics and a wrong goal all episodes then reached the limit.
+        :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`). So pairs for which the source is wrong are
+        explored in the end, whatever the source. MountainCar4D with the right source, noise, and five other misleading ones
+        (``degree=0``, breadth 0.1, 12 episodes, 4 seeds) took on average at most as many steps as with a decay at every time
+        limit. Effects alone do not suffice as evidence: with the right dynamics and a wrong goal all episodes then reached the
+        limit.
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The paper does not
         say. Where this is wrong the target's own transitions correct it; without it no path leads to an end at first.
     :param relevance: True: order the instances by relevance (Eq. 7), not by distance. The paper finds it harmful: it favours

@@ -14,8 +14,8 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source
-from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
-from sb3_combrel.transfer.timbrel import TIMBREL
+from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
+from sb3_combrel.transfer.methods.timbrel import TIMBREL
 
 # With fewer samples there is nothing to learn a mapping from.
 MIN_SAMPLES = 10
@@ -75,14 +75,14 @@ class LearnedTranslation(Transfer):
     The first ``n_random_steps`` transitions of the target are its sample: :meth:`action` asks for random actions until then,
     and nothing is transferred. The sample of the source is drawn from its instances. Then a subclass translates all source
     instances, with their rewards and ends, and nothing is learned any more. Where the target's own instances do not suffice,
-    the nearest translated ones come first, as in :class:`~sb3_combrel.transfer.timbrel.TIMBREL`, which is given them with the
-    identity as its mapping.
+    the nearest translated ones come first, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`, which is given them
+    with the identity as its mapping.
 
     :param source: source instances, or a path to them
     :param n_random_steps: size of the target's sample, in steps of the target
     :param n_source_samples: size of the source's sample, at most
     :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
     :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """

@@ -12,7 +12,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources, resolved_sets
-from sb3_combrel.transfer.prior_sets import is_factored
+from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_policy import SourcePolicy
 

@@ -11,8 +11,8 @@ from sb3_combrel.mappings.factored_mapping import describe_both_sides, describe_
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidate, MappedVariables
-from sb3_combrel.transfer.copies import Copies
-from sb3_combrel.transfer.prior_choice import Choice, moved
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.prior_choice import Choice, moved
 
 # Of a choice, for one target action: the copies that it moves, and the source actions by which it does.
 Moves = Sequence[tuple[int, int]]

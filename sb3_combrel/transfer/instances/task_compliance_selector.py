@@ -8,10 +8,10 @@ from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.compliance import ComplianceScratch, transition_compliance_plain
+from sb3_combrel.transfer.instances.compliance import ComplianceScratch, transition_compliance_plain
 from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-from sb3_combrel.transfer.selectors import PooledSelector
+from sb3_combrel.transfer.instances.selectors import PooledSelector
 
 _transition_compliance = EntryPoint(transition_compliance_plain)
 
@@ -20,7 +20,7 @@ class TaskComplianceSelector(PooledSelector):
     """
     Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
 
-    Parameters: see :class:`~sb3_combrel.transfer.selectors.Selector`, and
+    Parameters: see :class:`~sb3_combrel.transfer.instances.selectors.Selector`, and
 
     :param bandwidths: of compliance
     :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)

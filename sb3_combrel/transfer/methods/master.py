@@ -9,15 +9,15 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
-from sb3_combrel.transfer.bandwidths import CandidateBandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike
-from sb3_combrel.transfer.least_error import LeastErrorSelector, check_action_mappings, choose_least_error
-from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
-from sb3_combrel.transfer.prior_sets import copies_of, is_factored
-from sb3_combrel.transfer.selectors import SelectorParts
+from sb3_combrel.transfer.methods.least_error import LeastErrorSelector, check_action_mappings, choose_least_error
+from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
+from sb3_combrel.transfer.prior.prior_sets import copies_of, is_factored
+from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 DEFAULT_RANDOM_STEPS = 100
 
@@ -57,7 +57,7 @@ class MASTER(MappingTransfer):
     :param n_random_steps: random actions by which is chosen; with several environments all of them act randomly until there
         are so many transitions. A target action that was never drawn has no say
     :param breadth: kernel breadth of transferred instances, in unit coordinates
-    :param breadth_decay: as of :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param breadth_decay: as of :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too
     :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own model, seen
         through the mapping, is the prior of the target's. None: "prior" where the target's model takes one

@@ -9,11 +9,11 @@ import numpy as np
 
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.instances_check import InstancesCheck
+from sb3_combrel.transfer.instances.instances_check import InstancesCheck
 from sb3_combrel.transfer.placed_errors import PlacedErrors
-from sb3_combrel.transfer.selectors import Ranges, Selector
+from sb3_combrel.transfer.instances.selectors import Ranges, Selector
 from sb3_combrel.transfer.source_use import SourceUse
-from sb3_combrel.transfer.translation import Translator
+from sb3_combrel.transfer.instances.translation import Translator
 
 # Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
 RELEVANCE_GROWTH = 1.2
@@ -35,7 +35,7 @@ class InstanceTransfer(SourceUse):
     :param selector: it holds the candidates, the target task and the recorded transitions
     :param translator: of the candidates' instances
     :param breadth_decay: factor on the translator's breadth whenever the target's own transitions have contradicted what was
-        transferred (see :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`)
+        transferred (see :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`)
     :param measure_relevance: used where the translator's instances come in the order of their relevance
     """
 

@@ -6,17 +6,17 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
-from sb3_combrel.transfer.bandwidths import CandidateBandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
-from sb3_combrel.transfer.instance_transfer import RELEVANCE_GROWTH
-from sb3_combrel.transfer.least_error import check_action_mappings
-from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
-from sb3_combrel.transfer.prior_sets import is_factored
-from sb3_combrel.transfer.selectors import SelectorParts
-from sb3_combrel.transfer.source_prior import SourcePrior
-from sb3_combrel.transfer.task_compliance import candidate_compliances, draw_instances, instances_of_each
-from sb3_combrel.transfer.task_compliance_selector import TaskComplianceSelector
+from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
+from sb3_combrel.transfer.methods.least_error import check_action_mappings
+from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
+from sb3_combrel.transfer.prior.prior_sets import is_factored
+from sb3_combrel.transfer.instances.selectors import SelectorParts
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.methods.task_compliance import candidate_compliances, draw_instances, instances_of_each
+from sb3_combrel.transfer.instances.task_compliance_selector import TaskComplianceSelector
 
 # Seeds are saved as float64.
 MAX_SEED = 2**53
@@ -39,7 +39,7 @@ class SampleTransfer(MappingTransfer):
       of all tasks that have these are added up.
     - Instances are drawn for each target action, the same number for all, without replacement.
     - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice: the
-      nearest first, until the threshold is reached, as in :class:`~sb3_combrel.transfer.timbrel.TIMBREL`.
+      nearest first, until the threshold is reached, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
     - The paper draws once, after a batch of transitions of the target. Here instances are drawn after ``min_transitions``, and
       again whenever there are 1.2 times as many, with the same random numbers, so that more of those drawn stay. With
       ``min_transitions`` and ``max_transitions`` equal they are drawn once.
@@ -65,7 +65,7 @@ class SampleTransfer(MappingTransfer):
     :param min_transitions: transitions of the target after which instances are first drawn
     :param max_transitions: transitions that are recorded, at most
     :param breadth: kernel breadth of transferred instances, in unit coordinates
-    :param breadth_decay: as of :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param breadth_decay: as of :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too
     :param relevance: True: instances of a task are drawn in proportion to their relevance, Eq. 7; "near": to a relevance that
         does not favour those far from the target's transitions, ``equations.near_relevances``; False: all alike

@@ -7,15 +7,15 @@ import numpy as np
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
-from sb3_combrel.transfer.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
-from sb3_combrel.transfer.copies import MANY, Copies, Predicted
-from sb3_combrel.transfer.copy_sums import CopySums
+from sb3_combrel.transfer.prior.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
+from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
+from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.placed_errors import PlacedErrors
-from sb3_combrel.transfer.prior_candidates import PriorCandidates
-from sb3_combrel.transfer.prior_choice import Choice, Chooser, moved
+from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
+from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, moved
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.source_use import SourceUse
-from sb3_combrel.transfer.value_bound import ValueBound
+from sb3_combrel.transfer.prior.value_bound import ValueBound
 
 # A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
 SMALLEST_MOVE = 0.005
@@ -27,8 +27,8 @@ class SourcePrior(SourceUse):
     """
     What a source predicts of the target, through a mapping that is given or chosen by compliance.
 
-    What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.claims.Claims`. The weight of
-    the source's data is the least of all copies'. What is explained is said in :meth:`explained`.
+    What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.prior.claims.Claims`. The
+    weight of the source's data is the least of all copies'. What is explained is said in :meth:`explained`.
 
     :param copies: the copies that can be chosen
     :param task: the target task
@@ -159,8 +159,8 @@ class SourcePrior(SourceUse):
         """
         Return an upper bound on the return from each state of the sample, shape (n_points,), or None.
 
-        The source's values, see :class:`~sb3_combrel.transfer.value_bound.ValueBound`, while all of the target's actions are
-        explained, and neither ends nor rewards of the source are doubted.
+        The source's values, see :class:`~sb3_combrel.transfer.prior.value_bound.ValueBound`, while all of the target's actions
+        are explained, and neither ends nor rewards of the source are doubted.
         """
         if self.choice is None or not self.claims.allow_bound():
             return None
@@ -210,7 +210,7 @@ class SourcePrior(SourceUse):
         those of a car that hits the wall, count no more than others. Of a variable in a copy, over the transitions where the
         source has data; of one that stays, over all: how much it moves, in parts of what the action that moves it most does.
 
-        :return: shape (n_target_actions,), see :func:`~sb3_combrel.transfer.claims.part_explained`
+        :return: shape (n_target_actions,), see :func:`~sb3_combrel.transfer.prior.claims.part_explained`
         """
         return part_explained(*self._missed())
 

@@ -19,7 +19,7 @@ from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
 from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.bandwidths import CandidateBandwidths, candidate_bandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import (
     Candidate,
@@ -29,19 +29,19 @@ from sb3_combrel.transfer.candidates import (
     SourceLike,
     load_sources,
 )
-from sb3_combrel.transfer.instance_transfer import InstanceTransfer, MeasureRelevance
-from sb3_combrel.transfer.prior_sets import is_factored
+from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer, MeasureRelevance
+from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-from sb3_combrel.transfer.relevance import renew_near_relevance, renew_relevance
+from sb3_combrel.transfer.instances.relevance import renew_near_relevance, renew_relevance
 from sb3_combrel.transfer.renamed import warn_of_name
 from sb3_combrel.transfer.report import TransferReport
-from sb3_combrel.transfer.report_of_instances import report_of_instances
-from sb3_combrel.transfer.report_of_prior import report_of_prior
-from sb3_combrel.transfer.selectors import Selector, SelectorParts
+from sb3_combrel.transfer.instances.report_of_instances import report_of_instances
+from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
+from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.source_use import SourceUse
-from sb3_combrel.transfer.translation import Translator
+from sb3_combrel.transfer.instances.translation import Translator
 
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8
@@ -62,14 +62,14 @@ class MappingTransfer(Transfer):
     Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
 
     What it does once bound is done by an object, as ``use`` says: an
-    :class:`~sb3_combrel.transfer.instance_transfer.InstanceTransfer`, or a
-    :class:`~sb3_combrel.transfer.source_prior.SourcePrior`.
+    :class:`~sb3_combrel.transfer.instances.instance_transfer.InstanceTransfer`, or a
+    :class:`~sb3_combrel.transfer.prior.source_prior.SourcePrior`.
 
     :param source: instances, a path to them, the id or recipe of a task to learn them from, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
     :param breadth: kernel breadth of transferred instances, in unit coordinates
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after the target's own transitions
-        have contradicted what was transferred (see :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`)
+        have contradicted what was transferred (see :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`)
     :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance; "near": of the
         relevance that does not favour distant instances, times their weight

@@ -10,7 +10,7 @@ from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.models.fit_arrays import Kernel
 from sb3_combrel.models.linear_prediction import NearestLists
-from sb3_combrel.transfer.copy_predictions import CopyTable, Uses, see_state
+from sb3_combrel.transfer.prior.copy_predictions import CopyTable, Uses, see_state
 from sb3_combrel.transfer.source_model import predict_source
 
 # The smallest scale that compliance is measured by, squared unit coordinates: a variable that never moves.

@@ -14,8 +14,8 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
-from sb3_combrel.transfer.copy_predictions import CopyTable, UsePredictions, Uses, join_many_plain, predict_pairs_plain
-from sb3_combrel.transfer.copy_sums import LEAST_EFFECT, CopyScratch, CopySums, follow_plain, measure_plain
+from sb3_combrel.transfer.prior.copy_predictions import CopyTable, UsePredictions, Uses, join_many_plain, predict_pairs_plain
+from sb3_combrel.transfer.prior.copy_sums import LEAST_EFFECT, CopyScratch, CopySums, follow_plain, measure_plain
 from sb3_combrel.transfer.source_model import SourceModel
 
 # From so many pairs on the different states of each copy are predicted once.

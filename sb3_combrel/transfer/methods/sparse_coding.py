@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.transfer.candidates import SourceLike
-from sb3_combrel.transfer.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
-from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
+from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
 
 N_ITERATIONS = 30
 # Noise of the standardised target triplets, as a variance, that the regression starts from.
@@ -128,7 +128,7 @@ class SparseCodingMapping(LearnedTranslation):
     :param n_atoms: atoms of the second dictionary; None: twice the columns of a target triplet
     :param sparsity: weight of the codes' absolute values beside half the squared error
     :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
     :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """

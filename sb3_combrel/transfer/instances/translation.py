@@ -12,7 +12,7 @@ from sb3_combrel.common.kernels import difference, list_room
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.selectors import Ranges
+from sb3_combrel.transfer.instances.selectors import Ranges
 
 # Instances of a state and action by distance, at most; by relevance room is made for as many as it takes.
 MAX_TRANSFERRED = 32

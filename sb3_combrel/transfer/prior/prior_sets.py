@@ -14,8 +14,8 @@ from sb3_combrel.mappings.state_mappings import copies_of_source, with_mirrored
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike, load_sources
-from sb3_combrel.transfer.copies import Copies
-from sb3_combrel.transfer.prior_choice import (
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.prior_choice import (
     MAX_FACTORED_VARIABLES,
     Choice,
     Chooser,
@@ -24,7 +24,7 @@ from sb3_combrel.transfer.prior_choice import (
     draw_factored,
     draw_mapping,
 )
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 FACTORED_SETS = ("factored", "signed_factored")
 # Each copy predicts every transition with each source action.

@@ -8,7 +8,7 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.least_error import action_table
+from sb3_combrel.transfer.methods.least_error import action_table
 
 
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.transfer.copies import Copies
-from sb3_combrel.transfer.copy_sums import CopySums
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.copy_sums import CopySums
 
 # A mean compliance below this counts as this: one that is nothing must not outweigh all others.
 SMALLEST_COMPLIANCE = 1e-9

@@ -13,10 +13,10 @@ from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
-from sb3_combrel.transfer.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
-from sb3_combrel.transfer.copy_sums import LARGEST_MISS, LEAST_EFFECT
+from sb3_combrel.transfer.prior.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
+from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
-from sb3_combrel.transfer.soft_mapping import (
+from sb3_combrel.transfer.methods.soft_mapping import (
     FitData,
     Logits,
     all_readings,
@@ -28,7 +28,7 @@ from sb3_combrel.transfer.soft_mapping import (
     n_readings,
     probabilities,
 )
-from sb3_combrel.transfer.soft_predictions import MixturePredictions, Predicted
+from sb3_combrel.transfer.methods.soft_predictions import MixturePredictions, Predicted
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
 
 # Each mapping predicts every transition that is fitted to with each source action.
@@ -61,7 +61,7 @@ class SoftHomomorphism(Transfer):
     added. Scale and offset are not parameters: in unit coordinates, ranges correspond. As only the mean is fitted, a source
     action can also come out as the mean of others that it equals, such as no push as half a push to either side.
 
-    What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.claims.Claims`:
+    What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.prior.claims.Claims`:
     by the weight of the source's data, and by the part of the target's effects that the mixture explains, of the variable of
     which it explains least; nothing of what it explains less than half, and no end before one has been confirmed. Effects on
     variables of which it explains less than half under an action, of ten or more transitions, are predicted as 0.

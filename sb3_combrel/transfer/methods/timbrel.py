@@ -10,20 +10,20 @@ import numpy as np
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.bandwidths import CandidateBandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
-from sb3_combrel.transfer.mapping_transfer import (
+from sb3_combrel.transfer.methods.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_BREADTH_DECAY,
     RENAMED_ARGUMENTS,
     MappingTransfer,
 )
-from sb3_combrel.transfer.prior_sets import make_prior
+from sb3_combrel.transfer.prior.prior_sets import make_prior
 from sb3_combrel.transfer.renamed import accept_renamed
-from sb3_combrel.transfer.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
+from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
-from sb3_combrel.transfer.source_prior import SourcePrior
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
 class TIMBREL(MappingTransfer):
@@ -36,7 +36,7 @@ class TIMBREL(MappingTransfer):
 
     With ``use="prior"`` the source's own local linear model, seen through the mapping, is the prior of the target's model: the
     target's own instances are fitted to what it leaves over. What it claims to know without them is said in
-    :class:`~sb3_combrel.transfer.claims.Claims`. It needs ``FittedRMax(degree=1)``.
+    :class:`~sb3_combrel.transfer.prior.claims.Claims`. It needs ``FittedRMax(degree=1)``.
 
     ::
 
@@ -60,9 +60,9 @@ class TIMBREL(MappingTransfer):
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after new evidence against what
         was transferred (the paper: none, 1): the target's own transitions were predicted worse than by "no change", or ends
         were predicted that never came, or there was nothing left to find out (see
-        :class:`~sb3_combrel.transfer.instances_check.InstancesCheck`). So pairs for which the source is wrong are explored in
-        the end, whatever the source. A point robot among walls, from two to three dimensions by a mapping made by hand
-        (``degree=0``), with a model breadth of 0.05 reached its goal in 284, 290 and 282 of 300 episodes; with a decay at
+        :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`). So pairs for which the source is wrong are
+        explored in the end, whatever the source. A point robot among walls, from two to three dimensions by a mapping made by
+        hand (``degree=0``), with a model breadth of 0.05 reached its goal in 284, 290 and 282 of 300 episodes; with a decay at
         every time limit in 175, 159 and 159, without any in 284, 288 and 282. With the default model breadth, where episodes
         seldom reach the limit, the three are alike (265 to 291).
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The paper does not

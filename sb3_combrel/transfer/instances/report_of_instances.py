@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from sb3_combrel.transfer.instance_transfer import InstanceTransfer
+from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
 from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 
 _COMPLIANCES = ("compliance", "next_best_compliance", "no_change_compliance")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.transfer.candidates import SourceLike
-from sb3_combrel.transfer.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
-from sb3_combrel.transfer.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
-from sb3_combrel.transfer.three_way_machine import reconstruct, train
+from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
+from sb3_combrel.transfer.methods.three_way_machine import reconstruct, train
 
 
 class ThreeWayRBM(LearnedTranslation):
@@ -44,7 +44,7 @@ class ThreeWayRBM(LearnedTranslation):
     :param n_factors: factors of the tensor of weights
     :param n_updates: batches of 64 that it is trained on
     :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.timbrel.TIMBREL`
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
     :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """

@@ -1,0 +1,1 @@
+"""Source instances that join the target's: translated, selected by compliance, ranked by relevance."""

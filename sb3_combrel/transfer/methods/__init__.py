@@ -1,0 +1,1 @@
+"""The transfer methods, each with its parts that no other has."""
