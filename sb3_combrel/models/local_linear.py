@@ -27,7 +27,10 @@ ON_GRID = 0.5
 # As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, known is decided
 # by a kernel of half the squared breadth: a broad kernel knows soon how states change, and would never find a small goal. To
 # demand more weight instead would send the agent to where it has been first (point robot: in half of the runs no goal).
-EXPLORED, CHECKED_EVERY = 0.9, 50
+# The second and later times nearly all must be known: the agent goes to the nearest of what is not, and each time begins anew
+# near where episodes start. With 0.9 as well it had not been to the last tenth, where the goal is, after 8,000 steps in five
+# of 28 runs of the point robot; now all find it, the last after 3,395.
+EXPLORED, EXPLORED_AGAIN, CHECKED_EVERY = 0.9, 0.99, 50
 # In a damaged file there may be anything.
 MAX_NARROWING = 2.0**20
 
@@ -275,7 +278,8 @@ class LocalLinear(CompiledModel):
 
     def _narrow_known(self) -> np.ndarray:
         """Narrow the kernel that decides what is known while no outcome has told states apart; what is no longer known."""
-        if self._informed or self._n_added % CHECKED_EVERY or self.known.mean() < EXPLORED:
+        explored = EXPLORED if self._narrowing == 1.0 else EXPLORED_AGAIN
+        if self._informed or self._n_added % CHECKED_EVERY or self.known.mean() < explored:
             return NO_PAIRS
         self._set_narrowing(2.0 * self._narrowing)
         self._recount_totals()

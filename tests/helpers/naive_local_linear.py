@@ -18,7 +18,7 @@ RIDGE = 0.001
 EXPLAINED_WEIGHT = 0.5
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 ON_GRID = 0.5
-EXPLORED, CHECKED_EVERY = 0.9, 50
+EXPLORED, EXPLORED_AGAIN, CHECKED_EVERY = 0.9, 0.99, 50
 
 
 class Predicted(NamedTuple):
@@ -277,7 +277,8 @@ class NaiveLocalLinear:
     def narrow_known(self):
         """Every so many transitions: half the squared breadth if nearly all is known, and no outcome has told states apart."""
         checked = len(self.rewards) % CHECKED_EVERY == 0
-        if checked and not self.informed() and self.known.sum() >= EXPLORED * self.known.size:
+        explored = EXPLORED if self.narrowing == 1.0 else EXPLORED_AGAIN
+        if checked and not self.informed() and self.known.sum() >= explored * self.known.size:
             self.decide_by(2.0 * self.narrowing)
             self.known &= self.total >= self.needed_on_grid()
 
