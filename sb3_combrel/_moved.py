@@ -17,12 +17,6 @@ MOVED = {
     "transfer.q_learning": "sources.q_learning",
     "transfer.combrel": "transfer.methods.combrel",
     "transfer.timbrel": "transfer.methods.timbrel",
-    "transfer.master": "transfer.methods.master",
-    "transfer.experts": "transfer.methods.experts",
-    "transfer.sample_transfer": "transfer.methods.sample_transfer",
-    "transfer.soft_homomorphism": "transfer.methods.soft_homomorphism",
-    "transfer.sparse_coding": "transfer.methods.sparse_coding",
-    "transfer.three_way_rbm": "transfer.methods.three_way_rbm",
     "fitted_rmax.grid": "planning.grid",
 }
 """Old names, and where their content is now; both within this package."""
