@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sb3_combrel import MappingSet, SourceInstances
-from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
+from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceScratch, compliance_table
 
 N_TRANSITIONS = 3000

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from sb3_combrel import COMBREL, MappingSet
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer import equations
-from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths, TransferRules, Transitions
+from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 from sb3_combrel.transfer.instances.translation import Translator
 
 seeds = st.integers(0, 2**32 - 1)

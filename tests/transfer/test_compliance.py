@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.instances.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.candidates import Candidates, stacked_instances, stacked_table
+from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.instances.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.instances.compliance import (
     ComplianceScratch,
     compliance_table,
     task_compliance,
     transition_compliance,
 )
-from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.instances.relevance import relevance
 
 seeds = st.integers(0, 2**32 - 1)

@@ -11,11 +11,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
-from sb3_combrel.transfer.instances import compliance as compiled_compliance
 from sb3_combrel.transfer import equations
-from sb3_combrel.transfer.instances import relevance as compiled_relevance
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
+from sb3_combrel.transfer.instances import compliance as compiled_compliance
+from sb3_combrel.transfer.instances import relevance as compiled_relevance
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 3), st.integers(1, 3))

@@ -7,9 +7,9 @@ from helpers.asking import bound
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping
 from sb3_combrel.common.serialisation import KIND
-from sb3_combrel.transfer.methods import mapping_transfer
 from sb3_combrel.transfer.by_name import SAVED, describe_transfer, make_transfer, restore_transfer
 from sb3_combrel.transfer.candidates import Candidate
+from sb3_combrel.transfer.methods import mapping_transfer
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 FORMER = [("fading", "breadth_decay", 0.5), ("believe_terminal", "transfer_terminals", False)]

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.mappings.state_mappings import copies_of_source
+from sb3_combrel.transfer.equations import division_score, prediction_compliances, running_scales
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.equations import division_score, prediction_compliances, running_scales
 from sb3_combrel.transfer.prior.prior_choice import (
     MIN_GAIN,
     best_division,

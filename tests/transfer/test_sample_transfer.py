@@ -18,8 +18,8 @@ import sb3_combrel
 from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingSet, SampleTransfer
 from sb3_combrel.transfer import equations
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
+from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.methods.task_compliance import candidate_compliances, draw_instances
 
 POINTS = np.random.default_rng(5).random((12, 3))

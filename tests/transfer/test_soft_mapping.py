@@ -7,8 +7,8 @@ import pytest
 import torch as th
 from helpers import factored as f
 
-from sb3_combrel.transfer.methods import soft_mapping as soft
 from sb3_combrel.transfer.candidates import stacked_instances
+from sb3_combrel.transfer.methods import soft_mapping as soft
 from sb3_combrel.transfer.methods.soft_predictions import MixturePredictions
 from sb3_combrel.transfer.source_model import SourceModel
 

@@ -9,16 +9,16 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.instances.compliance import (
     ComplianceScratch,
     RewardCounts,
     no_change_compliance,
     transition_compliance_plain,
 )
-from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: every
 # transition changes some choices, and to plan again with each would cost more than all the rest.

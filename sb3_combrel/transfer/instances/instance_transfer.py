@@ -10,10 +10,10 @@ import numpy as np
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
-from sb3_combrel.transfer.placed_errors import PlacedErrors
 from sb3_combrel.transfer.instances.selectors import Ranges, Selector
-from sb3_combrel.transfer.source_use import SourceUse
 from sb3_combrel.transfer.instances.translation import Translator
+from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.source_use import SourceUse
 
 # Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
 RELEVANCE_GROWTH = 1.2

@@ -7,8 +7,8 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inner
 from sb3_combrel.common.periodic import difference
-from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 

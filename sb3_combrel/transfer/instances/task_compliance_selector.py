@@ -8,10 +8,10 @@ from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.instances.compliance import ComplianceScratch, transition_compliance_plain
 from sb3_combrel.transfer.equations import Bandwidths
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.instances.compliance import ComplianceScratch, transition_compliance_plain
 from sb3_combrel.transfer.instances.selectors import PooledSelector
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 _transition_compliance = EntryPoint(transition_compliance_plain)
 

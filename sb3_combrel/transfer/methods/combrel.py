@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
-from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.instances.compliance_selector import ComplianceSelector, SelectionOptions
+from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_BREADTH_DECAY,
@@ -20,10 +21,9 @@ from sb3_combrel.transfer.methods.mapping_transfer import (
     MappingTransfer,
 )
 from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
-from sb3_combrel.transfer.renamed import accept_renamed
-from sb3_combrel.transfer.instances.selectors import SelectorParts
-from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.renamed import accept_renamed
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 #: Arguments of COMBREL that have a meaning for transferred instances only.
 _OF_INSTANCES = (

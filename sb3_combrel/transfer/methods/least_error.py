@@ -10,11 +10,11 @@ from sb3_combrel.mappings.action_mappings import ActionMappings, AllActionMappin
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.instances.selectors import Ranges, Selector
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_choice import Choice
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-from sb3_combrel.transfer.instances.selectors import Ranges, Selector
 
 # Action mappings that are restricted as a whole are compared one by one.
 MAX_ACTION_MAPPINGS = 100_000

@@ -19,7 +19,6 @@ from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
 from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import (
     Candidate,
@@ -29,19 +28,20 @@ from sb3_combrel.transfer.candidates import (
     SourceLike,
     load_sources,
 )
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer, MeasureRelevance
-from sb3_combrel.transfer.prior.prior_sets import is_factored
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.instances.relevance import renew_near_relevance, renew_relevance
+from sb3_combrel.transfer.instances.report_of_instances import report_of_instances
+from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
+from sb3_combrel.transfer.instances.translation import Translator
+from sb3_combrel.transfer.prior.prior_sets import is_factored
+from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.renamed import warn_of_name
 from sb3_combrel.transfer.report import TransferReport
-from sb3_combrel.transfer.instances.report_of_instances import report_of_instances
-from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
-from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
-from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.source_use import SourceUse
-from sb3_combrel.transfer.instances.translation import Translator
 
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8

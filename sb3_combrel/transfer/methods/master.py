@@ -9,15 +9,15 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
-from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
+from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.least_error import LeastErrorSelector, check_action_mappings, choose_least_error
 from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
 from sb3_combrel.transfer.prior.prior_sets import copies_of, is_factored
-from sb3_combrel.transfer.instances.selectors import SelectorParts
-from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 DEFAULT_RANDOM_STEPS = 100
 

@@ -6,17 +6,17 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
-from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
+from sb3_combrel.transfer.instances.selectors import SelectorParts
+from sb3_combrel.transfer.instances.task_compliance_selector import TaskComplianceSelector
 from sb3_combrel.transfer.methods.least_error import check_action_mappings
 from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
-from sb3_combrel.transfer.prior.prior_sets import is_factored
-from sb3_combrel.transfer.instances.selectors import SelectorParts
-from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.methods.task_compliance import candidate_compliances, draw_instances, instances_of_each
-from sb3_combrel.transfer.instances.task_compliance_selector import TaskComplianceSelector
+from sb3_combrel.transfer.prior.prior_sets import is_factored
+from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 # Seeds are saved as float64.
 MAX_SEED = 2**53

@@ -13,9 +13,6 @@ from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
-from sb3_combrel.transfer.prior.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
-from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
-from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.methods.soft_mapping import (
     FitData,
     Logits,
@@ -29,6 +26,9 @@ from sb3_combrel.transfer.methods.soft_mapping import (
     probabilities,
 )
 from sb3_combrel.transfer.methods.soft_predictions import MixturePredictions, Predicted
+from sb3_combrel.transfer.prior.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
+from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
+from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
 
 # Each mapping predicts every transition that is fitted to with each source action.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.transfer.prior.copies import distinct_rows
 from sb3_combrel.transfer.methods.soft_mapping import Readings, Terms, as_source, brought_back
+from sb3_combrel.transfer.prior.copies import distinct_rows
 from sb3_combrel.transfer.source_model import SourceModel, SourcePredictions
 
 # Predictions of the sample are stored for so many mappings with a source action.

@@ -10,9 +10,10 @@ import numpy as np
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
+from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_BREADTH_DECAY,
@@ -20,10 +21,9 @@ from sb3_combrel.transfer.methods.mapping_transfer import (
     MappingTransfer,
 )
 from sb3_combrel.transfer.prior.prior_sets import make_prior
-from sb3_combrel.transfer.renamed import accept_renamed
-from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
-from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.renamed import accept_renamed
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 
 class TIMBREL(MappingTransfer):

@@ -8,8 +8,8 @@ import numpy as np
 
 from sb3_combrel.transfer.prior.copy_sums import SMALLEST_SCALE
 from sb3_combrel.transfer.prior.prior_choice import Choice, best_actions
-from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 
 # Alternatives are compared on so many of the recorded transitions, at most, evenly spread.
 MAX_TRANSITIONS = 1000

@@ -7,15 +7,15 @@ import numpy as np
 from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
+from sb3_combrel.transfer.placed_errors import PlacedErrors
 from sb3_combrel.transfer.prior.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.placed_errors import PlacedErrors
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, moved
+from sb3_combrel.transfer.prior.value_bound import ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
 from sb3_combrel.transfer.source_use import SourceUse
-from sb3_combrel.transfer.prior.value_bound import ValueBound
 
 # A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
 SMALLEST_MOVE = 0.005
