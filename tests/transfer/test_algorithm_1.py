@@ -204,6 +204,7 @@ def test_the_translator_transfers_the_instances_of_the_equations(seed, breadth, 
     )
     if by_relevance:
         translator.relevance[:] = rng.random(translator.relevance.shape)
+        translator.order_by_relevance()
     states, own = rng.random((20, 3)), rng.uniform(0.0, 1.2 * threshold, 20)
     first = rng.integers(len(candidates), size=20)
     found = translator(states, own, (first, first + 1))

@@ -19,6 +19,7 @@ from sb3_combrel.transfer.instances.translation import (
     TranslationArrays,
     TranslationRules,
     TranslationScratch,
+    most_relevant_first,
     translate_plain,
 )
 
@@ -38,12 +39,14 @@ def translated(states, own, mappings, source, task, breadth, transfer_terminals=
         np.full((n, room), np.nan),
         np.zeros((n, room), dtype=np.bool_),
     )
+    pool = np.array([0, len(rows)])
     threshold, fraction = task.exploration_threshold, task.min_fraction
     arrays = TranslationArrays(
         SourceArrays.of_instances(instances),
         CandidateMappings(rows, actions, *stacked_table([listed])),
         TranslationRules(threshold, breadth, task.min_weight, fraction, transfer_terminals, relevance is not None),
         np.empty((1, 0)) if relevance is None else relevance,
+        np.empty(0, dtype=np.int64) if relevance is None else most_relevant_first(relevance, instances.size[actions], pool),
         TranslationScratch.empty(room, d, instances.block_low.shape[2]),
         np.zeros(d, dtype=bool),
     )

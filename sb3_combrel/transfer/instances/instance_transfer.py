@@ -121,6 +121,7 @@ class InstanceTransfer(SourceUse):
 
     def _renew_relevance(self, n_used: int) -> None:
         self.measure_relevance(n_used=n_used, values=self.translator.relevance)
+        self.translator.order_by_relevance()
         self._n_of_relevance = n_used
         # Another order, for all states: one that is asked for when it is loaded must not differ from the others.
         self.all_changed = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,6 +129,9 @@ class TranslationArrays(NamedTuple):
     :param mappings: the candidates
     :param rules: when and how instances are translated
     :param relevance: float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
+    :param order: int64, shape (n_candidates * most instances of an action,): the same instances, as numbers in the flat array
+        of relevances, the most relevant of each candidate first, or of each target action's candidates together; -1 after
+        the last. (0,) if not used
     :param scratch: work space
     :param periodic: bool, shape (n_target_variables,): translated instances lie in the target's space, which wraps along these
     """
@@ -136,20 +140,21 @@ class TranslationArrays(NamedTuple):
     mappings: CandidateMappings
     rules: TranslationRules
     relevance: np.ndarray
+    order: np.ndarray
     scratch: TranslationScratch
     periodic: np.ndarray
 
     def plain(self) -> tuple[Any, ...]:
         """The same as plain tuples (see ``common.compiled``)."""
         structs = tuple(self.source), tuple(self.mappings), tuple(self.rules)
-        return *structs, self.relevance, tuple(self.scratch), self.periodic
+        return *structs, self.relevance, self.order, tuple(self.scratch), self.periodic
 
 
 @inlined
 def as_arrays(plain):
     """:class:`TranslationArrays` from plain tuples."""
     source, mappings, rules = SourceArrays(*plain[0]), CandidateMappings(*plain[1]), TranslationRules(*plain[2])
-    return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]), plain[5])
+    return TranslationArrays(source, mappings, rules, plain[3], plain[4], TranslationScratch(*plain[5]), plain[6])
 
 
 @part
@@ -179,7 +184,7 @@ def consider(j, candidate, weight, rank, own, kept, rules, scratch):
     value[k, _WEIGHT] = weight
     total = own
     for k in range(min(kept + 1, room)):
-        if not rules.by_relevance and value[k, _WEIGHT] < rules.min_fraction * total:
+        if not rules.times_weight and value[k, _WEIGHT] < rules.min_fraction * total:
             # Heavier than the last of the list, one need not have that fraction of the last's weight as well.
             enters = rules.min_fraction * total
             return k, min(enters, value[k - 1, _WEIGHT]) if k > 0 else enters
@@ -228,7 +233,7 @@ def gather(state, own, candidate, arrays, kept):
         if turn == nearest_block or scratch.gap[block] > nearest:
             continue
         for j in range(block * BLOCK, min(size, (block + 1) * BLOCK)):
-            if rules.by_relevance and arrays.relevance[candidate, j] <= scratch.enters[0]:
+            if rules.times_weight and arrays.relevance[candidate, j] <= scratch.enters[0]:
                 continue
             apart = 0.0
             for m in range(n_mapped):
@@ -236,15 +241,58 @@ def gather(state, own, candidate, arrays, kept):
                 apart += along * along
             if apart <= nearest:
                 weight = np.exp(apart * scale)
-                rank = arrays.relevance[candidate, j] if rules.by_relevance else weight
-                if rules.times_weight:
-                    rank *= weight
+                rank = weight * arrays.relevance[candidate, j] if rules.times_weight else weight
                 kept, enters = consider(j, candidate, weight, rank, own, kept, rules, scratch)
-                if enters > rules.min_weight and not rules.by_relevance:
-                    nearest = np.log(enters) / scale * (1 + 1e-12)
-                elif rules.times_weight and scratch.enters[0] > rules.min_weight:
+                if rules.times_weight:
                     # No relevance exceeds 1: what is lighter than the least rank that is needed has a lower one.
-                    nearest = np.log(scratch.enters[0]) / scale * (1 + 1e-12)
+                    enters = scratch.enters[0]
+                if enters > rules.min_weight:
+                    nearest = np.log(enters) / scale * (1 + 1e-12)
+    return kept
+
+
+@part
+def take_most_relevant(state, own, first, last, arrays):
+    """
+    Select the translated instances of some candidates in the order of their relevance, which is known before the state is.
+
+    So only as many are looked at as it takes to reach the threshold.
+
+    :param own: weight of the target's own instances at ``state``
+    :param first: the first candidate; ``last``: one past the last. All that ``arrays.order`` has together
+    :param arrays: TranslationArrays, whose scratch receives the selected
+    :return: how many they are
+    """
+    source, mappings, rules, scratch = arrays.source, arrays.mappings, arrays.rules, arrays.scratch
+    most = arrays.relevance.shape[1]
+    scale = -1.0 / (rules.breadth * rules.breadth)
+    far = np.log(rules.min_weight) / scale
+    total = own
+    kept = 0
+    for place in range(first * most, last * most):
+        pair = arrays.order[place]
+        if pair < 0 or total >= rules.threshold:
+            break
+        candidate = pair // most
+        j = pair - candidate * most
+        row, action = mappings.row[candidate], mappings.action[candidate]
+        apart = 0.0
+        for v in range(len(state)):
+            k = mappings.variable[row, v]
+            if k >= 0:
+                at = 1.0 - state[v] if mappings.sign[row, v] < 0.0 else state[v]
+                along = difference(at, source.state[action, j, k], arrays.periodic[v])
+                apart += along * along
+        if apart > far:
+            continue
+        if kept == len(scratch.value) - 1:
+            scratch.full[0] = True
+            break
+        scratch.number[kept, _INSTANCE] = j
+        scratch.number[kept, _CANDIDATE] = candidate
+        scratch.value[kept, _WEIGHT] = np.exp(apart * scale)
+        total += scratch.value[kept, _WEIGHT]
+        kept += 1
     return kept
 
 
@@ -311,9 +359,12 @@ def translate(states, own, ranges, arrays, transferred):
         if own[s] >= arrays.rules.threshold:
             continue
         kept = np.int64(0)
-        arrays.scratch.enters[0] = -np.inf
-        for candidate in range(first[s], last[s]):
-            kept = gather(states[s], own[s], candidate, arrays, kept)
+        if arrays.rules.by_relevance and not arrays.rules.times_weight:
+            kept = take_most_relevant(states[s], own[s], first[s], last[s], arrays)
+        else:
+            arrays.scratch.enters[0] = -np.inf
+            for candidate in range(first[s], last[s]):
+                kept = gather(states[s], own[s], candidate, arrays, kept)
         write_row(s, own[s], kept, arrays, transferred)
 
 
@@ -326,6 +377,25 @@ def translate_plain(states, own, ranges, arrays, transferred):
 _translate = EntryPoint(translate_plain)
 
 
+def most_relevant_first(relevance: np.ndarray, sizes: np.ndarray, pools: np.ndarray) -> np.ndarray:
+    """
+    Sort the instances of pools of candidates by relevance; of those that are equally relevant the first comes first.
+
+    :param relevance: shape (n_candidates, most instances of an action)
+    :param sizes: how many instances each candidate has, int64, shape (n_candidates,)
+    :param pools: the first candidate of each pool, and ``n_candidates``, int64
+    :return: see ``TranslationArrays.order``
+    """
+    most = relevance.shape[1]
+    missing = np.arange(most) >= sizes[:, None]
+    rank = np.where(missing, np.inf, -relevance).ravel()
+    order = np.empty(rank.shape, dtype=np.int64)
+    for first, last in itertools.pairwise((pools * most).tolist()):
+        order[first:last] = first + np.argsort(rank[first:last], kind="stable")
+    order[missing.ravel()[order]] = -1
+    return order
+
+
 class Translator:
     """
     Translates instances of selected candidates, with the arrays that this takes.
@@ -334,6 +404,7 @@ class Translator:
     :param task: the target task
     :param breadth: kernel breadth of transferred instances, unit coordinates
     :param transfer_terminals: see ``TranslationRules``; ``by_relevance`` and ``times_weight``: the same
+    :param pooled: whether instances of all candidates of a target action come from one pool, and not those of one candidate
     """
 
     def __init__(
@@ -345,6 +416,7 @@ class Translator:
         transfer_terminals: bool,
         by_relevance: bool,
         times_weight: bool = False,
+        pooled: bool = False,
     ):
         largest = int(candidates.instances.size.max())
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
@@ -364,11 +436,14 @@ class Translator:
                     times_weight=times_weight,
                 ),
                 relevance=np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0)),
+                order=np.empty(len(candidates) * largest if by_relevance and not times_weight else 0, dtype=np.int64),
                 scratch=self._make_scratch(),
                 periodic=np.array(task.periodic),
             )
         )
         self._make_room(task.n_actions)
+        self._pools = candidates.arrays.first if pooled else np.arange(len(candidates) + 1)
+        self.order_by_relevance()
 
     # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
 
@@ -393,6 +468,12 @@ class Translator:
     def relevance(self) -> np.ndarray:
         """Relevance of each candidate's instances, shape (n_candidates, most instances of an action); (1, 0) if not used."""
         return self._arrays.relevance
+
+    def order_by_relevance(self) -> None:
+        """Take in that :attr:`relevance` has changed. Of those that are equally relevant the first comes first."""
+        if len(self._arrays.order):
+            sizes = self._arrays.source.size[self._arrays.mappings.action]
+            self._arrays.order[:] = most_relevant_first(self.relevance, sizes, self._pools)
 
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""

@@ -160,9 +160,10 @@ class MappingTransfer(Transfer):
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         bandwidths = candidate_bandwidths(self.candidates, self.bandwidths)
         parts = SelectorParts(self.candidates, task, RecordedTransitions(task.n_variables), self.rng)
+        selector = self._make_selector(parts, bandwidths)
         return InstanceTransfer(
-            self._make_selector(parts, bandwidths),
-            self._make_translator(self.candidates, task, float(self.breadth)),
+            selector,
+            self._make_translator(self.candidates, task, float(self.breadth), pooled=not selector.selects_one),
             breadth_decay=self.breadth_decay,
             measure_relevance=self._relevance_to(parts.transitions, bandwidths),
         )
@@ -179,7 +180,9 @@ class MappingTransfer(Transfer):
         """Return whether whole mappings are the candidates."""
         return False
 
-    def _make_translator(self, candidates: Candidates, task: TargetTask, breadth: float) -> Translator:
+    def _make_translator(
+        self, candidates: Candidates, task: TargetTask, breadth: float, *, pooled: bool = False
+    ) -> Translator:
         """Make the translator of the instances of some candidates."""
         by_relevance = bool(self.relevance) and self.ranks_by_relevance
         return Translator(
@@ -189,6 +192,7 @@ class MappingTransfer(Transfer):
             transfer_terminals=self.transfer_terminals,
             by_relevance=by_relevance,
             times_weight=by_relevance and self.relevance == NEAR,
+            pooled=pooled,
         )
 
     @abstractmethod
