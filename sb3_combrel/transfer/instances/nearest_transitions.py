@@ -165,6 +165,15 @@ def choose_one(near, compliance, required, n_candidates, draw, total):
     return best
 
 
+@inner
+def same_neighbors(near, others):
+    """Return whether two states have the same nearest transitions, in the same order."""
+    for k in range(len(near)):
+        if near[k] != others[k]:
+            return False
+    return True
+
+
 @part
 def choose(rows, actions, near, cache, first, draws, choice):
     """
@@ -180,14 +189,18 @@ def choose(rows, actions, near, cache, first, draws, choice):
     :return: how many changed
     """
     n_changed = 0
+    last = np.int64(-1)
+    best = np.int64(-1)
     for k in range(len(rows)):
         row = rows[k]
         action = actions[k]
         draw = draws[k] if len(draws) > 0 else -1.0
-        n_candidates = first[action + 1] - first[action]
-        chosen = choose_one(near[row], cache.compliance, cache.required, n_candidates, draw, cache.total)
-        if chosen >= 0:
-            chosen += first[action]
+        # Most states have the same nearest transitions as the state before, and their choice follows from these alone.
+        if last < 0 or draw >= 0.0 or not same_neighbors(near[row], near[last]):
+            n_candidates = first[action + 1] - first[action]
+            best = choose_one(near[row], cache.compliance, cache.required, n_candidates, draw, cache.total)
+        last = row
+        chosen = best + first[action] if best >= 0 else best
         if chosen != choice[row]:
             choice[row] = chosen
             rows[n_changed] = row
