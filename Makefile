@@ -93,7 +93,7 @@ icub-video: $(VENV)/.installed-all gl
 
 test: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up
-	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal --durations 25
 
 pytest: test
 

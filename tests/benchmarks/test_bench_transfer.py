@@ -1,11 +1,12 @@
-"""Compliance of a whole target sample: 3000 transitions of 4D Mountain Car with 1000 instances of the plain one."""
+"""Transfer of 1000 instances of Mountain Car to 4D: compliance of 3000 transitions, and translation for 3000 states."""
 
 import time
 
 import numpy as np
 import pytest
+from helpers.naive_transfer import target_task
 
-from sb3_combrel import MappingSet, SourceInstances
+from sb3_combrel import TIMBREL, MappingSet, SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
 from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceScratch, compliance_table
@@ -40,3 +41,14 @@ def test_compliance_of_3000_transitions_with_every_mapping(benchmark, name):
         np.empty((N_TRANSITIONS, len(table.variable), len(instances.size))),
     )
     benchmark.pedantic(compliance_table, args=arguments, rounds=5, warmup_rounds=1)
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize("relevance", [False, True], ids=["nearest first", "most relevant first"])
+def test_translation_of_3000_states_from_the_pool_of_all_mappings(benchmark, relevance):
+    states = np.random.default_rng(0).uniform(0.3, 0.7, (N_TRANSITIONS, 4))
+    method = TIMBREL(source_of_random_walks(), "pool", mappings="injective", breadth=0.1, relevance=relevance)
+    method.bind(target_task(states, 5), np.random.default_rng(0))
+    points, actions, own = np.arange(N_TRANSITIONS), np.zeros(N_TRANSITIONS, dtype=np.int64), np.zeros(N_TRANSITIONS)
+    found = benchmark.pedantic(method.transferred_to_sample, args=(points, actions, own), rounds=5, warmup_rounds=1)
+    assert found.length[:N_TRANSITIONS].any()

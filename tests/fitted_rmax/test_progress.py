@@ -113,7 +113,7 @@ NORMAL = {
     "MountainCar2D": (lambda: gym.make("combrel/MountainCar2D-v0"), 3000, {}),
     "CartPole": (
         lambda: gym.make("CartPole-v1"),
-        5000,
+        3000,
         dict(
             bounds=([-4.8, -3.0, -0.23, -3.2], [4.8, 3.0, 0.23, 3.2]),
             exploration_threshold=0.5,
