@@ -257,6 +257,13 @@ def test_on_the_walk_the_mapping_is_the_identity():
     assert model.policy.transfer.describe_prior() == "a0: a0 on (s0, s1); a1: a1 on (s0, s1)"
 
 
+@pytest.mark.parametrize("use", USES)
+def test_its_report_has_its_own_figures(use):
+    report = small(transfer=MASTER(walk_source(), n_random_steps=20, use=use)).learn(200).transfer.report()
+    assert report.statistics["transfer/steps_to_find_mapping"] == 20
+    assert report.statistics["transfer/mapping_found"] == 1.0
+
+
 def test_several_environments_act_at_random_together():
     model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=MASTER(walk_source(), n_random_steps=20)).learn(120)
     assert parts(model.policy.transfer.chosen)[:2] == ((0, 1), (0, 1))

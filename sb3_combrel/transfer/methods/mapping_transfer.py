@@ -332,7 +332,7 @@ class MappingTransfer(Transfer):
         if self._source_use.n_observed == 0:
             raise ValueError("there is nothing to report before learning: call model.learn(total_timesteps) first")
         if self.use == "prior":
-            return report_of_prior(repr(self), self.source_prior)
+            return report_of_prior(repr(self), self.source_prior, self.statistics())
         return report_of_instances(repr(self), self._instances, self.statistics())
 
     def get_state(self) -> dict[str, np.ndarray]:

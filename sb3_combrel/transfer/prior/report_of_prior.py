@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -43,12 +44,13 @@ class _Fit(NamedTuple):
         return float(self.compliance[rows].mean()), float(self.error[rows].sum()) / moved if moved > 0.0 else np.nan
 
 
-def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
+def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, float]) -> TransferReport:
     """
     Report what a source was taken for, as the prior of the target's model.
 
     :param method: the method with its arguments, as text
     :param prior: after one step at least
+    :param statistics: the method's figures of the log, by name
     """
     names = prior.task.action_names
     pairs = np.argwhere(~prior.claims.explains)
@@ -71,7 +73,7 @@ def report_of_prior(method: str, prior: SourcePrior) -> TransferReport:
         ends=(prior.claims.outcomes.confirmed, prior.claims.outcomes.contradicted),
         bounds_values=prior.value_bound() is not None,
         rewards=(prior.claims.outcomes.rewards_right, prior.claims.outcomes.rewards_wrong),
-        statistics=prior.statistics(),
+        statistics=statistics,
     )
 
 
