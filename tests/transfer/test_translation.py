@@ -13,14 +13,13 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
-from sb3_combrel.transfer.instances.translation import (
+from sb3_combrel.transfer.instances.translation import most_relevant_first, translate_plain
+from sb3_combrel.transfer.instances.translation_arrays import (
     CandidateMappings,
     SourceArrays,
     TranslationArrays,
     TranslationRules,
     TranslationScratch,
-    most_relevant_first,
-    translate_plain,
 )
 
 seeds = st.integers(0, 2**32 - 1)
