@@ -1,5 +1,5 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
-# make test    all tests, the slow ones too    make test-fast    all but the slow ones
+# make test    the tests that are quick, what CI runs   make test-all   all of them    make test-fast    all but the slow ones
 # make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
 # make build   wheel and source distribution in dist/   make smoke   install the wheel into an empty environment, and try it
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
@@ -38,7 +38,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python;
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build smoke gl clean
+.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -92,6 +92,10 @@ icub-video: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.icub $(ICUB_ARGS)
 
 test: $(VENV)/.installed-all gl
+	$(BIN)/python -m sb3_combrel.experiments.warm_up
+	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal --durations 25 -m "not long"
+
+test-all: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal --durations 25
 
