@@ -1,9 +1,9 @@
 """Fitted R-Max for Stable-Baselines3, with transfer between tasks that have other states and other actions."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_combrel._moved import keep_old_names
+from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
 from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
@@ -26,7 +26,6 @@ FittedRMax.default_callbacks.append(with_dashboard)
 keep_old_names()
 register_fitted_rmax(FittedRMax)
 
-__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 __all__ = [
     "COMBREL",
     "MASTER",

@@ -1,0 +1,198 @@
+"""Learning with and without transfer, compared in one call: runs, measures, tests, a picture, and a sentence."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_combrel.common.checks import as_count, check_count, check_finite
+from sb3_combrel.comparison.result import CompareResult, evaluate
+from sb3_combrel.fitted_rmax.arguments import MAX_SEED
+from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose
+from sb3_combrel.runs.runner import Backend, check_all_succeeded, run_missing
+from sb3_combrel.sources.recipes import task_spec
+from sb3_combrel.transfer.base import Transfer
+
+# What ``compare`` passes to the learner itself.
+_TAKEN = ("env", "transfer", "seed", "_init_setup_model")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedRun(Job):
+    """A run of a comparison, whose result has the transfer method's report."""
+
+    def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
+        """Report what transfer did."""
+        return {"report": None if model.transfer is None else model.transfer.report()}
+
+
+def compare(
+    env: Task,
+    methods: Mapping[str, TransferLike],
+    *,
+    seeds: int | Sequence[int] = 10,
+    steps: int = 20_000,
+    learner: Mapping[str, Any] | None = None,
+    baseline: str | None = None,
+    threshold: float | None = None,
+    n_jobs: int | None = 1,
+    progress_bar: bool = False,
+) -> CompareResult:
+    """
+    Learn a task with several methods of transfer and without, and say whether transfer helped.
+
+    Each method learns with the same seeds; everything is tested before the first run begins::
+
+        result = sb3_combrel.compare(
+            "combrel/MountainCar4D-v0", {"none": None, "COMBREL": COMBREL(source)}, seeds=10, steps=5_000, n_jobs=2
+        )
+        print(result.sentence)
+        print(result.table)
+        result.figure().savefig("curves.png")
+
+    The question is answered by the return averaged over environment steps, exploration included, with the permutation test of
+    the difference of means, corrected by Holm's method if several methods are compared with the baseline. The steps of
+    learning the source do not count.
+
+    :param env: id of the task, or a function without arguments that makes the environment; each run has its own
+    :param methods: for each name a transfer method, as :class:`~sb3_combrel.FittedRMax` takes it, or None for no transfer
+    :param seeds: number of runs of each method, with seeds from 0 on; or the seeds themselves
+    :param steps: environment steps of each run; episodes that are not complete by then do not count
+    :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods
+    :param baseline: the method that the others are compared with; None: the one without transfer
+    :param threshold: return that the time to threshold is measured to; None: the median, over the baseline's runs, of the mean
+        return of their last episodes
+    :param n_jobs: runs at a time, each in a process of its own; 1: one after the other in this process; None: one a core.
+        Results do not depend on it.
+    :param progress_bar: show how many runs are complete
+    :return: learning curves, measures, p-values, table, figure and sentence
+    :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short
+        for a single episode
+    :raises FileNotFoundError: if a source does not exist
+    :raises ~sb3_combrel.runs.runner.JobError: if a run failed
+    """
+    baseline = check_methods(methods, baseline)
+    numbers = check_seeds(seeds)
+    steps = as_count("steps", steps)
+    check_count("n_jobs", n_jobs, none_allowed=True)
+    if threshold is not None:
+        check_finite("threshold", threshold)
+    learner = check_learner(learner)
+    task = task_of(env)
+    runs = [
+        ComparedRun(group="", method=method, seed=seed, env=task, n_steps=steps, learner=learner, transfer=transfer)
+        for method, transfer in methods.items()
+        for seed in numbers
+    ]
+    for run in runs[:: len(numbers)]:
+        _try_out(run)
+    results = run_missing(runs, backend=Backend(n_jobs=n_jobs), console=Console(stderr=True) if progress_bar else None)
+    check_all_succeeded(results)
+    for result in results:
+        if not result.steps:
+            raise ValueError(
+                f"steps={steps} is too few: no episode ended in the run of {result.method}, seed {result.seed}; take more, or "
+                "a time limit"
+            )
+    by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(methods)}
+    return evaluate(by_method, baseline, threshold)
+
+
+def _try_out(run: ComparedRun) -> None:
+    """Make the model of a run, so that what does not fit is found before anything is learned."""
+    env = run.make_env()
+    try:
+        with chosen_on_purpose():
+            run.make_model(env)
+    except (ValueError, TypeError, OSError) as error:
+        # Subclasses may ask for more than a message.
+        kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
+        raise kind(f"{run.method}: {error}") from error
+    finally:
+        env.close()
+
+
+def check_methods(methods: Any, baseline: Any) -> str:
+    """
+    Return the baseline's name.
+
+    :param methods: should be a dict from names to transfer methods or None
+    :param baseline: one of its names; None: the one without transfer
+    :raises ValueError: if they are not
+    """
+    if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
+        raise ValueError(f"methods must be a dict from names to transfer methods, got {methods!r}")
+    if len(methods) < 2:
+        raise ValueError(
+            f'methods must have at least two, such as {{"none": None, "COMBREL": COMBREL(source)}}, got {methods!r}'
+        )
+    for name, transfer in methods.items():
+        if not (transfer is None or isinstance(transfer, Transfer | dict | str)):
+            raise ValueError(f"methods must be transfer methods or None for no transfer, got {transfer!r} for {name!r}")
+    without = [name for name, transfer in methods.items() if transfer is None]
+    if baseline is None:
+        if len(without) != 1:
+            raise ValueError(f"baseline must be one of {', '.join(methods)}, as {len(without)} methods are without transfer")
+        return without[0]
+    if baseline not in methods:
+        raise ValueError(f"baseline must be one of {', '.join(methods)}, got {baseline!r}")
+    return str(baseline)
+
+
+def check_seeds(seeds: Any) -> list[int]:
+    """
+    Return the seeds.
+
+    :param seeds: their number, or the seeds themselves
+    :raises ValueError: if they are neither
+    """
+    if isinstance(seeds, Sequence) and not isinstance(seeds, str):
+        numbers = [as_count("seeds", seed, min=0, max=MAX_SEED) for seed in seeds]
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise ValueError(f"seeds must be different whole numbers, at least one, got {list(seeds)!r}")
+        return numbers
+    return list(range(as_count("seeds", seeds)))
+
+
+def check_learner(learner: Any) -> dict[str, Any]:
+    """
+    Return further arguments of the learner.
+
+    :param learner: should be a dict of them, or None
+    :raises ValueError: if it is not, or has others
+    """
+    if learner is None:
+        return {}
+    known = [name for name in inspect.signature(FittedRMax).parameters if name not in _TAKEN]
+    if not isinstance(learner, Mapping):
+        raise ValueError(f"learner must be a dict of arguments of FittedRMax, got {learner!r}")
+    for name in learner:
+        if name not in known:
+            raise ValueError(f"learner must have arguments out of {', '.join(known)}, got {name!r}")
+    return dict(learner)
+
+
+def task_of(env: Any) -> Task:
+    """
+    Return what makes the environment of each run.
+
+    :param env: id of an environment, or a function that makes one
+    :raises ValueError: if it is neither
+    """
+    if isinstance(env, str):
+        spec = task_spec(env)
+        if spec is None:
+            raise ValueError(f"env must be the id of an environment or a function that makes one; there is no {env!r}")
+        return spec
+    if not callable(env):
+        raise ValueError(
+            f"env must be the id of an environment or a function that makes one, as each run has its own, got {env!r}; "
+            "for example env=lambda: MyEnv()"
+        )
+    return env  # type: ignore[no-any-return]

@@ -1,0 +1,330 @@
+"""
+Whatever has seeds runs here: jobs that have no result yet are carried out, several at a time, on this machine or a cluster.
+
+The workers write nothing. A result comes back to the caller, which writes it to a file of its own as it arrives, so that the
+machines of a cluster need no folder in common, and a call that is stopped is continued by the next.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import socket
+import threading
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import cloudpickle
+import torch as th
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.files import write_whole
+from sb3_combrel.common.version import __version__
+from sb3_combrel.runs.job import Job, Result
+
+BACKENDS = ("loky", "ray", "dask")
+FOLDER = "runs"
+#: How often jobs are begun again, without a single result in between, because workers have died.
+MAX_BREAKDOWNS = 3
+SECONDS_TO_REACH = 5.0
+
+_NEEDS = {"loky": ("joblib", "experiments"), "ray": ("ray", "ray"), "dask": ("distributed", "dask")}
+_HOW_TO_START = {
+    "ray": "Start one with: ray start --head --port=6379, and on each worker node: ray start --address=HEAD:6379; "
+    "run this command on one of these nodes",
+    "dask": "Start one with: dask scheduler --port 8786, and on each worker node: "
+    "dask worker tcp://SCHEDULER:8786 --nworkers -1 --nthreads 1",
+}
+# A learning run seeds the random numbers of its whole process, so runs in several threads of one would disturb each other.
+_one_at_a_time = threading.Lock()
+
+
+class JobError(RuntimeError):
+    """A job has failed: it raised an exception, or the workers that carried it out died too often."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """
+    Where jobs are carried out.
+
+    :param name: "loky" for processes of this machine, "ray" or "dask" for a running cluster
+    :param n_jobs: processes of this machine at a time; 1 for this process; None: one a core
+    :param address: of the cluster, such as "10.0.0.1:6379" (Ray) or "tcp://10.0.0.1:8786" (Dask)
+    """
+
+    name: str = "loky"
+    n_jobs: int | None = None
+    address: str | None = None
+
+    def check(self) -> None:
+        """
+        Check that jobs can be carried out here, before anything is prepared.
+
+        :raises ValueError: if an argument is wrong
+        :raises ModuleNotFoundError: if the backend is not installed; names the extra to install
+        :raises ConnectionError: if nothing answers at the address
+        """
+        if self.name not in BACKENDS:
+            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {self.name!r}")
+        check_count("jobs", self.n_jobs, none_allowed=True)
+        package, extra = _NEEDS[self.name]
+        try:
+            __import__(package)
+        except ModuleNotFoundError as error:
+            message = f"backend {self.name} needs {package}, which is not installed: pip install 'sb3-combrel[{extra}]'"
+            raise ModuleNotFoundError(message, name=package) from error
+        if self.name == "loky":
+            if self.address is not None:
+                raise ValueError(f"address is for the backends ray and dask, got {self.address!r}")
+            return
+        if self.n_jobs is not None:
+            raise ValueError(f"jobs is for the backend loky; with {self.name} the cluster decides, got {self.n_jobs}")
+        self._reach()
+
+    def _reach(self) -> None:
+        address = self.address or ""
+        parts = urlsplit(address if "://" in address else f"//{address}")
+        try:
+            port = parts.port
+        except ValueError:
+            port = None
+        # Not "ray://": connections of Ray's client server often hang.
+        if parts.scheme not in ("", *(("tcp", "tls") if self.name == "dask" else ())) or not parts.hostname or port is None:
+            raise ValueError(
+                f"address of {self.name} must be a host and a port of a running cluster, got {self.address!r}. "
+                f"{_HOW_TO_START[self.name]}"
+            )
+        try:
+            socket.create_connection((parts.hostname, port), timeout=SECONDS_TO_REACH).close()
+        except OSError as error:
+            raise ConnectionError(
+                f"no {self.name} cluster answers at {self.address} ({error}). {_HOW_TO_START[self.name]}"
+            ) from error
+
+
+LOCAL = Backend()
+
+
+def run_missing(
+    jobs: Sequence[Job], output: Path | None = None, backend: Backend = LOCAL, console: Console | None = None
+) -> list[Result]:
+    """
+    Carry out the jobs that have no result yet. One that fails does not stop the others, and is tried again by the next call.
+
+    Results are the same wherever a job is carried out, if they depend on the job alone.
+
+    :param jobs: with different names
+    :param output: folder that the results are written to, in :data:`FOLDER`, and found in; None: they are only returned
+    :param backend: where jobs are carried out
+    :param console: where to show the progress; None: nowhere
+    :return: the results of all jobs, in their order, those that failed too, see :func:`check_all_succeeded`
+    :raises ValueError: if two jobs have one name, a job cannot be pickled, or the folder has results of other settings, or
+        files that are not results
+    """
+    console = console or Console(quiet=True)
+    names = Counter(job.name for job in jobs)
+    if names.total() > len(names):
+        raise ValueError(f"jobs must have different names, got {', '.join(name for name, n in names.items() if n > 1)} twice")
+    found = {} if output is None else _read_all(jobs, output)
+    missing = [job for job in jobs if job.name not in found]
+    if found:
+        console.print(f"{len(found)} of {len(jobs)} runs were complete already.")
+    with _progress(jobs, missing, console) as advance:
+        for job, result in _carry_out(missing, backend):
+            found[job.name] = result
+            if output is not None:
+                _write(job, result, output)
+            advance(job, result)
+    return [found[job.name] for job in jobs]
+
+
+def check_all_succeeded(results: Sequence[Result]) -> None:
+    """
+    Raise an error if jobs have failed.
+
+    :raises JobError: with the number of failed jobs, and name, exception and traceback of the first
+    """
+    failed = [result for result in results if result.error]
+    if failed:
+        first = failed[0]
+        others = f" ({len(failed) - 1} other runs failed, too)" if len(failed) > 1 else ""
+        raise JobError(f"{first.method}, seed {first.seed}: {first.error}{others}\n{first.traceback}".rstrip())
+
+
+def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None:
+    """
+    Read the settings and the result of a job from a folder; None if it has none or a file that is not whole.
+
+    :param output: the folder
+    :param name: of the job
+    """
+    try:
+        content = json.loads((output / FOLDER / f"{name}.json").read_text())
+        return dict(content["settings"]), Result(**content["result"])
+    except (FileNotFoundError, ValueError, TypeError, KeyError):
+        return None
+
+
+def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
+    """Results by name, without those that failed."""
+    if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
+        raise ValueError(f"{output} has files that are not results of this command; choose another --output")
+    (output / FOLDER).mkdir(parents=True, exist_ok=True)
+    found = {}
+    for job in jobs:
+        read = read_result(output, job.name)
+        if read is None:
+            continue
+        before, now = read[0], _settings(job)
+        other = [f"{key} was {before.get(key)!r} and is {now[key]!r}" for key in now if before.get(key) != now[key]]
+        if other:
+            raise ValueError(f"{output} has results of other settings ({job.title}: {'; '.join(other)}); use another --output")
+        if not read[1].error:
+            found[job.name] = read[1]
+    return found
+
+
+def _settings(job: Job) -> dict[str, Any]:
+    return dict(json.loads(json.dumps({"version": __version__, **job.settings()})))
+
+
+def _write(job: Job, result: Result, output: Path) -> None:
+    content = {"settings": _settings(job), "result": vars(result)}
+    write_whole(output / FOLDER / f"{job.name}.json", (json.dumps(content) + "\n").encode())
+
+
+def _carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Result]]:
+    """Jobs and their results, as they finish. What died with its worker is begun again."""
+    # As bytes a job goes through one and the same pickler once, whatever the backend makes of it.
+    packed = {job.name: (job, _pack(job)) for job in jobs}
+    breakdowns = 0
+    with ExitStack() as stack:
+        parallel = stack.enter_context(_parallel(backend)) if packed else None
+        while packed:
+            alone = breakdowns >= MAX_BREAKDOWNS
+            batch = list(packed)[:1] if alone else list(packed)
+            try:
+                assert parallel is not None
+                for content in parallel([packed[name][1] for name in batch]):
+                    result = pickle.loads(content)
+                    yield packed.pop(result.name)[0], result
+                    breakdowns = min(breakdowns, MAX_BREAKDOWNS) if alone else 0
+            except Exception as error:  # of a worker that died, as the backend calls it; exceptions of jobs are results
+                breakdowns += 1
+                if breakdowns > MAX_BREAKDOWNS and alone:
+                    job, _ = packed.pop(batch[0])
+                    yield job, job.result(error=f"its worker died: {type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def _pack(job: Job) -> bytes:
+    try:
+        return cloudpickle.dumps(job)
+    except Exception as error:  # picklers raise what they like
+        raise ValueError(f"{job.title} cannot be sent to a worker, its pickling failed: {error}") from error
+
+
+def perform(packed: bytes, version: str, caller: int) -> bytes:
+    """
+    Carry out a job, in one thread: what runs on the worker. An exception of the job is in its result.
+
+    :param packed: the job, pickled
+    :param version: of this package where the job comes from
+    :param caller: id of the process that the job comes from
+    :return: the result, pickled
+    """
+    if version != __version__:
+        raise RuntimeError(f"the worker has sb3-combrel {__version__}, the caller {version}; install the same on both")
+    if os.getpid() != caller and threading.current_thread() is threading.main_thread():
+        # Ctrl-C reaches the workers as well; the caller ends them.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with _one_at_a_time, _one_thread():
+        job: Job = pickle.loads(packed)
+        try:
+            return pickle.dumps(job.carry_out())
+        except Exception as error:  # whatever a third party's code raises
+            line = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            return pickle.dumps(job.result(error=line, traceback=traceback.format_exc()))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """More threads would fight with those of other runs for the cores."""
+    n_threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(n_threads)
+
+
+@contextmanager
+def _parallel(backend: Backend) -> Iterator[Callable[[list[bytes]], Iterator[bytes]]]:
+    """Make a function that performs packed jobs on the backend and yields their results as they finish."""
+    from joblib import Parallel, delayed, parallel_config
+
+    n_jobs, options, how = backend.n_jobs or -1, {}, {"return_as": "generator_unordered", "batch_size": 1}
+    with ExitStack() as stack:
+        if backend.name == "ray":
+            import ray
+            from ray.util.joblib import register_ray
+
+            ray.init(backend.address, log_to_driver=False, logging_level="ERROR")
+            stack.callback(ray.shutdown)
+            register_ray()
+            # Its backend hands results out when all are there.
+            n_jobs, how["return_as"] = int(ray.cluster_resources().get("CPU", 0)), "list"
+            if n_jobs < 1:
+                raise ConnectionError(f"the ray cluster at {backend.address} has no workers. {_HOW_TO_START['ray']}")
+        elif backend.name == "dask":
+            options = {"scheduler_host": backend.address, "wait_for_workers_timeout": SECONDS_TO_REACH}
+        else:
+            options = {"inner_max_num_threads": 1}
+        stack.enter_context(parallel_config(backend=backend.name, n_jobs=n_jobs, **options))
+
+        def parallel(packed: list[bytes]) -> Iterator[bytes]:
+            size = n_jobs if how["return_as"] == "list" else len(packed)
+            for start in range(0, len(packed), size):
+                calls = (delayed(perform)(each, __version__, os.getpid()) for each in packed[start : start + size])
+                yield from Parallel(**how)(calls)
+
+        yield parallel
+
+
+@contextmanager
+def _progress(jobs: Sequence[Job], missing: Sequence[Job], console: Console) -> Iterator[Callable[[Job, Result], None]]:
+    """Bars of progress, one a method or, of several groups, one a group; in a log file a line for each run."""
+    times = TimeElapsedColumn(), TimeRemainingColumn()
+    groups = {job.group for job in jobs}
+
+    def bar_of(job: Job) -> str:
+        return job.group if len(groups) > 1 else job.method
+
+    with Progress(
+        TextColumn("{task.description:<26}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        *times,
+        console=console,
+        disable=not console.is_terminal,
+    ) as progress:
+        n_runs, n_missing = Counter(map(bar_of, jobs)), Counter(map(bar_of, missing))
+        bars = {name: progress.add_task(name, total=n, completed=n - n_missing[name]) for name, n in n_runs.items()}
+
+        def advance(job: Job, result: Result) -> None:
+            progress.advance(bars[bar_of(job)])
+            if result.error or not console.is_terminal:
+                said = f"failed: {result.error}" if result.error else f"{sum(result.steps):,} steps, {result.seconds:.0f} s"
+                console.print(f"  {job.title}: {said}", markup=False, soft_wrap=True)
+
+        yield advance

@@ -1,0 +1,32 @@
+"""Files with source instances, learned once for an output folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from sb3_combrel.sources.source_instances import SourceInstances
+
+FOLDER = "sources"
+
+
+def load_or_learn(path: Path, learn: Callable[[], SourceInstances], console: Console) -> SourceInstances:
+    """
+    Load instances from a file, or learn them and write it.
+
+    :param path: the file
+    :param learn: learns them
+    :param console: where to show what is being done
+    """
+    if path.exists():
+        try:
+            return SourceInstances.load(path)
+        except ValueError as error:
+            console.print(f"{error}: they are learned again.", markup=False, soft_wrap=True)
+    with console.status(f"Learning {path.stem} ..."):
+        found = learn()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    found.save(path)
+    return found
