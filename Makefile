@@ -78,14 +78,14 @@ icub: $(VENV)/.installed-demo
 
 # Takes its table into the documentation as well. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
 icub-breadths: $(VENV)/.installed-demo
-	$(BIN)/python -m sb3_combrel.experiments.breadths $(ICUB_ARGS)
+	$(BIN)/python -m sb3_combrel.experiments.suite.breadths $(ICUB_ARGS)
 	mkdir -p docs/results
 	cp breadths_experiment/summary.csv docs/results/icub_breadths.csv
 	cp breadths_experiment/tables.md docs/results/icub_breadths.md
 
 # A later call goes on with what is there.
 suite: $(VENV)/.installed-demo
-	$(BIN)/python -m sb3_combrel.experiments.suite --output suite_output $(SUITE_ARGS)
+	$(BIN)/python -m sb3_combrel.experiments.suite.command --output suite_output $(SUITE_ARGS)
 
 # ICUB_ARGS="--task arm --look primitives", for instance.
 icub-video: $(VENV)/.installed-all gl

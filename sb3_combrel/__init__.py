@@ -20,7 +20,7 @@ from sb3_combrel.transfer.methods.three_way_rbm import ThreeWayRBM
 from sb3_combrel.transfer.methods.timbrel import TIMBREL
 
 if TYPE_CHECKING:
-    from sb3_combrel.experiments.compare import compare
+    from sb3_combrel.comparison.compare import compare
 
 FittedRMax.default_callbacks.append(with_dashboard)
 keep_old_names()
@@ -40,6 +40,7 @@ __all__ = [
     "SourceInstances",
     "SparseCodingMapping",
     "ThreeWayRBM",
+    "__version__",
     "compare",
     "explain",
 ]
@@ -48,7 +49,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # Statistics take a moment to import, and only who compares needs them.
     if name == "compare":
-        from sb3_combrel.experiments.compare import compare
+        from sb3_combrel.comparison.compare import compare
 
         return compare
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

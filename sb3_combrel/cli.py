@@ -62,13 +62,13 @@ def record(
     from rich.console import Console
 
     from sb3_combrel import SourceInstances
-    from sb3_combrel.experiments.runs import make_task
+    from sb3_combrel.runs.job import make_env
 
     console = Console()
     file = output if output.suffix == ".npz" else output.with_name(output.name + ".npz")
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists; use --overwrite or another --output")
-    env = make_task(env_id)
+    env = make_env(env_id)
     with console.status(f"Learning {env_id} for {total_timesteps:,} steps ..."):
         source = SourceInstances.from_q_learning(
             env, n_instances=n_instances, seed=seed, total_timesteps=total_timesteps, method=method
@@ -184,7 +184,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 1
     from gymnasium.error import Error as GymnasiumError
 
-    from sb3_combrel.experiments.engine_jobs import JobError
+    from sb3_combrel.runs.runner import JobError
 
     try:
         tyro.extras.subcommand_cli_from_dict(

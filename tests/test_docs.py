@@ -110,7 +110,7 @@ def test_a_command_with_a_wrong_option_is_found(cli_without_work):
     with pytest.raises(SystemExit):
         cli.main(["reproduce", "fig2", "--episode-count", "10"])
     with pytest.raises(AssertionError):
-        check_module_call("sb3_combrel.experiments.suite", ["--sedes", "0-9"])
+        check_module_call("sb3_combrel.experiments.suite.command", ["--sedes", "0-9"])
     with pytest.raises(AssertionError):
         check_module_call("sb3_combrel.zoo", ["train", "--algo", "combrell"])
 

@@ -117,7 +117,7 @@ def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
 
     import combrel_envs  # noqa: F401 - registers the environments
     from sb3_combrel import COMBREL, FittedRMax
-    from sb3_combrel.experiments.mountain_car import learn_source
+    from sb3_combrel.experiments.tasks.mountain_car import learn_source
 
     env = make_vec_env(case.env_id, seed=seed, env_kwargs=case.env_kwargs)
     transfer = COMBREL(learn_source()) if case.transfers else None

@@ -95,14 +95,14 @@ def learn_with_each_method(logs: Path, total_timesteps: int) -> None:
     :param total_timesteps: environment steps of each run
     """
     from sb3_combrel import FittedRMax
-    from sb3_combrel.experiments import mountain_car
-    from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+    from sb3_combrel.experiments.tasks import mountain_car
+    from sb3_combrel.runs.job import chosen_on_purpose, make_env
     from sb3_combrel.tensorboard.callback import DashboardCallback
 
     source = mountain_car.learn_source()
     for method, transfer in mountain_car.methods(source).items():
-        env = make_task(mountain_car.TARGET_ID, max_episode_steps=1000)
-        with coarse_on_purpose(), warnings.catch_warnings(), contextlib.closing(env):
+        env = make_env(mountain_car.TARGET_ID, max_episode_steps=1000)
+        with chosen_on_purpose(), warnings.catch_warnings(), contextlib.closing(env):
             model = FittedRMax(env, transfer=transfer, seed=0, tensorboard_log=str(logs), **mountain_car.LEARNER)
             dashboard = DashboardCallback(picture_freq=500, scalar_share=1.0)
             model.learn(total_timesteps, dashboard, log_interval=1, tb_log_name=method.replace(" ", "_"))

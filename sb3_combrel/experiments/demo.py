@@ -16,12 +16,14 @@ from rich.console import Console
 
 import sb3_combrel
 from sb3_combrel import FittedRMax, SourceInstances
-from sb3_combrel.experiments import mountain_car, report
+from sb3_combrel.experiments import report
 from sb3_combrel.experiments.figures import draw_learning_curves
 from sb3_combrel.experiments.parallel import carry_out_all
-from sb3_combrel.experiments.runs import Run, coarse_on_purpose, make_task
+from sb3_combrel.experiments.runs import Run
+from sb3_combrel.experiments.tasks import mountain_car
 from sb3_combrel.experiments.video import film, greedy_episode
 from sb3_combrel.experiments.warm_up import warm_up
+from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
 SETTINGS, SOURCE, RUNS, TENSORBOARD = "settings.json", "source.npz", "runs", "tensorboard"
 FIGURE, TABLES, RESULTS = "learning_curves.png", "tables.md", "results.csv"
@@ -170,7 +172,7 @@ def _best(runs: Sequence[Run], console: Console) -> Run:
 
 
 def _drive(run: Run) -> int:
-    with closing(make_task(run.env_id, max_episode_steps=run.max_episode_steps)) as env:
+    with closing(make_env(run.env_id, max_episode_steps=run.max_episode_steps)) as env:
         return sum(1 for _ in greedy_episode(load_car(run.model_file), env, EVALUATION_SEED))
 
 
@@ -179,7 +181,7 @@ def _film(output: Path, max_episode_steps: int, console: Console) -> None:
 
     (output / VIDEO).unlink(missing_ok=True)
     size = {"width": 480, "height": 360}
-    env = make_task(mountain_car.TARGET_ID, max_episode_steps=max_episode_steps, render_mode="rgb_array", **size)
+    env = make_env(mountain_car.TARGET_ID, max_episode_steps=max_episode_steps, render_mode="rgb_array", **size)
     try:
         with console.status("Filming the trained car ..."):
             film(load_car(output / MODEL), env, output / VIDEO, EVALUATION_SEED)
@@ -195,7 +197,7 @@ def load_car(path: Path) -> FittedRMax:
 
     :param path: a file that a run has left
     """
-    with coarse_on_purpose():
+    with chosen_on_purpose():
         return FittedRMax.load(path)
 
 

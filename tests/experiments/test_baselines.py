@@ -14,7 +14,7 @@ from stable_baselines3 import DQN
 from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments import baselines, icub_arm, mountain_car
-from sb3_combrel.experiments.baselines import (
+from sb3_combrel.experiments.paper.baselines import (
     ALGORITHMS,
     HYPERPARAMETERS,
     OWN,

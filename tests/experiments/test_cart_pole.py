@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_combrel.experiments import cart_pole
-from sb3_combrel.experiments.suite_tasks import TASKS
+from sb3_combrel.experiments.tasks import cart_pole
+from sb3_combrel.experiments.suite.tasks import TASKS
 
 # Gymnasium's constants, of a cart of 1 kg and a pole of 0.1 kg.
 GRAVITY, CART, POLE, FORCE, DT = 9.8, 1.0, 0.1, 10.0, 0.02

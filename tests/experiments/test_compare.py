@@ -14,7 +14,7 @@ from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.experiments import compare as module
 from sb3_combrel.experiments.compare import RunResult, compare, returns_over_steps, smallest_p_value
 from sb3_combrel.experiments.engine_jobs import JobError
-from sb3_combrel.experiments.suite_runs import EpisodeRecorder
+from sb3_combrel.experiments.suite.runs import EpisodeRecorder
 from sb3_combrel.experiments.transfer_measures import LearningCurves, compare_learning
 
 LEARNER = dict(model_breadth=0.15, resolution=3, degree=0)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_combrel.experiments import icub_arm
+from sb3_combrel.experiments.tasks import icub_arm
 from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB
 from sb3_combrel.experiments.runs import make_task
 

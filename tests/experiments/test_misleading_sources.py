@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.experiments.misleading_sources import MISLEADING, NOISE
+from sb3_combrel.experiments.tasks.misleading_sources import MISLEADING, NOISE
 from sb3_combrel.experiments.runs import make_task
 
 

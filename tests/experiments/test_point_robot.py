@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from sb3_combrel import FittedRMax
-from sb3_combrel.experiments.point_robot import (
+from sb3_combrel.experiments.tasks.point_robot import (
     MAX_EPISODE_STEPS,
     STEP,
     WALLS,
@@ -22,8 +22,8 @@ from sb3_combrel.experiments.point_robot import (
     move,
     slab,
 )
-from sb3_combrel.experiments.suite_runs import EpisodeRecorder
-from sb3_combrel.experiments.suite_tasks import TASKS
+from sb3_combrel.experiments.suite.runs import EpisodeRecorder
+from sb3_combrel.experiments.suite.tasks import TASKS
 
 
 @pytest.mark.parametrize("start", ["fixed", "random"])

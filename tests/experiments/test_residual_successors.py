@@ -5,7 +5,7 @@ import pytest
 from helpers.kernel_models import random_transitions
 
 from sb3_combrel.experiments import residual_successors
-from sb3_combrel.experiments.residual_successors import LAST_EXPONENT, RIDGE, MeanSuccessor, ResidualSuccessors
+from sb3_combrel.experiments.suite.residual_successors import LAST_EXPONENT, RIDGE, MeanSuccessor, ResidualSuccessors
 from sb3_combrel.models.base import ModelSettings
 from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.planning.mdp import FiniteMDP

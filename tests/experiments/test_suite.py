@@ -12,10 +12,10 @@ from scipy import stats
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_combrel.experiments import suite, suite_runs
-from sb3_combrel.experiments.point_robot import make_point_robot
+from sb3_combrel.experiments.tasks.point_robot import make_point_robot
 from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.experiments.statistics import holm, p_value_of_difference
-from sb3_combrel.experiments.suite_measures import (
+from sb3_combrel.experiments.suite.measures import (
     Episodes,
     failures,
     mean_return_in,
@@ -26,10 +26,10 @@ from sb3_combrel.experiments.suite_measures import (
     summary_of_evaluation,
     summary_of_learning,
 )
-from sb3_combrel.experiments.suite_report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
-from sb3_combrel.experiments.suite_runs import SuiteRun, Variant, play
-from sb3_combrel.experiments.suite_tasks import TASKS, NoisyActions, Task, tasks_of
-from sb3_combrel.experiments.suite_transfers import INSTANCE_ORACLES, ORACLES, TRANSFERS, make_transfer, source_for
+from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
+from sb3_combrel.experiments.suite.runs import SuiteRun, Variant, play
+from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Task, tasks_of
+from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, TRANSFERS, make_transfer, source_for
 
 SMALL = Task("small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(steps_in(1, 3),), headline="steps_1_to_3")
 SHORT = Task("short", partial(make_point_robot, 2), n_steps=500)
@@ -121,7 +121,7 @@ def test_results_of_other_settings_are_not_mixed_in(tmp_path):
 
 def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
     from sb3_combrel import SourceInstances
-    from sb3_combrel.experiments.suite_tasks import Source
+    from sb3_combrel.experiments.suite.tasks import Source
 
     calls = []
 
@@ -151,7 +151,7 @@ def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
 def test_a_source_of_another_domain_is_learnt_in_place_of_the_own(tmp_path, monkeypatch):
     from sb3_combrel import SourceInstances
     from sb3_combrel.experiments import suite_transfers
-    from sb3_combrel.experiments.suite_tasks import Source
+    from sb3_combrel.experiments.suite.tasks import Source
 
     calls = []
 

@@ -20,10 +20,10 @@ from sb3_combrel.experiments.benchmark.runs import BenchmarkJob, Outcome, carry_
 from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.experiments.carrying_out import LOCAL, Engine, progress_of
-from sb3_combrel.experiments.engines import JobError
 from sb3_combrel.experiments.output_folder import prepare_folder
 from sb3_combrel.experiments.result_files import RunFiles, run_name
-from sb3_combrel.experiments.source_files import FOLDER, load_or
+from sb3_combrel.runs.runner import JobError
+from sb3_combrel.runs.source_files import FOLDER, load_or_learn
 
 ALL = "all"
 OUTPUT = Path("benchmark")
@@ -149,7 +149,7 @@ def prepare_sources(
     for pair in pairs:
         try:
             found[pair.name] = tuple(
-                load_or(output / FOLDER / f"{source.name}.npz", source.learn, console) for source in pair.sources
+                load_or_learn(output / FOLDER / f"{source.name}.npz", source.learn, console) for source in pair.sources
             )
         except Exception as error:  # a third party's environment raises what it likes
             failed[pair.name] = f"its source could not be learned: {type(error).__name__}: {' '.join(str(error).split())}"

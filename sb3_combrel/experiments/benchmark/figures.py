@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_combrel.comparison.curves import LearningCurves, curves_of, moving_average
+from sb3_combrel.comparison.figures import COLOURS, figure_of, save
+from sb3_combrel.comparison.statistics import ALPHA, Estimate, bootstrap_band
 from sb3_combrel.experiments.benchmark.methods import NONE
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS, Cell, MethodScores
-from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.figures import COLOURS, figure_of, moving_average, save
-from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of
-from sb3_combrel.experiments.statistics import ALPHA, Estimate
 
 #: Moving average over so many episodes.
 WINDOW = 5

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_combrel import COMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
 from sb3_combrel.experiments.benchmark.methods import Sources
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.runs import chosen_on_purpose
+from sb3_combrel.runs.job import chosen_on_purpose
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.prior.prior_choice import best_division
 from sb3_combrel.transfer.prior.source_prior import SourcePrior

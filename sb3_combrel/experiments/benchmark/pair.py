@@ -13,22 +13,15 @@ import gymnasium as gym
 
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.checks import check_count, check_finite
-from sb3_combrel.experiments.runs import chosen_on_purpose, make_task
-from sb3_combrel.experiments.suite_tasks import Source
+from sb3_combrel.experiments.suite.tasks import Source
+from sb3_combrel.runs.job import Task, chosen_on_purpose, make_env
 from sb3_combrel.transfer.candidates import MappedVariables
 
-#: An environment: its id, or a function that makes it.
-Task = str | Callable[[], gym.Env]
 #: How a source is recorded, see :func:`recorded`.
 LEARNERS: dict[str, Callable[..., SourceInstances]] = {
     "fitted_rmax": SourceInstances.from_fitted_rmax,
     "q_learning": SourceInstances.from_q_learning,
 }
-
-
-def make_env(task: Task) -> gym.Env:
-    """Make the environment of a task."""
-    return make_task(task) if isinstance(task, str) else task()
 
 
 def recorded(name: str, task: Task, learner: str = "fitted_rmax", n_instances: int = 1000, **arguments: Any) -> Source:

@@ -10,6 +10,9 @@ import numpy as np
 from rich.console import Console
 
 from sb3_combrel.common.files import write_whole
+from sb3_combrel.comparison.measures import Comparison
+from sb3_combrel.comparison.statistics import ALPHA, Estimate
+from sb3_combrel.comparison.tables import Table, p_text, without_minus_zero, write_tables
 from sb3_combrel.experiments.benchmark.figures import draw_pair
 from sb3_combrel.experiments.benchmark.methods import NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
@@ -25,9 +28,7 @@ from sb3_combrel.experiments.benchmark.scores import (
     measure_name,
     ranks,
 )
-from sb3_combrel.experiments.report import Table, csv_text, p_text, without_minus_zero, write_tables
-from sb3_combrel.experiments.statistics import ALPHA, Estimate
-from sb3_combrel.experiments.transfer_measures import Comparison
+from sb3_combrel.experiments.report import csv_text
 
 OVERVIEW, PAGE, RUNS = "overview", "benchmark", "runs.csv"
 _EMPTY = "-"

@@ -17,9 +17,9 @@ from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.benchmark.methods import Method, Sources, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.result_files import run_name
-from sb3_combrel.experiments.runs import chosen_on_purpose
-from sb3_combrel.experiments.suite_runs import UNLIMITED, EpisodeRecorder
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.runs.episodes import EpisodeRecorder
+from sb3_combrel.runs.job import UNLIMITED, chosen_on_purpose
 from sb3_combrel.transfer.base import Transfer
 
 # Limit of the episodes of a run that is made for compiling: some must end.

@@ -9,18 +9,23 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from sb3_combrel.comparison.curves import curves_of
+from sb3_combrel.comparison.measures import (
+    TransferMeasures,
+    compare_learning,
+    counts_within,
+    total_reward,
+    total_reward_by_steps,
+)
+from sb3_combrel.comparison.statistics import Estimate, bootstrap_band, interquartile_mean, p_value_of_difference, resampled
 from sb3_combrel.experiments.benchmark.methods import NONE, Method, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import Outcome
-from sb3_combrel.experiments.bootstrap import bootstrap_band, resampled
-from sb3_combrel.experiments.learning_curves import curves_of
-from sb3_combrel.experiments.learning_measures import counts_within, total_reward, total_reward_by_steps
-from sb3_combrel.experiments.statistics import Estimate, holm_by_name, interquartile_mean, p_value_of_difference
-from sb3_combrel.experiments.transfer_measures import TransferMeasures, compare_learning
+from sb3_combrel.experiments.statistics import holm_by_name
 
 #: With fewer runs of each method there are neither intervals nor tests.
 FEWEST_RUNS = 3
-#: Taylor & Stone's measures, by the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`; the areas
+#: Taylor & Stone's measures, by the fields of :class:`~sb3_combrel.comparison.measures.TransferMeasures`; the areas
 #: are those over environment steps where the budget is in steps.
 MEASURES = ("jumpstart", "asymptotic_performance", "total_reward", "transfer_ratio", "time_to_threshold")
 _AREAS = ("total_reward", "transfer_ratio")

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_combrel.experiments.baselines import (
+from sb3_combrel.comparison.figures import panels_of, save
+from sb3_combrel.comparison.statistics import bootstrap_band
+from sb3_combrel.comparison.tables import Table
+from sb3_combrel.experiments.paper.baselines import (
     ALGORITHMS,
     OF_SOURCE,
     OWN,
@@ -20,13 +23,10 @@ from sb3_combrel.experiments.baselines import (
     Evaluations,
     learn,
 )
-from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.figures import panels_of, save
 from sb3_combrel.experiments.paper.curves import STYLES
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR, Domain
 from sb3_combrel.experiments.paper.methods import Sources
 from sb3_combrel.experiments.paper.runs import Result
-from sb3_combrel.experiments.report import Table
 from sb3_combrel.experiments.result_files import run_name
 
 N_RUNS = 5

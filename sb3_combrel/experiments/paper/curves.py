@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_combrel.experiments.bootstrap import bootstrap_band
-from sb3_combrel.experiments.figures import COLOURS, moving_average, panels_of, readable_ticks, save
+from sb3_combrel.comparison.curves import moving_average
+from sb3_combrel.comparison.figures import COLOURS, panels_of, readable_ticks, save
+from sb3_combrel.comparison.measures import steps_to_reach
+from sb3_combrel.comparison.statistics import bootstrap_band
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import Domain
-from sb3_combrel.experiments.statistics import steps_to_reach
 
 #: Moving average, and the median for thresholds, over so many episodes.
 WINDOW = 5

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.experiments.bootstrap import bootstrap_band, bootstrap_relative_difference
-from sb3_combrel.experiments.figures import COLOURS, panels_of, readable_ticks, save
+from sb3_combrel.comparison.figures import COLOURS, panels_of, readable_ticks, save
+from sb3_combrel.comparison.statistics import bootstrap_band, bootstrap_relative_difference, holm, p_value_of_difference
+from sb3_combrel.comparison.tables import Table, p_text
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.paper.methods import Sources
 from sb3_combrel.experiments.paper.plan import jobs_of
 from sb3_combrel.experiments.paper.runs import Job
 from sb3_combrel.experiments.paper.verdicts import interval_text, share_text
-from sb3_combrel.experiments.report import Table, p_text
-from sb3_combrel.experiments.statistics import holm, p_value_of_difference
 
 BREADTHS = (0.05, 0.1, 0.2, 0.3, 0.4)
 METHODS = (m.NO_TRANSFER, m.COMBREL_PLAIN, m.TIMBREL_RANDOM)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.experiments import icub_arm, mountain_car
+from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 
 #: As in the paper; where exploration is expensive, with this package's instance transfer; and this package's defaults.
 PAPER, EXPLORE, BEST = SETTINGS = ("paper", "explore", "best")

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_combrel.experiments.learning_curves import LearningCurves, curves_of
-from sb3_combrel.experiments.learning_measures import counts_within
+from sb3_combrel.comparison.curves import LearningCurves, curves_of
+from sb3_combrel.comparison.measures import Comparison, compare_learning, counts_within
+from sb3_combrel.comparison.statistics import holm
+from sb3_combrel.comparison.tables import Table, p_text, without_minus_zero
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.experiments.paper.methods import METHODS, NO_TRANSFER
 from sb3_combrel.experiments.paper.runs import Result
-from sb3_combrel.experiments.report import Table, p_text, without_minus_zero
-from sb3_combrel.experiments.statistics import holm
-from sb3_combrel.experiments.transfer_measures import Comparison, compare_learning
 
-#: Columns of the table, and the fields of :class:`~sb3_combrel.experiments.transfer_measures.TransferMeasures`.
+#: Columns of the table, and the fields of :class:`~sb3_combrel.comparison.measures.TransferMeasures`.
 _COLUMNS = {
     "jumpstart": "jumpstart",
     "asymptotic performance": "asymptotic_performance",

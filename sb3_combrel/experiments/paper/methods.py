@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
-from sb3_combrel.experiments.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.experiments.paper.domains import BEST, ICUB, MOUNTAIN_CAR, Domain, Setting
 from sb3_combrel.experiments.paper.oracle import best_mappings
+from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.mappings.named_sets import resolve
 from sb3_combrel.transfer.base import Transfer
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.comparison.tables import Table, write_tables
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baselines_table, draw_baselines, evaluation_rows
 from sb3_combrel.experiments.paper.curves import draw_curves, draw_selection, draw_times
@@ -28,8 +29,8 @@ from sb3_combrel.experiments.paper.selections import (
     state_mapping_table,
 )
 from sb3_combrel.experiments.paper.verdicts import CONTROL, PAPERS, judge, summary_table, verdict_table
-from sb3_combrel.experiments.report import Table, csv_text, write_tables
-from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+from sb3_combrel.experiments.report import csv_text
+from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
 #: Minutes that the paper gives for 200 episodes (Table 5).
 PAPERS_MINUTES = {m.NO_TRANSFER: 24.0, m.TIMBREL_INTUITIVE: 28.1, m.COMBREL_PLAIN: 40.9}
@@ -122,8 +123,8 @@ def _draw_east(domain: Domain, setting: str, results: Sequence[Result], title: s
 def _sample_of(domain: Domain, setting: str) -> tuple[np.ndarray, StateScaling]:
     """The finite sample of states that the learner plans with, unit coordinates, and the scaling."""
     learner = domain.settings[setting].learner
-    with coarse_on_purpose():
-        model = FittedRMax(make_task(domain.target_id), **learner)
+    with chosen_on_purpose():
+        model = FittedRMax(make_env(domain.target_id), **learner)
     return model.agent.grid.points(), model.agent.task.scaling
 
 

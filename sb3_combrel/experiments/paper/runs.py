@@ -15,9 +15,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.experiments.paper.recording import SelectionRecorder, selections_at_sample, uses_of
 from sb3_combrel.experiments.result_files import RESULTS, RunFiles, run_name
-from sb3_combrel.experiments.runs import chosen_on_purpose, make_task
-from sb3_combrel.experiments.suite_runs import UNLIMITED, EpisodeRecorder
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.runs.episodes import EpisodeRecorder
+from sb3_combrel.runs.job import UNLIMITED, chosen_on_purpose, make_env
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -121,7 +121,7 @@ def carry_out(job: Job) -> Result:
     """
     episodes = TimedRecorder(job.n_episodes)
     selections = SelectionRecorder()
-    with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, chosen_on_purpose():
+    with closing(make_env(job.env_id, max_episode_steps=job.max_episode_steps)) as env, chosen_on_purpose():
         model = FittedRMax(env, transfer=job.transfer, seed=job.seed, **job.learner)
         start = time.process_time()
         callbacks: list[BaseCallback] = [episodes, selections] if job.records_selections else [episodes]

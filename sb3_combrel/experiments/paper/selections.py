@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from sb3_combrel.comparison.tables import Table, p_text
 from sb3_combrel.experiments.paper.runs import Result
-from sb3_combrel.experiments.report import Table, p_text
 
 #: As many action mappings as the paper's Table 2 has.
 N_SHOWN = 9

@@ -9,7 +9,7 @@ from rich.console import Console
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, PAPER, Domain
 from sb3_combrel.experiments.paper.methods import Sources
-from sb3_combrel.experiments.source_files import FOLDER, load_or
+from sb3_combrel.runs.source_files import FOLDER, load_or_learn
 
 SOURCE_SEED = 0
 #: Seed of the learner whose transitions of the arm's task the oracle has; no run has it.
@@ -28,12 +28,12 @@ def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
     (other,) = (each for each in DOMAINS.values() if each.name != domain.name)
     target = None
     if domain.name == ICUB.name:
-        target = load_or(output / FOLDER / f"{domain.name}_target.npz", lambda: _record_target(domain), console)
+        target = load_or_learn(output / FOLDER / f"{domain.name}_target.npz", lambda: _record_target(domain), console)
     return Sources(_source(domain, output, console), _source(other, output, console), target)
 
 
 def _source(domain: Domain, output: Path, console: Console) -> SourceInstances:
-    return load_or(output / FOLDER / f"{domain.name}.npz", lambda: domain.learn_source(SOURCE_SEED), console)
+    return load_or_learn(output / FOLDER / f"{domain.name}.npz", lambda: domain.learn_source(SOURCE_SEED), console)
 
 
 def _record_target(domain: Domain) -> SourceInstances:

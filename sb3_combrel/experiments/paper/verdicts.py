@@ -8,13 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.experiments.bootstrap import bootstrap_relative_difference
-from sb3_combrel.experiments.effect_sizes import cliffs_delta
+from sb3_combrel.comparison.measures import steps_to_reach
+from sb3_combrel.comparison.statistics import ALPHA, bootstrap_relative_difference, cliffs_delta, holm, p_value_of_difference
+from sb3_combrel.comparison.tables import Table, p_text, without_minus_zero
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.curves import WINDOW
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
-from sb3_combrel.experiments.report import Table, p_text, without_minus_zero
-from sb3_combrel.experiments.statistics import ALPHA, holm, p_value_of_difference, steps_to_reach
 
 HELD, NOT_HELD, OPPOSITE = "held", "not held", "opposite"
 PAPERS, CONTROL = "paper", "control"

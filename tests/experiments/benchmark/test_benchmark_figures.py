@@ -8,7 +8,7 @@ from sb3_combrel.experiments.benchmark.methods import NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.benchmark.scores import cells_of, compare
-from sb3_combrel.experiments.suite_tasks import Source
+from sb3_combrel.experiments.suite.tasks import Source
 from sb3_combrel.experiments.transfer_measures import LearningCurves
 
 

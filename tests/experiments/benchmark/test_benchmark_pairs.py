@@ -9,13 +9,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, SourceInstances
-from sb3_combrel.experiments.benchmark.cart_with_pendulum import PARTS, CartWithPendulumEnv, make_cart_with_pendulum
+from sb3_combrel.experiments.tasks.cart_with_pendulum import PARTS, CartWithPendulumEnv, make_cart_with_pendulum
 from sb3_combrel.experiments.benchmark.known import errors_of, known_error
 from sb3_combrel.experiments.benchmark.methods import METHODS, DoesNotFit, Method
 from sb3_combrel.experiments.benchmark.pair import Pair, described, make_env, recorded
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
 from sb3_combrel.experiments.benchmark.pairs.mirrored_car import ACTIONS, ORDER, SIGNS, make_car, make_disguised
-from sb3_combrel.experiments.benchmark.renamed import disguise, disguised, mirrored
+from sb3_combrel.experiments.tasks.disguised import disguise, disguised, mirrored
 from sb3_combrel.experiments.benchmark.runs import BenchmarkJob, carry_out, has_mapping, known_share
 from sb3_combrel.experiments.runs import chosen_on_purpose
 from sb3_combrel.transfer.candidates import MappedVariables
@@ -32,8 +32,8 @@ def random_instances(task, n=300, seed=0, **options):
 def sources():
     """For each pair instances of random actions in tasks of the same spaces as its sources."""
     from sb3_combrel.experiments.benchmark.pairs import pendulum_acrobot
-    from sb3_combrel.experiments.cart_pole import LEARNER, make_cart_pole
-    from sb3_combrel.experiments.point_robot import make_point_robot
+    from sb3_combrel.experiments.tasks.cart_pole import LEARNER, make_cart_pole
+    from sb3_combrel.experiments.tasks.point_robot import make_point_robot
 
     robot = random_instances(lambda: make_point_robot(2, 0.003, "random"))
     return {

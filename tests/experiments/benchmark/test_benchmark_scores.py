@@ -20,7 +20,7 @@ from sb3_combrel.experiments.benchmark.report import (
 from sb3_combrel.experiments.benchmark.runs import Outcome, jobs_of
 from sb3_combrel.experiments.benchmark.scores import Cell, cells_of, compare, interquartile, mean_ranks, performances, ranks
 from sb3_combrel.experiments.statistics import holm
-from sb3_combrel.experiments.suite_tasks import Source
+from sb3_combrel.experiments.suite.tasks import Source
 
 
 def pair_of(name="made-up", **options):

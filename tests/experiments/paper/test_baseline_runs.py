@@ -2,7 +2,7 @@
 
 from helpers.paper_results import made_up
 
-from sb3_combrel.experiments.baselines import PLAIN, QUANTILE
+from sb3_combrel.experiments.paper.baselines import PLAIN, QUANTILE
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baselines_table, evaluation_rows
 

@@ -9,7 +9,7 @@ import pytest
 from helpers.paper_results import made_up, quiet
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
-from sb3_combrel.experiments.mountain_car import factored_mapping, intuitive_mapping
+from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import BEST, DOMAINS, EXPLORE, ICUB, MOUNTAIN_CAR, PAPER, SETTINGS
 from sb3_combrel.experiments.paper.methods import METHODS, methods_in, target_names

@@ -19,7 +19,7 @@ from helpers.paper_results import made_up
 from imageio.v3 import imread
 
 from sb3_combrel.experiments import carrying_out
-from sb3_combrel.experiments.baselines import ALGORITHMS
+from sb3_combrel.experiments.paper.baselines import ALGORITHMS
 from sb3_combrel.experiments.paper import baseline_runs, reproduce
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import DOMAINS

@@ -3,9 +3,9 @@
 import functools
 
 from sb3_combrel import FactoredMapping
-from sb3_combrel.experiments import cart_pole
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.suite_tasks import CART_POLE
+from sb3_combrel.experiments.suite.tasks import CART_POLE
+from sb3_combrel.experiments.tasks import cart_pole
 
 #: Half the length of the pole, 0.5 in CartPole-v1. With twice that, the right mapping would predict twice the angular effects
 #: of a push, which is no better than none.

@@ -1,9 +1,9 @@
 """The iCub's torso is the source of its arm, both striking a ball (Section 5.2 of the COMBREL paper)."""
 
 from sb3_combrel import FactoredMapping, InterTaskMapping
-from sb3_combrel.experiments import icub_arm
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.suite_tasks import STRIKE, TORSO
+from sb3_combrel.experiments.suite.tasks import STRIKE, TORSO
+from sb3_combrel.experiments.tasks import icub_arm
 
 PITCH, YAW = 0, 1
 # Actions of the torso: 2k moves joint k in the negative, 2k + 1 in the positive direction.

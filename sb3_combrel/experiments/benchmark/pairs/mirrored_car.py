@@ -6,11 +6,11 @@ import gymnasium as gym
 
 from sb3_combrel import FactoredMapping
 from sb3_combrel.experiments.benchmark.pair import Pair, recorded
-from sb3_combrel.experiments.benchmark.renamed import disguise, disguised
-from sb3_combrel.experiments.runs import make_task
+from sb3_combrel.experiments.tasks.disguised import disguise, disguised
+from sb3_combrel.runs.job import make_env
 
 ORDER, SIGNS, ACTIONS = (1, 0), (1, -1), (2, 0, 1)
-make_car = functools.partial(make_task, "MountainCar-v0", disable_env_checker=True)
+make_car = functools.partial(make_env, "MountainCar-v0", disable_env_checker=True)
 SOURCE = recorded("gym_mountain_car", make_car, "q_learning")
 
 

@@ -4,14 +4,14 @@ import gymnasium as gym
 from gymnasium.wrappers import DiscretizeAction
 
 from sb3_combrel.experiments.benchmark.pair import Pair, recorded
-from sb3_combrel.experiments.runs import make_task
-from sb3_combrel.experiments.suite_tasks import ACROBOT, make_acrobot
+from sb3_combrel.experiments.suite.tasks import ACROBOT, make_acrobot
+from sb3_combrel.runs.job import make_env
 from sb3_combrel.wrappers import AngleObservation
 
 
 def make_pendulum() -> gym.Env:
     """Make the pendulum with three torques, as many as the acrobot has."""
-    return AngleObservation(DiscretizeAction(make_task("Pendulum-v1", disable_env_checker=True), bins=3))
+    return AngleObservation(DiscretizeAction(make_env("Pendulum-v1", disable_env_checker=True), bins=3))
 
 
 PAIR = Pair(

@@ -4,8 +4,8 @@ import functools
 
 from sb3_combrel import InterTaskMapping
 from sb3_combrel.experiments.benchmark.pair import Pair, recorded
-from sb3_combrel.experiments.point_robot import make_point_robot
-from sb3_combrel.experiments.suite_tasks import SLIGHT_NOISE
+from sb3_combrel.experiments.suite.tasks import SLIGHT_NOISE
+from sb3_combrel.experiments.tasks.point_robot import make_point_robot
 
 ROBOT_2D = recorded("point_robot_2d", functools.partial(make_point_robot, 2, SLIGHT_NOISE, "random"))
 

@@ -3,8 +3,8 @@
 import functools
 
 from sb3_combrel import FactoredMapping, InterTaskMapping
-from sb3_combrel.experiments.benchmark.cart_with_pendulum import make_cart_with_pendulum
 from sb3_combrel.experiments.benchmark.pair import Pair, recorded
+from sb3_combrel.experiments.tasks.cart_with_pendulum import make_cart_with_pendulum
 
 CART = recorded("cart", functools.partial(make_cart_with_pendulum, "cart"), n_instances=500, n_episodes=30)
 PENDULUM = recorded("pendulum_alone", functools.partial(make_cart_with_pendulum, "pendulum"), n_episodes=50)

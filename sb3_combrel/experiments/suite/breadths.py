@@ -1,6 +1,6 @@
 """Does exploration end? The iCub's tasks at the paper's breadth, at half and at twice that, with and without noise.
 
-Run as ``python -m sb3_combrel.experiments.breadths``; ``make icub-breadths`` does.
+Run as ``python -m sb3_combrel.experiments.suite.breadths``; ``make icub-breadths`` does.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from joblib import cpu_count
 from rich.console import Console
 
 from sb3_combrel.common.checks import check_count, check_positive
-from sb3_combrel.experiments import icub_arm
+from sb3_combrel.comparison.measures import episodes_to_reach
+from sb3_combrel.comparison.tables import Table
 from sb3_combrel.experiments.demo import prepare_folder
-from sb3_combrel.experiments.icub_arm import MAX_EPISODE_STEPS, SOURCE_ID, TARGET_ID
 from sb3_combrel.experiments.parallel import carry_out_all
-from sb3_combrel.experiments.report import Table
 from sb3_combrel.experiments.runs import Run
-from sb3_combrel.experiments.statistics import episodes_to_reach
+from sb3_combrel.experiments.tasks import icub_arm
+from sb3_combrel.experiments.tasks.icub_arm import MAX_EPISODE_STEPS, SOURCE_ID, TARGET_ID
 from sb3_combrel.experiments.warm_up import warm_up
 
 BREADTHS = (0.05, 0.1, 0.2)

@@ -2,7 +2,7 @@
 
 Two models in plain NumPy that differ in nothing else: one successor a state-action pair, the mean; or one for each of the
 nearest instances, the mean plus what the fit leaves unexplained of it. Run as ``python -m
-sb3_combrel.experiments.residual_successors --seeds 4``; each run takes half a minute.
+sb3_combrel.experiments.suite.residual_successors --seeds 4``; each run takes half a minute.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import ClassVar
 import numpy as np
 import torch as th
 
-from sb3_combrel.experiments.suite_measures import LAST
-from sb3_combrel.experiments.suite_runs import EVALUATION_SEED, EpisodeRecorder, play
-from sb3_combrel.experiments.suite_tasks import TASKS
+from sb3_combrel.experiments.suite.measures import LAST
+from sb3_combrel.experiments.suite.tasks import TASKS
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.models.base import Model, Predictions
+from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, play
 
 #: The tasks with two state variables and random outcomes, and how many steps of each are learnt.
 STEPS = {"ICubTorso-noisy": 1500, "MountainCar-v0-noisy": 3000}

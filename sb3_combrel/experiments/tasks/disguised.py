@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel import InterTaskMapping
-from sb3_combrel.experiments.cart_pole import permuted
+from sb3_combrel.experiments.tasks.cart_pole import permuted
 
 
 class RenamedActions(gym.ActionWrapper):

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.experiments.report import Table
-from sb3_combrel.experiments.statistics import holm, p_value_of_difference
-from sb3_combrel.experiments.suite_runs import WITH_STATE, WITHOUT_STATE
-from sb3_combrel.experiments.suite_tasks import Task
+from sb3_combrel.comparison.statistics import holm, p_value_of_difference
+from sb3_combrel.comparison.tables import Table
+from sb3_combrel.experiments.suite.runs import WITH_STATE, WITHOUT_STATE
+from sb3_combrel.experiments.suite.tasks import Task
 
-#: Prefixes of the columns of evaluation, see :mod:`~sb3_combrel.experiments.suite_runs`.
+#: Prefixes of the columns of evaluation, see :mod:`~sb3_combrel.experiments.suite.runs`.
 POLICIES = (WITH_STATE, WITHOUT_STATE)
 #: Columns of every task besides its own measures, with whether more is better.
 COMMON = {
@@ -76,7 +76,7 @@ def cells_of(
     :param tasks: the tasks
     :param variants: names of the variants
     :param reference: the variant that the others are compared with; None for no tests
-    :param test: ``"welch"`` or ``"mann-whitney"``, see :func:`~sb3_combrel.experiments.statistics.p_value_of_difference`
+    :param test: ``"welch"`` or ``"mann-whitney"``, see :func:`~sb3_combrel.comparison.statistics.p_value_of_difference`
     :return: by task, column and variant; only where there are runs. Holm's correction is over all tests of one column name
         of a task.
     """

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.experiments.statistics import steps_to_reach
+from sb3_combrel.comparison.measures import steps_to_reach
 
 #: So many episodes at the end of learning are what the frozen policy is compared with.
 LAST = 10

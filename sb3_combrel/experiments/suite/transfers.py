@@ -2,7 +2,7 @@
 The transfer methods of the suite, by name, and the source from which each transfers.
 
 ``COMBREL@...`` is COMBREL from a source that misleads: the task's own one changed, see
-:mod:`~sb3_combrel.experiments.misleading_sources`, or with ``COMBREL@other-domain`` one of another domain.
+:mod:`~sb3_combrel.experiments.tasks.misleading_sources`, or with ``COMBREL@other-domain`` one of another domain.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from sb3_combrel import COMBREL, MASTER, TIMBREL, FactoredMapping, InterTaskMapping, MappingExperts, SourceInstances
-from sb3_combrel.experiments import cart_pole
-from sb3_combrel.experiments.misleading_sources import MISLEADING
-from sb3_combrel.experiments.mountain_car import factored_mapping, intuitive_mapping
-from sb3_combrel.experiments.suite_tasks import CAR_2D, CART_POLE, TORSO, Source, Task
+from sb3_combrel.experiments.suite.tasks import CAR_2D, CART_POLE, TORSO, Source, Task
+from sb3_combrel.experiments.tasks import cart_pole
+from sb3_combrel.experiments.tasks.misleading_sources import MISLEADING
+from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.transfer.base import Transfer
 
 

@@ -11,10 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeAction
 
-from sb3_combrel.experiments import cart_pole, icub_arm, mountain_car
-from sb3_combrel.experiments.point_robot import make_point_robot
-from sb3_combrel.experiments.runs import make_task
-from sb3_combrel.experiments.suite_measures import (
+from sb3_combrel.experiments.suite.measures import (
     Measure,
     mean_return_in,
     mean_steps_in,
@@ -22,6 +19,9 @@ from sb3_combrel.experiments.suite_measures import (
     steps_until_always,
     steps_until_median,
 )
+from sb3_combrel.experiments.tasks import cart_pole, icub_arm, mountain_car
+from sb3_combrel.experiments.tasks.point_robot import make_point_robot
+from sb3_combrel.runs.job import make_env
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.wrappers import AngleObservation
 
@@ -98,12 +98,12 @@ class Task:
 
 def make_pendulum() -> gym.Env:
     """Make the pendulum with five torques: Gymnasium's ``DiscretizeAction`` takes the centres of five intervals."""
-    return AngleObservation(DiscretizeAction(make_task("Pendulum-v1", disable_env_checker=True), bins=5))
+    return AngleObservation(DiscretizeAction(make_env("Pendulum-v1", disable_env_checker=True), bins=5))
 
 
 def make_acrobot() -> gym.Env:
     """Make the acrobot with its two angles in place of their cosines and sines."""
-    return AngleObservation(make_task("Acrobot-v1", disable_env_checker=True))
+    return AngleObservation(make_env("Acrobot-v1", disable_env_checker=True))
 
 
 def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
@@ -113,7 +113,7 @@ def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
     :param env_id: id of an environment with Discrete actions
     :param kwargs: arguments of ``gymnasium.make``
     """
-    return NoisyActions(make_task(env_id, **kwargs))
+    return NoisyActions(make_env(env_id, **kwargs))
 
 
 #: Steps after which an episode of combrel's Mountain Cars is cut off.
@@ -133,10 +133,10 @@ CAR_2D = Source("mountain_car_2d", mountain_car.learn_source)
 TORSO = Source("icub_torso", icub_arm.learn_source)
 CART_POLE = Source("cart_pole", cart_pole.learn_source)
 
-_car_2d = partial(make_task, mountain_car.SOURCE_ID, max_episode_steps=CAP)
-_car_4d = partial(make_task, mountain_car.TARGET_ID, max_episode_steps=CAP)
-_car_6d = partial(make_task, "combrel/MountainCar6D-v0", max_episode_steps=CAP)
-_gym_car = partial(make_task, "MountainCar-v0", disable_env_checker=True)
+_car_2d = partial(make_env, mountain_car.SOURCE_ID, max_episode_steps=CAP)
+_car_4d = partial(make_env, mountain_car.TARGET_ID, max_episode_steps=CAP)
+_car_6d = partial(make_env, "combrel/MountainCar6D-v0", max_episode_steps=CAP)
+_gym_car = partial(make_env, "MountainCar-v0", disable_env_checker=True)
 _cart_pole = cart_pole.make_cart_pole
 _long_cart_pole = partial(cart_pole.make_cart_pole, cart_pole.LONG, cart_pole.ORDER)
 _noisy_car_2d = partial(make_noisy, mountain_car.SOURCE_ID, max_episode_steps=CAP)
@@ -181,7 +181,7 @@ _ALL = (
     *(
         Task(
             f"ICubTorso{suffix}",
-            partial(make_task, f"combrel/ICubTorsoStrike{noisy}-v0"),
+            partial(make_env, f"combrel/ICubTorsoStrike{noisy}-v0"),
             STRIKE,
             n_steps=4000,
             measures=(_TORSO_SETTLED, _NEAR_50),
@@ -193,7 +193,7 @@ _ALL = (
     *(
         Task(
             f"ICubArm{suffix}",
-            partial(make_task, f"combrel/ICubArmStrike{noisy}-v0"),
+            partial(make_env, f"combrel/ICubArmStrike{noisy}-v0"),
             STRIKE,
             n_steps=10_000,
             measures=(_NEAR_50,),

@@ -1,6 +1,6 @@
 """The suite by which settings of the learner and transfer methods are compared: tasks, variants, seeds.
 
-Run as ``python -m sb3_combrel.experiments.suite --tasks MountainCar4D CartPole-v1 --variants default b0.3:model_breadth=0.3
+Run as ``python -m sb3_combrel.experiments.suite.command --tasks MountainCar4D CartPole-v1 --variants default b0.3:model_breadth=0.3
 --seeds 0-9 --jobs 2 --output suite_output``; a later call with the same folder does what is missing.
 """
 
@@ -18,11 +18,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments.statistics import TESTS
-from sb3_combrel.experiments.suite_report import cells_of, format_number, frozen_table, overview_table, task_table
-from sb3_combrel.experiments.suite_runs import SOURCES, SuiteRun, Variant, carry_out, records, write_csv
-from sb3_combrel.experiments.suite_tasks import TASKS, Task, tasks_of
-from sb3_combrel.experiments.suite_transfers import check_transfer
+from sb3_combrel.comparison.statistics import TESTS
+from sb3_combrel.comparison.tables import write_csv
+from sb3_combrel.experiments.suite.report import cells_of, format_number, frozen_table, overview_table, task_table
+from sb3_combrel.experiments.suite.runs import SOURCES, SuiteRun, Variant, carry_out, records
+from sb3_combrel.experiments.suite.tasks import TASKS, Task, tasks_of
+from sb3_combrel.experiments.suite.transfers import check_transfer
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 
 TABLES = "tables.md"

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel import InterTaskMapping, SourceInstances
-from sb3_combrel.experiments.runs import make_task, outside_bounds_on_purpose
+from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
 SOURCE_ID = "CartPole-v1"
 N_INSTANCES = 1000
@@ -47,7 +47,7 @@ def make_cart_pole(half_length: float | None = None, order: Sequence[int] | None
     :param order: for each variable of the observation the index of CartPole-v1's; None for CartPole-v1's own order
     :raises ValueError: if ``half_length`` is not a positive finite number, or ``order`` is no permutation of the variables
     """
-    env = make_task(SOURCE_ID, disable_env_checker=True)
+    env = make_env(SOURCE_ID, disable_env_checker=True)
     if half_length is not None:
         if not (np.isfinite(half_length) and half_length > 0.0):
             raise ValueError(f"half_length must be a positive finite number, got {half_length!r}")
@@ -87,7 +87,7 @@ def learn_source(seed: int = 0) -> SourceInstances:
 
     :param seed: seed of the learner and the choice
     """
-    with closing(make_cart_pole()) as env, outside_bounds_on_purpose():
+    with closing(make_cart_pole()) as env, chosen_on_purpose():
         return SourceInstances.from_fitted_rmax(
             env, N_INSTANCES, seed, n_episodes=N_SOURCE_EPISODES, degree=SOURCE_DEGREE, **LEARNER
         )

@@ -18,11 +18,12 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.common.files import write_whole
-from sb3_combrel.experiments.runs import coarse_on_purpose, outside_bounds_on_purpose
-from sb3_combrel.experiments.suite_measures import Episodes, summary_of_evaluation, summary_of_learning
-from sb3_combrel.experiments.suite_tasks import Source, Task
-from sb3_combrel.experiments.suite_transfers import make_transfer, source_for
+from sb3_combrel.experiments.suite.measures import summary_of_evaluation, summary_of_learning
+from sb3_combrel.experiments.suite.tasks import Source, Task
+from sb3_combrel.experiments.suite.transfers import make_transfer, source_for
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.runs.episodes import Episodes
+from sb3_combrel.runs.job import chosen_on_purpose
 
 #: Evaluation episodes begin with this seed plus the run's: no run has learnt with it.
 EVALUATION_SEED = 1_000_000
@@ -44,7 +45,7 @@ class Variant:
 
     :param name: in tables and file names
     :param learner: arguments of :class:`~sb3_combrel.FittedRMax`; they come before the task's own
-    :param transfer: a name of :data:`~sb3_combrel.experiments.suite_transfers.TRANSFERS`, or None
+    :param transfer: a name of :data:`~sb3_combrel.experiments.suite.transfers.TRANSFERS`, or None
     """
 
     name: str
@@ -119,7 +120,7 @@ class SuiteRun:
         transfer = None
         if self.variant.transfer is not None and self.source is not None:
             transfer = make_transfer(self.variant.transfer, self.task, self.file_of(self.source))
-        with coarse_on_purpose():
+        with chosen_on_purpose():
             learner = {**self.task.learner, **self.variant.learner}
             return FittedRMax(env, transfer=transfer, seed=self.seed, **learner)
 
@@ -160,7 +161,7 @@ def carry_out(run: SuiteRun) -> SuiteRun:
     th.set_num_threads(1)
     _compile(run)
     recorder = EpisodeRecorder(run.task.n_episodes)
-    with closing(run.task.make()) as env, outside_bounds_on_purpose():
+    with closing(run.task.make()) as env, chosen_on_purpose():
         model = run.make_model(env)
         start = time.process_time()
         model.learn(run.task.n_steps or UNLIMITED, recorder, log_interval=None)
@@ -192,7 +193,7 @@ def evaluate(run: SuiteRun, model: FittedRMax, last10_return: float) -> dict[str
     """
     found: dict[str, float] = {}
     for name, keeps_state in ((WITH_STATE, True), (WITHOUT_STATE, False)):
-        with closing(run.task.make()) as env, outside_bounds_on_purpose():
+        with closing(run.task.make()) as env, chosen_on_purpose():
             episodes = play(model, env, run.evaluation_episodes, EVALUATION_SEED + run.seed, keeps_state)
         summary = summary_of_evaluation(episodes, run.task.failure_return, last10_return)
         found |= {f"{name}_{key}": value for key, value in summary.items()}
@@ -256,7 +257,7 @@ def _compile(run: SuiteRun) -> None:
     key = (run.task.name, run.variant.name)
     if key in _COMPILED:
         return
-    with closing(run.task.make()) as env, outside_bounds_on_purpose():
+    with closing(run.task.make()) as env, chosen_on_purpose():
         model = run.make_model(gym.wrappers.TimeLimit(env, COMPILED_STEPS // 2)).learn(COMPILED_STEPS, log_interval=None)
         play(model, gym.wrappers.TimeLimit(env, 3), 1, run.seed, keeps_state=True)
     _COMPILED.add(key)

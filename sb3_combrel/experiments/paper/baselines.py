@@ -22,11 +22,10 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments import icub_arm, mountain_car
 from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB
-from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
-from sb3_combrel.experiments.suite_measures import Episodes
-from sb3_combrel.experiments.suite_runs import EVALUATION_SEED, EpisodeRecorder, play
+from sb3_combrel.experiments.tasks import icub_arm, mountain_car
+from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, Episodes, play
+from sb3_combrel.runs.job import chosen_on_purpose, make_env
 from sb3_combrel.sources.recording import TransitionRecorder
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import Transfer
@@ -208,7 +207,7 @@ def learn(job: BaselineJob) -> Learnt:
             f"total_timesteps must be more than the {n_before} steps that were made to fill the replay buffer of "
             f"{job.algorithm!r}, got {job.total_timesteps}"
         )
-    with closing(make_env(job)) as env, closing(make_env(job)) as evaluation_env:
+    with closing(scaled_env(job)) as env, closing(scaled_env(job)) as evaluation_env:
         model = make_model(job, env)
         if prefilled is not None:
             assert model.replay_buffer is not None
@@ -221,16 +220,16 @@ def learn(job: BaselineJob) -> Learnt:
     return Learnt(Episodes(*both), evaluator.evaluations, prefilled)
 
 
-def make_env(job: BaselineJob) -> RescaleObservation:
+def scaled_env(job: BaselineJob) -> RescaleObservation:
     """Make the environment of a job as the networks see it, observations between -1 and 1."""
-    return RescaleObservation(make_task(job.env_id, max_episode_steps=job.max_episode_steps), *OBSERVATION_RANGE)
+    return RescaleObservation(make_env(job.env_id, max_episode_steps=job.max_episode_steps), *OBSERVATION_RANGE)
 
 
 def make_model(job: BaselineJob, env: gym.Env) -> Any:
     """
     Make the algorithm of a job, which has learnt nothing yet.
 
-    :param env: from :func:`make_env`
+    :param env: from :func:`scaled_env`
     :raises ImportError: if QR-DQN is asked for and sb3-contrib is missing
     """
     algorithm: type = DQN
@@ -261,7 +260,7 @@ def prefill(job: BaselineJob) -> tuple[Episodes, Transitions]:
         )
     settings = PREFILLINGS[job.env_id]
     recorder, transitions = EpisodeRecorder(settings.n_episodes), TransitionRecorder()
-    with closing(make_task(job.env_id, max_episode_steps=job.max_episode_steps)) as env, coarse_on_purpose():
+    with closing(make_env(job.env_id, max_episode_steps=job.max_episode_steps)) as env, chosen_on_purpose():
         model = FittedRMax(env, transfer=COMBREL(job.source, **settings.transfer), seed=job.seed, **settings.learner)
         model.learn(settings.n_episodes * job.max_episode_steps, [transitions, recorder], log_interval=None)
     transfer = model.agent.transfer
