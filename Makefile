@@ -89,7 +89,7 @@ suite: $(VENV)/.installed-demo
 
 # ICUB_ARGS="--task arm --look primitives", for instance.
 icub-video: $(VENV)/.installed-all gl
-	$(BIN)/python -m sb3_combrel.experiments.icub $(ICUB_ARGS)
+	$(BIN)/python -m sb3_combrel.experiments.film $(ICUB_ARGS)
 
 test: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up

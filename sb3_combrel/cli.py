@@ -86,7 +86,7 @@ def reproduce(
     episodes: int | None = None,
     jobs: int | None = None,
     output: Path | None = None,
-    backend: str = "joblib",
+    backend: str = "loky",
     address: str | None = None,
 ) -> None:
     """
@@ -102,13 +102,14 @@ def reproduce(
     :param episodes: of each run; by default 200 and 300
     :param jobs: local processes at a time; one a core by default
     :param output: folder for all results; by default reproduction/ and the name of the setting
-    :param backend: joblib (local processes), or ray or dask: a cluster that is running
+    :param backend: loky (local processes), or ray or dask: a cluster that is running
     :param address: of the cluster, such as 10.0.0.1:6379 (ray) or tcp://10.0.0.1:8786 (dask)
     """
-    from sb3_combrel.experiments.carrying_out import Engine
     from sb3_combrel.experiments.paper.reproduce import reproduce as run
+    from sb3_combrel.runs.runner import Backend
 
-    made = run(target, setting=setting, runs=runs, episodes=episodes, output=output, engine=Engine(backend, jobs, address))
+    where = Backend(backend, jobs, address)
+    made = run(target, setting=setting, runs=runs, episodes=episodes, output=output, backend=where)
     print("Written:", *made, sep="\n  ")
 
 
@@ -135,7 +136,7 @@ def benchmark(
     seeds: int = 10,
     first_seed: int = 7000,
     jobs: int | None = None,
-    backend: str = "joblib",
+    backend: str = "loky",
     address: str | None = None,
     output: Path = Path("benchmark"),
 ) -> None:
@@ -149,15 +150,15 @@ def benchmark(
     :param seeds: runs of each method on each pair
     :param first_seed: seed of the first
     :param jobs: local processes at a time; one a core by default
-    :param backend: joblib (local processes), or ray or dask: a cluster that is running
+    :param backend: loky (local processes), or ray or dask: a cluster that is running
     :param address: of the cluster, such as 10.0.0.1:6379 (ray) or tcp://10.0.0.1:8786 (dask)
     :param output: folder for all results
     """
     from sb3_combrel.experiments.benchmark.command import benchmark as run
-    from sb3_combrel.experiments.carrying_out import Engine
+    from sb3_combrel.runs.runner import Backend
 
-    engine = Engine(backend, jobs, address)
-    made = run(pairs, methods, seeds=seeds, first_seed=first_seed, output=output, engine=engine)
+    where = Backend(backend, jobs, address)
+    made = run(pairs, methods, seeds=seeds, first_seed=first_seed, output=output, backend=where)
     print("Written:", *made, sep="\n  ")
 
 

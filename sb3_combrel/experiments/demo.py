@@ -2,39 +2,109 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
+import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import cpu_count
+import pandas as pd
+from matplotlib.ticker import MaxNLocator
 from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
 
-import sb3_combrel
-from sb3_combrel import FittedRMax, SourceInstances
-from sb3_combrel.experiments import report
-from sb3_combrel.experiments.figures import draw_learning_curves
-from sb3_combrel.experiments.parallel import carry_out_all
-from sb3_combrel.experiments.runs import Run
+from sb3_combrel import FittedRMax
+from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.comparison.figures import COLOURS, MARKERS, draw_band, figure_of
+from sb3_combrel.comparison.statistics import mean_of_runs, saving
+from sb3_combrel.comparison.tables import Table
+from sb3_combrel.experiments.film import film, greedy_episode
 from sb3_combrel.experiments.tasks import mountain_car
-from sb3_combrel.experiments.video import film, greedy_episode
 from sb3_combrel.experiments.warm_up import warm_up
-from sb3_combrel.runs.job import chosen_on_purpose, make_env
+from sb3_combrel.runs.episodes import EVALUATION_SEED
+from sb3_combrel.runs.job import Job, Result, chosen_on_purpose, make_env
+from sb3_combrel.runs.runner import FOLDER, Backend, check_all_succeeded, prepare_folder, run_missing
+from sb3_combrel.runs.source_files import load_or_learn
 
-SETTINGS, SOURCE, RUNS, TENSORBOARD = "settings.json", "source.npz", "runs", "tensorboard"
+SOURCE, TENSORBOARD = "source.npz", "tensorboard"
 FIGURE, TABLES, RESULTS = "learning_curves.png", "tables.md", "results.csv"
 MODEL, VIDEO = "car.zip", "car.mp4"
 #: All that the demonstration writes into its folder.
-OUTPUTS = (SETTINGS, SOURCE, RUNS, TENSORBOARD, FIGURE, TABLES, RESULTS, MODEL, VIDEO)
-
+OUTPUTS = (SOURCE, FOLDER, TENSORBOARD, FIGURE, TABLES, RESULTS, MODEL, VIDEO)
+MAPPINGS_SHOWN = 8
 FILMED = "COMBREL"
-SOURCE_SEED = 0
-#: Not the seed of any run.
-EVALUATION_SEED = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoRun(Job):
+    """
+    A run that leaves its model and TensorBoard logs in the output folder, and counts the mappings used.
+
+    :param folder: the output folder
+    """
+
+    folder: Path
+
+    @property
+    def model_file(self) -> Path:
+        """The trained model."""
+        return self.folder / FOLDER / f"{self.name}.zip"
+
+    def settings(self) -> dict[str, Any]:
+        """All but the folder, which may be moved."""
+        return {name: value for name, value in super().settings().items() if name != "folder"}
+
+    def carry_out(self) -> Result:
+        """Learn; a run that was stopped is repeated from the start, so that its results are those of a run without a stop."""
+        logs = self.folder / TENSORBOARD
+        for earlier in logs.glob(f"{self.name}_[0-9]*"):
+            shutil.rmtree(earlier, ignore_errors=True)
+        assert self.n_episodes is not None and self.max_episode_steps is not None
+        episodes = EpisodeLog(self.n_episodes)
+        with closing(self.make_env()) as env, chosen_on_purpose():
+            model = FittedRMax(env, transfer=self.transfer, seed=self.seed, tensorboard_log=str(logs), **self.learner)
+            start = time.process_time()
+            model.learn(self.n_episodes * self.max_episode_steps, episodes, log_interval=1, tb_log_name=self.name)
+            seconds = time.process_time() - start
+        transfer: Any = model.agent.transfer
+        counts = {} if transfer is None else {str(mapping): count for mapping, count in transfer.mapping_counts()}
+        model.save(self.model_file)
+        more = {"mappings": counts, "wall_seconds": episodes.wall_seconds}
+        return self.result(episodes.steps, episodes.returns, episodes.terminated, model.num_timesteps, more, seconds)
+
+
+class EpisodeLog(BaseCallback):
+    """
+    Keeps and logs every episode, and stops the learning after the last.
+
+    :param n_episodes: episodes to learn
+    """
+
+    def __init__(self, n_episodes: int):
+        super().__init__()
+        self.n_episodes = n_episodes
+        self.steps: list[int] = []
+        self.returns: list[float] = []
+        self.terminated: list[bool] = []
+        self.wall_seconds: list[float] = []
+
+    def _on_step(self) -> bool:
+        # One step later: the algorithm plans and logs at the end of an episode only after it has asked the callbacks.
+        if len(self.steps) >= self.n_episodes:
+            return False
+        for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
+            if done:
+                self.steps.append(int(info["episode"]["l"]))
+                self.returns.append(float(info["episode"]["r"]))
+                self.terminated.append(not info.get("TimeLimit.truncated", False))
+                self.wall_seconds.append(float(info["episode"]["t"]))
+                self.logger.record("rollout/ep_len", self.steps[-1])
+                self.logger.record("rollout/episode", len(self.steps))
+        return True
 
 
 def run_demo(
@@ -58,100 +128,60 @@ def run_demo(
     :param max_episode_steps: steps after which an episode is cut off
     :param model_breadth: breadth of the learner's kernel; None for the learner's own
     :param workers: processes at a time; None for one a core
-    :param fresh: delete the results in the folder first
+    :param fresh: delete the results of the demonstration in the folder first; nothing else is ever deleted
     :param console: where to write; None for the standard output
-    :raises ValueError: if a number is below 1, or the folder has results of other settings
+    :raises ValueError: if a number is below 1, or the folder has results of other settings or other files
     """
-    workers = cpu_count() if workers is None else workers
-    numbers = {"seeds": n_seeds, "episodes": n_episodes, "max_episode_steps": max_episode_steps, "workers": workers}
-    for name, number in numbers.items():
-        if number < 1:
-            raise ValueError(f"{name} must be at least 1, got {number}")
-    if model_breadth is not None and not model_breadth > 0.0:
-        raise ValueError(f"model_breadth must be positive, got {model_breadth}")
+    check_count("seeds", n_seeds)
+    check_count("episodes", n_episodes)
+    check_count("max_episode_steps", max_episode_steps)
+    check_count("workers", workers, none_allowed=True)
+    if model_breadth is not None:
+        check_positive("model_breadth", model_breadth)
     console = console or Console()
+    if fresh and (output / FOLDER).exists():
+        for name in OUTPUTS:
+            path = output / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    prepare_folder(output)
+    source = load_or_learn(output / SOURCE, mountain_car.learn_source, console)
     learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
-    prepare_folder(output, _settings(learner, max_episode_steps), fresh)
-    source = _source(output / SOURCE, console)
     runs = [
-        Run(output, method, seed, mountain_car.TARGET_ID, n_episodes, max_episode_steps, transfer, learner)
+        DemoRun(
+            group="",
+            method=method,
+            seed=seed,
+            env=mountain_car.TARGET_ID,
+            n_episodes=n_episodes,
+            max_episode_steps=max_episode_steps,
+            learner=learner,
+            transfer=transfer,
+            folder=output,
+        )
         for seed in range(n_seeds)
         for method, transfer in mountain_car.methods(source).items()
     ]
-    if not all(run.is_complete() for run in runs):
+    if not all(run.model_file.exists() for run in runs):
         with console.status("Compiling; the first time this takes a while ..."):
             warm_up()
         console.print(f"Learning {mountain_car.TARGET_ID}: {n_seeds} runs of {n_episodes} episodes with each method ...")
-    carry_out_all(runs, workers, console)
-    _report(runs, output, console)
+    results = run_missing(runs, output, Backend(n_jobs=workers), console)
+    check_all_succeeded(results)
+    _report(results, max_episode_steps, output, console)
     shutil.copyfile(_best([run for run in runs if run.method == FILMED], console).model_file, output / MODEL)
     _film(output, max_episode_steps, console)
     _epilogue(output, n_seeds, console)
 
 
-def prepare_folder(output: Path, settings: dict[str, Any], fresh: bool | None = None) -> None:
-    """
-    Prepare the folder for results; those of an earlier call with the same settings are kept.
-
-    :param output: the folder
-    :param settings: what the results depend on, as data that JSON can represent
-    :param fresh: delete earlier results of the demonstration; nothing else is ever deleted. None: the command has no --fresh
-    :raises ValueError: if there are results of other settings, or files that are not results of the command
-    """
-    file = output / SETTINGS
-    if output.exists() and not file.exists() and any(output.iterdir()):
-        raise ValueError(f"{output} has files that are not results of this command; choose another --output")
-    if fresh:
-        for name in OUTPUTS:
-            path = output / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-    elif file.exists():
-        before = json.loads(file.read_text())
-        other = sorted(key for key in {*before, *settings} if before.get(key) != settings.get(key))
-        if other:
-            differences = ", ".join(f"{key} was {before.get(key)!r} and is {settings.get(key)!r}" for key in other)
-            remedy = "use another --output" if fresh is None else "use --fresh or another --output"
-            raise ValueError(f"{output} has results of other settings ({differences}); {remedy}")
-    output.mkdir(parents=True, exist_ok=True)
-    unfinished = file.with_suffix(".part")
-    unfinished.write_text(json.dumps(settings, indent=2) + "\n")
-    os.replace(unfinished, file)
-
-
-def _settings(learner: dict[str, Any], max_episode_steps: int) -> dict[str, Any]:
-    """Return what a run's results depend on, except for its seed and number of episodes."""
-    return {
-        "version": sb3_combrel.__version__,
-        "source": mountain_car.SOURCE_ID,
-        "target": mountain_car.TARGET_ID,
-        "source_instances": mountain_car.N_INSTANCES,
-        "source_seed": SOURCE_SEED,
-        "learner": learner,
-        "max_episode_steps": max_episode_steps,
-    }
-
-
-def _source(path: Path, console: Console) -> SourceInstances:
-    if path.exists():
-        return SourceInstances.load(path)
-    with console.status(f"Learning the source task {mountain_car.SOURCE_ID} ..."):
-        source = mountain_car.learn_source(SOURCE_SEED)
-    source.save(path)
-    console.print(f"Learned {mountain_car.SOURCE_ID} by Q-learning and kept {len(source)} instances.")
-    return source
-
-
-def _report(runs: Sequence[Run], output: Path, console: Console) -> None:
-    steps = {
-        method: np.array([run.steps() for run in runs if run.method == method])
-        for method in dict.fromkeys(run.method for run in runs)
-    }
-    cap = runs[0].max_episode_steps
-    title = "Mountain Car 4D, learned with 1000 instances of Mountain Car 2D"
-    draw_learning_curves(steps, output / FIGURE, title, cap)
-    report.write_results(runs, output / RESULTS)
-    tables = [report.episodes_table(steps), report.savings_table(steps, mountain_car.NO_TRANSFER)]
-    tables += [report.mappings_table(runs, method) for method in steps if method != mountain_car.NO_TRANSFER]
+def _report(results: Sequence[Result], cap: int, output: Path, console: Console) -> None:
+    by_method: dict[str, list[Result]] = {}
+    for result in results:
+        by_method.setdefault(result.method, []).append(result)
+    steps = {method: np.array([result.steps for result in its_own]) for method, its_own in by_method.items()}
+    draw_learning_curves(steps, output / FIGURE, "Mountain Car 4D, learned with 1000 instances of Mountain Car 2D", cap)
+    results_frame(results).to_csv(output / RESULTS, index=False, lineterminator="\r\n")
+    tables = [episodes_table(steps), savings_table(steps, mountain_car.NO_TRANSFER)]
+    tables += [mappings_table(its_own, method) for method, its_own in by_method.items() if method != mountain_car.NO_TRANSFER]
     note = f"An episode that doesn't reach the goal is cut off after {cap} steps and counts as {cap}."
     (output / TABLES).write_text("\n".join(table.as_markdown() for table in tables) + f"\n{note}\n")
     for table in tables:
@@ -159,7 +189,102 @@ def _report(runs: Sequence[Run], output: Path, console: Console) -> None:
     console.print(note)
 
 
-def _best(runs: Sequence[Run], console: Console) -> Run:
+def results_frame(results: Sequence[Result]) -> pd.DataFrame:
+    """Return a row for each episode of each run."""
+    frames = [
+        pd.DataFrame(
+            {
+                "method": result.method,
+                "seed": result.seed,
+                "episode": range(1, len(result.steps) + 1),
+                "steps": result.steps,
+                "reached_goal": np.array(result.terminated, dtype=int),
+                "seconds": [f"{seconds:.2f}" for seconds in result.more["wall_seconds"]],
+            }
+        )
+        for result in results
+    ]
+    return pd.concat(frames)
+
+
+def draw_learning_curves(steps: dict[str, np.ndarray], path: Path, title: str, cap: int) -> None:
+    """
+    Draw the steps of each episode, mean of the runs, with bands of 95% confidence.
+
+    :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
+    :param path: PNG file to write
+    :param title: title of the figure
+    :param cap: steps after which an episode was cut off
+    """
+    figure = figure_of(7.0, 4.2)
+    axes = figure.add_subplot()
+    highest = 0.0
+    for (method, samples), colour, marker in zip(steps.items(), COLOURS, MARKERS, strict=False):
+        mean, low, high = mean_of_runs(samples)
+        # No run can need more steps than the cap, nor fewer than none.
+        low, high = np.maximum(low, 0), np.minimum(high, cap)
+        highest = max(highest, float(high.max()))
+        label = f"{method} ({len(samples)} runs)"
+        draw_band(axes, np.arange(1, len(mean) + 1), (mean, low, high), colour, label=label, marker=marker, markersize=5)
+    axes.set_xlabel("episode")
+    axes.set_ylabel(f"steps to goal (at most {cap})")
+    axes.set_title(title)
+    if np.isfinite(highest) and highest > 0.0:
+        axes.set_ylim(0, 1.05 * highest)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=120)
+
+
+def episodes_table(steps: dict[str, np.ndarray]) -> Table:
+    """
+    Make a table of the steps of each episode and of all, mean of the runs and half the width of its 95% confidence interval.
+
+    :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
+    """
+    n_runs, n_episodes = next(iter(steps.values())).shape
+    columns = [
+        [_mean_and_half(samples[:, episode]) for episode in range(n_episodes)] + [_mean_and_half(samples.sum(axis=1))]
+        for samples in steps.values()
+    ]
+    labels = [str(episode + 1) for episode in range(n_episodes)] + ["all"]
+    title = f"Steps to goal, mean of {n_runs} runs and 95% confidence interval"
+    return Table(title, ("episode", *steps), list(zip(labels, *columns, strict=True)))
+
+
+def savings_table(steps: dict[str, np.ndarray], baseline: str) -> Table:
+    """
+    Make a table of the steps saved over all episodes.
+
+    :param steps: as above
+    :param baseline: the method that the others are compared with
+    """
+    rows = []
+    for method, samples in steps.items():
+        if method != baseline:
+            saved = saving(steps[baseline].sum(axis=1), samples.sum(axis=1))
+            interval = "needs more runs" if np.isnan(saved.low) else f"{saved.low:,.0f} to {saved.high:,.0f}"
+            p_value = "-" if np.isnan(saved.p_value) else f"{saved.p_value:.1e}"
+            rows.append((method, f"{saved.steps:,.0f}", interval, f"{saved.share:.0%}", p_value))
+    header = ("method", "steps saved", "95% interval", "share", "p (Welch)")
+    return Table(f"Environment steps saved, compared with {baseline}", header, rows)
+
+
+def mappings_table(results: Sequence[Result], method: str) -> Table:
+    """Make a table of the mappings that a method used most, over all its runs."""
+    counts = sum((Counter(result.more["mappings"]) for result in results), Counter())
+    total = max(counts.total(), 1)
+    rows = [(name, f"{count / total:.1%}") for name, count in counts.most_common(MAPPINGS_SHOWN)]
+    return Table(f"Mappings that {method} used most ({len(counts)} in all)", ("mapping", "share of uses"), rows)
+
+
+def _mean_and_half(samples: np.ndarray) -> str:
+    mean, _, high = mean_of_runs(samples)
+    return f"{mean:,.0f}" if np.isnan(high) else f"{mean:,.0f} ± {high - mean:,.0f}"
+
+
+def _best(runs: Sequence[DemoRun], console: Console) -> DemoRun:
     """Return the run whose model needs the fewest steps without exploring."""
     with console.status("Trying the trained cars ..."):
         steps = [_drive(run) for run in runs]
@@ -171,8 +296,8 @@ def _best(runs: Sequence[Run], console: Console) -> Run:
     return runs[best]
 
 
-def _drive(run: Run) -> int:
-    with closing(make_env(run.env_id, max_episode_steps=run.max_episode_steps)) as env:
+def _drive(run: DemoRun) -> int:
+    with closing(run.make_env()) as env:
         return sum(1 for _ in greedy_episode(load_car(run.model_file), env, EVALUATION_SEED))
 
 
@@ -181,14 +306,12 @@ def _film(output: Path, max_episode_steps: int, console: Console) -> None:
 
     (output / VIDEO).unlink(missing_ok=True)
     size = {"width": 480, "height": 360}
-    env = make_env(mountain_car.TARGET_ID, max_episode_steps=max_episode_steps, render_mode="rgb_array", **size)
-    try:
-        with console.status("Filming the trained car ..."):
-            film(load_car(output / MODEL), env, output / VIDEO, EVALUATION_SEED)
-    except (RenderingError, ModuleNotFoundError) as error:
-        console.print(f"No video: {error}", style="yellow", markup=False)
-    finally:
-        env.close()
+    with closing(make_env(mountain_car.TARGET_ID, max_episode_steps, render_mode="rgb_array", **size)) as env:
+        try:
+            with console.status("Filming the trained car ..."):
+                film(load_car(output / MODEL), env, output / VIDEO, EVALUATION_SEED)
+        except (RenderingError, ModuleNotFoundError) as error:
+            console.print(f"No video: {error}", style="yellow", markup=False)
 
 
 def load_car(path: Path) -> FittedRMax:
@@ -209,7 +332,7 @@ def _epilogue(output: Path, n_seeds: int, console: Console) -> None:
         VIDEO: "the trained car",
         MODEL: "the trained model: FittedRMax.load",
         SOURCE: "the source instances: SourceInstances.load",
-        RUNS: "episodes, mappings and model of each run",
+        FOLDER: "result and model of each run",
         TENSORBOARD: "logs of each run",
     }
     console.print(f"\nEverything is in {output.resolve()}:", highlight=False, soft_wrap=True)

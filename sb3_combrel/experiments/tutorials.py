@@ -8,7 +8,6 @@ Run as ``python -m sb3_combrel.experiments.tutorials``.
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import sys
@@ -124,11 +123,13 @@ def _fenced(block: str | None) -> str | None:
     return None if block is None else block.split("```text\n", 1)[1].rsplit("\n```", 1)[0]
 
 
-def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description="Execute the tutorials and renew the outputs and figures in them.")
-    parser.add_argument("files", type=Path, nargs="*", help=f"tutorials; all of {FOLDER}/ if none is named")
-    for file in parser.parse_args().files or tutorial_files():
+def tutorials(files: tuple[Path, ...] = (), /) -> None:
+    """
+    Execute tutorials and renew the outputs and figures in them.
+
+    :param files: tutorials; all of tutorials/ by default
+    """
+    for file in files or tutorial_files():
         began = time.perf_counter()
         outputs = execute(file)
         write_whole(file, with_outputs(file.read_text(), outputs).encode())
@@ -136,4 +137,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    import tyro
+
+    tyro.cli(tutorials)

@@ -176,11 +176,21 @@ def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None
         return None
 
 
-def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
-    """Results by name, without those that failed."""
+def prepare_folder(output: Path) -> None:
+    """
+    Prepare a folder for results; those that are there are kept.
+
+    :param output: the folder
+    :raises ValueError: if it has files that are not results
+    """
     if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
         raise ValueError(f"{output} has files that are not results of this command; choose another --output")
     (output / FOLDER).mkdir(parents=True, exist_ok=True)
+
+
+def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
+    """Results by name, without those that failed."""
+    prepare_folder(output)
     found = {}
     for job in jobs:
         read = read_result(output, job.name)

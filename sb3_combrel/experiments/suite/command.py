@@ -1,30 +1,29 @@
 """The suite by which settings of the learner and transfer methods are compared: tasks, variants, seeds.
 
-Run as ``python -m sb3_combrel.experiments.suite.command --tasks MountainCar4D CartPole-v1 --variants default b0.3:model_breadth=0.3
---seeds 0-9 --jobs 2 --output suite_output``; a later call with the same folder does what is missing.
+Run as ``python -m sb3_combrel.experiments.suite.command --tasks MountainCar4D CartPole-v1 --variants default
+b0.3:model_breadth=0.3 --seeds 0-9 --jobs 2 --output suite_output``; a later call with the same folder does what is missing.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
-from rich.progress import Progress
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.comparison.statistics import TESTS
-from sb3_combrel.comparison.tables import write_csv
-from sb3_combrel.experiments.suite.report import cells_of, format_number, frozen_table, overview_table, task_table
-from sb3_combrel.experiments.suite.runs import SOURCES, SuiteRun, Variant, carry_out, records
-from sb3_combrel.experiments.suite.tasks import TASKS, Task, tasks_of
+from sb3_combrel.experiments.suite.report import cells_of, frozen_table, overview_table, task_table
+from sb3_combrel.experiments.suite.runs import Variant, suite_runs, write_csv_files
+from sb3_combrel.experiments.suite.tasks import Task, tasks_of
 from sb3_combrel.experiments.suite.transfers import check_transfer
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, run_missing
+from sb3_combrel.runs.source_files import FOLDER, load_or_learn
 
 TABLES = "tables.md"
 DEFAULT = "default"
@@ -81,7 +80,7 @@ def run_suite(
     tasks: Sequence[Task],
     variants: Sequence[Variant],
     seeds: Sequence[int],
-    jobs: int = 1,
+    jobs: int | None = 1,
     evaluation_episodes: int = 100,
     reference: str | None = None,
     test: str = "welch",
@@ -96,7 +95,7 @@ def run_suite(
     :param tasks: what to learn
     :param variants: the settings to compare, with different names
     :param seeds: seeds of the runs
-    :param jobs: processes at a time
+    :param jobs: processes at a time; None: one a core
     :param evaluation_episodes: episodes to play after learning
     :param reference: name of the variant that the others are compared with; None for the first
     :param test: ``"welch"`` or ``"mann-whitney"``
@@ -107,25 +106,29 @@ def run_suite(
     reference = names[0] if reference is None and names else reference
     _check(variants, tasks, jobs, evaluation_episodes, reference, test)
     console = console or Console()
-    runs = [SuiteRun(output, task, own, seed, evaluation_episodes) for seed in seeds for task in tasks for own in variants]
-    missing = [run for run in runs if not run.is_complete()]
-    if len(missing) < len(runs):
-        console.print(f"{len(runs) - len(missing)} of {len(runs)} runs were complete already.")
-    _learn_sources(missing, console)
-    _carry_out_all(missing, jobs, console)
-    write_csv(output)
-    _write_tables(runs, tasks, names, str(reference), test, console)
+    prepare_folder(output)
+    wanted = {source.name: source for task in tasks for own in variants if (source := own.source(task)) is not None}
+    sources = {name: load_or_learn(output / FOLDER / f"{name}.npz", source.learn, console) for name, source in wanted.items()}
+    runs = suite_runs(tasks, variants, seeds, evaluation_episodes, sources)
+    results = run_missing(runs, output, Backend(n_jobs=jobs), console)
+    write_csv_files(output)
+    check_all_succeeded(results)
+    cells = cells_of([result.more["row"] for result in results], tasks, names, reference, test)
+    overview, frozen = overview_table(cells, tasks, names), frozen_table(cells, tasks, names)
+    tables = [overview, frozen, *(task_table(cells, task, names, f"p against {reference}") for task in tasks)]
+    (output / TABLES).write_text("\n".join(table.as_markdown() for table in tables))
+    console.print(overview.for_terminal())
 
 
 def _check(
     variants: Sequence[Variant],
     tasks: Sequence[Task],
-    jobs: int,
+    jobs: int | None,
     evaluation_episodes: int,
     reference: str | None,
     test: str,
 ) -> None:
-    check_count("jobs", jobs)
+    check_count("jobs", jobs, none_allowed=True)
     check_count("evaluation_episodes", evaluation_episodes)
     names = [variant.name for variant in variants]
     if not names or len(set(names)) < len(names):
@@ -140,49 +143,6 @@ def _check(
                 check_transfer(variant.transfer, task)
 
 
-def _learn_sources(runs: Sequence[SuiteRun], console: Console) -> None:
-    """Learn, once for all runs, the source tasks that they need."""
-    for run in runs:
-        source = run.source
-        if source is not None and not run.file_of(source).exists():
-            console.print(f"Learning the source task {source.name} ...")
-            (run.folder / SOURCES).mkdir(parents=True, exist_ok=True)
-            source.learn().save(run.file_of(source))
-
-
-def _carry_out_all(runs: Sequence[SuiteRun], jobs: int, console: Console) -> None:
-    """Carry out runs, each in one thread of a process of its own, and write the CSV files after each."""
-    if not runs:
-        return
-    with Progress(console=console, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("runs", total=len(runs))
-        with parallel_config(backend="loky", inner_max_num_threads=1):
-            finished = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(carry_out)(run) for run in runs)
-            for number, run in enumerate(finished, 1):
-                write_csv(run.folder)
-                progress.update(bar, completed=number)
-                console.print(f"[{number}/{len(runs)}] {_line(run)}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _line(run: SuiteRun) -> str:
-    row = json.loads(run.file.read_text())["row"]
-    values = [f"{key} {format_number(row[key])}" for key in dict.fromkeys((run.task.headline, "greedy_mean", "ms_per_step"))]
-    return f"{run.task.name}, {run.variant.name}, seed {run.seed}: {', '.join(values)}"
-
-
-def _write_tables(
-    runs: Sequence[SuiteRun], tasks: Sequence[Task], variants: Sequence[str], reference: str, test: str, console: Console
-) -> None:
-    names = {run.name for run in runs}
-    rows = [record["row"] for record in records(runs[0].folder) if record["row"]["run"] in names]
-    cells = cells_of(rows, tasks, variants, reference, test)
-    overview = overview_table(cells, tasks, variants)
-    frozen = frozen_table(cells, tasks, variants)
-    tables = [overview, frozen, *(task_table(cells, task, variants, f"p against {reference}") for task in tasks)]
-    (runs[0].folder / TABLES).write_text("\n".join(table.as_markdown() for table in tables))
-    console.print(overview.for_terminal())
-
-
 def _value(text: str) -> Any:
     try:
         return json.loads(text)
@@ -190,29 +150,42 @@ def _value(text: str) -> Any:
         return text.strip()
 
 
+def suite(
+    tasks: list[str] = ["all"],  # noqa: B006 - tyro shows it, nobody changes it
+    variants: list[str] = [DEFAULT],  # noqa: B006
+    seeds: str = "0-9",
+    first_seed: int = 0,
+    jobs: int | None = None,
+    evaluation_episodes: int = 100,
+    reference: str | None = None,
+    test: str = "welch",
+    output: Path = Path("suite_output"),
+) -> None:
+    """
+    Compare settings of Fitted R-Max and transfer methods over tasks.
+
+    :param tasks: names of tasks, or all
+    :param variants: default, name:key=value,key=value, or JSON with a name
+    :param seeds: numbers and ranges, such as 0-9 or 0,2,5-7
+    :param first_seed: is added to each of the seeds
+    :param jobs: processes at a time; one a core by default
+    :param evaluation_episodes: played after learning
+    :param reference: the variant that the others are compared with; the first by default
+    :param test: welch, mann-whitney or permutation
+    :param output: folder for all results; a later call goes on from there
+    """
+    chosen, numbers = [variant_of(text) for text in variants], seeds_of(seeds, first_seed)
+    run_suite(output, tasks_of(tasks), chosen, numbers, jobs, evaluation_episodes, reference, test)
+
+
 def main() -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description="Compare settings of Fitted R-Max and transfer methods over tasks.")
-    parser.add_argument("--tasks", nargs="+", default=["all"], help=f"'all' or some of {', '.join(TASKS)}")
-    parser.add_argument(
-        "--variants", nargs="+", default=[DEFAULT], help="default, name:key=value,key=value, or JSON with a name"
-    )
-    parser.add_argument("--seeds", default="0-9", help="numbers and ranges")
-    parser.add_argument("--first-seed", type=int, default=0, help="is added to each of the seeds")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
-    parser.add_argument("--evaluation-episodes", type=int, default=100, help="played after learning")
-    parser.add_argument("--reference", default=None, help="the variant to compare with; the first if not given")
-    parser.add_argument("--test", choices=TESTS, default="welch")
-    parser.add_argument(
-        "--output", type=Path, default=Path("suite_output"), help="a later call continues from the results in it"
-    )
-    given = parser.parse_args()
+    import tyro
+
     try:
-        tasks, variants = tasks_of(given.tasks), [variant_of(text) for text in given.variants]
-        seeds = seeds_of(given.seeds, given.first_seed)
-        run_suite(given.output, tasks, variants, seeds, given.jobs, given.evaluation_episodes, given.reference, given.test)
+        tyro.cli(suite, config=(tyro.conf.FlagCreatePairsOff,))
     except ValueError as error:
-        parser.error(str(error))
+        sys.exit(f"suite: {error}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.comparison.measures import steps_to_reach
+from sb3_combrel.runs.episodes import Episodes
 
 #: So many episodes at the end of learning are what the frozen policy is compared with.
 LAST = 10
@@ -15,31 +16,6 @@ LAST = 10
 SHORTEST_TAIL = 5
 #: The frozen policy is as good as the learning agent if its mean return is lower by at most this fraction.
 TOLERATED_LOSS = 0.05
-
-
-class Episodes(NamedTuple):
-    """
-    Episodes that have ended, one entry each.
-
-    :param steps: environment steps, shape (n_episodes,)
-    :param returns: undiscounted sums of rewards, shape (n_episodes,)
-    :param terminated: bool, whether a terminal state ended it; False for a time limit, shape (n_episodes,)
-    """
-
-    steps: np.ndarray
-    returns: np.ndarray
-    terminated: np.ndarray
-
-    @classmethod
-    def from_rows(cls, rows: list[tuple[int, float, bool]]) -> Episodes:
-        """Make them from (steps, return, terminated) of each episode."""
-        steps, returns, terminated = zip(*rows, strict=True) if rows else ((), (), ())
-        return cls(np.array(steps, dtype=np.int64), np.array(returns, dtype=np.float64), np.array(terminated, dtype=bool))
-
-    def last(self, n: int) -> Episodes:
-        """The last ``n`` of them, or all if there are fewer."""
-        start = max(len(self.steps) - n, 0)
-        return Episodes(*(column[start:] for column in self))
 
 
 class Measure(NamedTuple):

@@ -160,8 +160,7 @@ def _p_values(values: dict[str, np.ndarray], reference: str | None, test: str) -
     if reference is None or reference not in values:
         return {}
     others = [variant for variant in values if variant != reference]
-    raw = [p_value_of_difference(values[reference], values[variant], test) for variant in others]
-    return dict(zip(others, holm(np.array(raw)).tolist(), strict=True))
+    return holm({variant: p_value_of_difference(values[reference], values[variant], test) for variant in others})
 
 
 def _mark(cell: Cell) -> str:

@@ -7,19 +7,23 @@ sb3_combrel.experiments.suite.residual_successors --seeds 4``; each run takes ha
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
 from contextlib import closing
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
-import torch as th
+from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_combrel.common.checks import check_count
+from sb3_combrel.comparison.tables import markdown_table
 from sb3_combrel.experiments.suite.measures import LAST
 from sb3_combrel.experiments.suite.tasks import TASKS
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.models.base import Model, Predictions
-from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, play
+from sb3_combrel.runs.episodes import EVALUATION_SEED, play
+from sb3_combrel.runs.job import Job, Result
+from sb3_combrel.runs.runner import Backend, check_all_succeeded, run_missing
 
 #: The tasks with two state variables and random outcomes, and how many steps of each are learnt.
 STEPS = {"ICubTorso-noisy": 1500, "MountainCar-v0-noisy": 3000}
@@ -119,37 +123,52 @@ def _fit(
     return mean_effect + np.einsum("ni,nij->nj", at - mean_state, slopes), differences - away @ slopes
 
 
-def run(task_name: str, model_class: type[Model], seed: int) -> tuple[float, float]:
+@dataclass(frozen=True, kw_only=True)
+class ModelRun(Job):
+    """A run whose result has the mean returns of the last episodes of learning and of playing without exploration."""
+
+    def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
+        """Play the task without exploration."""
+        with closing(self.make_env()) as env:
+            played = play(model, env, EVALUATION_EPISODES, EVALUATION_SEED + self.seed, keeps_state=True)
+        return {"learning": float(np.mean(result.returns[-LAST:])), "greedy": float(played.returns.mean())}
+
+
+def jobs_of(n_seeds: int) -> list[ModelRun]:
+    """Make the runs of both models on each of the tasks, with the seeds from 0 on."""
+    return [
+        ModelRun(
+            group=name,
+            method=model.__name__,
+            seed=seed,
+            env=TASKS[name].make,
+            n_steps=n_steps,
+            learner={"resolution": RESOLUTION, "policy_kwargs": {"model_class": model}, **TASKS[name].learner},
+        )
+        for name, n_steps in STEPS.items()
+        for model in (MeanSuccessor, ResidualSuccessors)
+        for seed in range(n_seeds)
+    ]
+
+
+def residual_successors(seeds: int = 4, jobs: int | None = 1) -> None:
     """
-    Learn a task and play it without exploration.
+    Compare the two models, and print a table with a row for each run.
 
-    :param task_name: one of :data:`STEPS`
-    :return: mean return of the last ten episodes of learning, and of the evaluation
+    :param seeds: runs of each, from seed 0 on
+    :param jobs: processes at a time
     """
-    task, recorder = TASKS[task_name], EpisodeRecorder()
-    with closing(task.make()) as env:
-        model = FittedRMax(env, seed=seed, resolution=RESOLUTION, policy_kwargs=dict(model_class=model_class), **task.learner)
-        model.learn(STEPS[task_name], recorder, log_interval=None)
-    with closing(task.make()) as env:
-        played = play(model, env, EVALUATION_EPISODES, EVALUATION_SEED + seed, keeps_state=True)
-    return float(recorder.episodes.returns[-LAST:].mean()), float(played.returns.mean())
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the comparison and print a table row for each run."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--seeds", type=int, default=4, help="runs of each, from seed 0 on")
-    seeds = parser.parse_args(arguments).seeds
-    if seeds < 1:
-        parser.error(f"--seeds must be at least 1, got {seeds}")
-    th.set_num_threads(1)
-    print("| task | model | seed | last 10 of learning | greedy |\n| --- | --- | ---: | ---: | ---: |")
-    for task_name in STEPS:
-        for model_class in (MeanSuccessor, ResidualSuccessors):
-            for seed in range(seeds):
-                learning, greedy = run(task_name, model_class, seed)
-                print(f"| {task_name} | {model_class.__name__} | {seed} | {learning:.1f} | {greedy:.1f} |", flush=True)
+    check_count("seeds", seeds)
+    results = run_missing(jobs_of(seeds), backend=Backend(n_jobs=jobs), console=Console(stderr=True))
+    check_all_succeeded(results)
+    rows = [
+        (each.group, each.method, str(each.seed), f"{each.more['learning']:.1f}", f"{each.more['greedy']:.1f}")
+        for each in results
+    ]
+    print(markdown_table(("task", "model", "seed", "last 10 of learning", "greedy"), rows, n_names=2))
 
 
 if __name__ == "__main__":
-    main()
+    import tyro
+
+    tyro.cli(residual_successors)

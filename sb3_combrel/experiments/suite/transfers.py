@@ -8,7 +8,6 @@ The transfer methods of the suite, by name, and the source from which each trans
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 from sb3_combrel import COMBREL, MASTER, TIMBREL, FactoredMapping, InterTaskMapping, MappingExperts, SourceInstances
 from sb3_combrel.experiments.suite.tasks import CAR_2D, CART_POLE, TORSO, Source, Task
@@ -55,19 +54,6 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
     OTHER_DOMAIN: lambda source, task: COMBREL(source),
     **{f"COMBREL@{name}": _misled(change) for name, change in MISLEADING.items()},
 }
-
-
-def make_transfer(name: str, task: Task, source: Path) -> Transfer:
-    """
-    Make the transfer method of a name, for a task.
-
-    :param name: one of :data:`TRANSFERS`
-    :param task: the target task
-    :param source: file with the instances of the source task, that of :func:`source_for`
-    :raises ValueError: as :func:`check_transfer` does
-    """
-    check_transfer(name, task)
-    return TRANSFERS[name](SourceInstances.load(source), task.name)
 
 
 def source_for(name: str, task: Task) -> Source:

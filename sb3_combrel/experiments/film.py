@@ -1,20 +1,19 @@
-"""Pictures of the iCub striking the ball: learn a task by Fitted R-Max, then film what was learnt.
-
-Run as ``python -m sb3_combrel.experiments.icub``.
-"""
+"""Short films of trained agents; of the iCub striking the ball by ``python -m sb3_combrel.experiments.film``."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import gymnasium as gym
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel import FittedRMax
-from sb3_combrel.experiments.video import greedy_episode, write_video
+
+FRAMES_A_SECOND = 15
 
 TASK_IDS = {"torso": "combrel/ICubTorsoStrike-v0", "arm": "combrel/ICubArmStrike-v0"}
 #: More episodes than it takes to learn a task.
@@ -22,10 +21,66 @@ N_EPISODES = {"torso": 40, "arm": 80}
 #: What the return cannot exceed: a hit by the first command returns 99.
 MAX_VALUE = 100.0
 
-#: As long as the commands take: the film runs in real time.
-FRAMES_A_SECOND = 10
+#: As long as the commands take: the iCub's film runs in real time.
+ICUB_FRAMES_A_SECOND = 10
 #: How long the film goes on after the hit, in frames.
 N_ROLLING = 15
+
+
+def greedy_episode(model: BaseAlgorithm, env: Any, seed: int | None = None) -> Iterator[tuple[int, bool]]:
+    """
+    Drive one episode without exploring.
+
+    :param model: the agent
+    :param env: the environment; it is left open
+    :param seed: seed of the episode
+    :return: after each step its number, from 1 on, and whether the episode is over
+    """
+    observation, _ = env.reset(seed=seed)
+    step, over, state = 0, False, None
+    while not over:
+        action, state = model.predict(observation, state, deterministic=True)
+        observation, _, terminated, truncated, _ = env.step(action)
+        step, over = step + 1, terminated or truncated
+        yield step, over
+
+
+def film(
+    model: BaseAlgorithm, env: Any, path: Path, seed: int | None = None, *, every: int = 4, most_steps: int = 400
+) -> None:
+    """
+    Film one episode, driven without exploring.
+
+    :param model: the agent
+    :param env: an environment with ``render_mode="rgb_array"``; it is left open
+    :param path: MP4 file to write
+    :param seed: seed of the episode
+    :param every: steps between two frames, as software rendering is slow
+    :param most_steps: steps after which the film ends if the episode does not
+    :raises combrel_envs.RenderingError: if OpenGL is missing
+    """
+    frames = []
+    for step, over in greedy_episode(model, env, seed):
+        if over or step % every == 1:
+            frames.append(env.render())
+        if step >= most_steps:
+            break
+    write_video(frames, path)
+
+
+def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> None:
+    """
+    Write frames as an MP4 file, completely or not at all.
+
+    :param frames: arrays of shape (height, width, 3), uint8
+    :param path: file to write
+    :param fps: frames a second
+    """
+    from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
+
+    unfinished = path.with_suffix(".part.mp4")
+    ImageSequenceClip(frames, fps=fps).write_videofile(str(unfinished), logger=None)
+    unfinished.replace(path)
 
 
 def learn(task: str, n_episodes: int | None = None, seed: int = 0, **kwargs: Any) -> FittedRMax:
@@ -60,7 +115,7 @@ def film_strike(model: FittedRMax, env: Any, video: Path, picture: Path) -> int:
 
     frames = [env.render() for _ in greedy_episode(model, env)]
     Image.fromarray(frames[-1]).save(picture)
-    write_video(frames + list(_rolling(env)), video, FRAMES_A_SECOND)
+    write_video(frames + list(_rolling(env)), video, ICUB_FRAMES_A_SECOND)
     return len(frames)
 
 
@@ -83,29 +138,36 @@ def write_pictures(task: str, look: str, output: Path, n_episodes: int | None = 
     :param n_episodes: episodes to learn; None for as many as it takes
     :param seed: seed of the learner
     """
-    import gymnasium
-
     output.mkdir(parents=True, exist_ok=True)
     model = learn(task, n_episodes, seed)
     model.save(output / f"{task}.zip")
     video, picture = output / f"{task}.mp4", output / f"{task}.png"
-    with closing(gymnasium.make(TASK_IDS[task], render_mode="rgb_array", look=look)) as env:
+    with closing(gym.make(TASK_IDS[task], render_mode="rgb_array", look=look)) as env:
         n_commands = film_strike(model, env, video, picture)
     print(f"{task}: learnt for {model.num_timesteps} steps, {n_commands} commands without exploring; {video}, {picture}")
 
 
-def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description="Learn the iCub's ball-striking tasks and film what was learnt.")
-    parser.add_argument("--task", choices=[*TASK_IDS, "both"], default="both")
-    parser.add_argument("--look", choices=["primitives", "meshes"], default="meshes")
-    parser.add_argument("--episodes", type=int, default=None, help="episodes to learn; as many as it takes if not given")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path, default=Path("icub_output"))
-    arguments = parser.parse_args()
-    for task in TASK_IDS if arguments.task == "both" else [arguments.task]:
-        write_pictures(task, arguments.look, arguments.output, arguments.episodes, arguments.seed)
+def icub(
+    task: Literal["torso", "arm", "both"] = "both",
+    look: Literal["primitives", "meshes"] = "meshes",
+    episodes: int | None = None,
+    seed: int = 0,
+    output: Path = Path("icub_output"),
+) -> None:
+    """
+    Learn the iCub's ball-striking tasks and film what was learnt.
+
+    :param task: which
+    :param look: of the robot
+    :param episodes: to learn; as many as it takes by default
+    :param seed: seed of the learner
+    :param output: folder for models, videos and pictures
+    """
+    for name in TASK_IDS if task == "both" else [task]:
+        write_pictures(name, look, output, episodes, seed)
 
 
 if __name__ == "__main__":
-    main()
+    import tyro
+
+    tyro.cli(icub)
