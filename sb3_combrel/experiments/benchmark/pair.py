@@ -14,7 +14,7 @@ import gymnasium as gym
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.checks import check_count, check_finite
 from sb3_combrel.experiments.suite.tasks import Source
-from sb3_combrel.runs.job import Task, chosen_on_purpose, make_env
+from sb3_combrel.runs.job import Task, chosen_on_purpose, described, make_env
 from sb3_combrel.transfer.candidates import MappedVariables
 
 #: How a source is recorded, see :func:`recorded`.
@@ -70,6 +70,7 @@ class Pair:
     :param sources_by_action: number of the source of each of ``known_by_action``; () for the first source throughout
     :param mappings: the set that methods choose from with priors, "factored" or "signed_factored"
     :param instance_mappings: the set that they choose from with instances, such as "injective" or "signed_injective"
+    :param digest: of the file in which a third party defines it; "" for the package's own
     :raises ValueError: if an argument is out of its range
     """
 
@@ -86,6 +87,7 @@ class Pair:
     sources_by_action: Sequence[int] = ()
     mappings: str = "factored"
     instance_mappings: str = "injective"
+    digest: str = ""
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -169,23 +171,3 @@ def check_name(name: object) -> None:
     """
     if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
         raise ValueError(f'name must be of letters, digits, "-", "_" and ".", got {name!r}')
-
-
-def described(value: Any) -> Any:
-    """
-    Return a value as JSON can hold it: functions by name, with what they are called with, and others as their ``repr``.
-
-    Objects without a ``repr`` of their own, which names their place in memory, by their class.
-    """
-    if isinstance(value, functools.partial):
-        keywords = {name: described(each) for name, each in value.keywords.items()}
-        return {"function": described(value.func), "arguments": [described(each) for each in value.args], **keywords}
-    if callable(value) and hasattr(value, "__qualname__"):
-        return f"{value.__module__}.{value.__qualname__}"
-    if isinstance(value, Mapping):
-        return {str(name): described(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [described(each) for each in value]
-    if type(value).__repr__ is object.__repr__:
-        return f"{type(value).__module__}.{type(value).__qualname__}"
-    return value if value is None or isinstance(value, bool | int | float | str) else repr(value)

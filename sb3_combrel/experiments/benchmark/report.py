@@ -7,16 +7,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.comparison.measures import Comparison
 from sb3_combrel.comparison.statistics import ALPHA, Estimate
-from sb3_combrel.comparison.tables import Table, p_text, without_minus_zero, write_tables
+from sb3_combrel.comparison.tables import Table, p_text, without_minus_zero, write_csv, write_tables
 from sb3_combrel.experiments.benchmark.figures import draw_pair
 from sb3_combrel.experiments.benchmark.methods import NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.benchmark.scores import (
     FEWEST_RUNS,
     MEASURES,
@@ -28,7 +28,7 @@ from sb3_combrel.experiments.benchmark.scores import (
     measure_name,
     ranks,
 )
-from sb3_combrel.experiments.report import csv_text
+from sb3_combrel.runs.job import Result
 
 OVERVIEW, PAGE, RUNS = "overview", "benchmark", "runs.csv"
 _EMPTY = "-"
@@ -50,7 +50,7 @@ def write_report(
     pairs: Sequence[Pair],
     methods: Sequence[Method],
     seeds: Sequence[int],
-    outcomes: Sequence[Outcome],
+    outcomes: Sequence[Result],
     output: Path,
     command: Sequence[str],
     console: Console,
@@ -61,7 +61,7 @@ def write_report(
     :param pairs: the pairs
     :param methods: the methods, in the order of tables
     :param seeds: seeds that count
-    :param outcomes: of all runs
+    :param outcomes: results of all runs
     :param output: folder to write to
     :param command: the command that made them, for the page
     :param console: where to show the tables
@@ -99,8 +99,8 @@ def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Met
         if found is None:
             rows.append((name, *[""] * (len(_HEADER) - 2), note_of(name, cell)))
             continue
-        shares = [each.known_share for each in cell.outcomes if each.known_share is not None]
-        steps = [each.mapping_steps for each in cell.outcomes if each.mapping_steps is not None]
+        shares = _known(cell, "known_share")
+        steps = _known(cell, "mapping_steps")
         row = (
             name,
             str(len(cell.outcomes)),
@@ -110,7 +110,7 @@ def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Met
             *(_measure_text(pair, found, measure) for measure in MEASURES),
             f"{np.mean(shares):.0%}" if shares else _EMPTY,
             f"{np.mean(steps):,.0f}" if steps else _EMPTY,
-            f"{np.mean([each.seconds[0] for each in cell.outcomes]):.1f}",
+            f"{np.mean([each.seconds for each in cell.outcomes]):.1f}",
             note_of(name, cell),
         )
         rows.append(row)
@@ -253,12 +253,26 @@ def few_runs(n_seeds: int) -> str:
     )
 
 
-def _write_runs(outcomes: Sequence[Outcome], path: Path) -> Path:
+def _known(cell: Cell, name: str) -> list[float]:
+    """What the runs of a method have measured, where they have."""
+    return [each.more[name] for each in cell.outcomes if each.more[name] is not None]
+
+
+def _write_runs(results: Sequence[Result], path: Path) -> Path:
     """Write one line for each run, as far as it got."""
-    columns = ("pair", "method", "seed", "n_steps", "known_share", "mapping_steps", "misfit", "error")
-    rows: list[Sequence[object]] = [(*columns, "steps_of_episodes", "returns_of_episodes")]
-    for each in sorted(outcomes, key=lambda one: (one.pair, one.method, one.seed)):
-        values = ["" if getattr(each, name) is None else getattr(each, name) for name in columns]
-        rows.append((*values, " ".join(map(str, each.steps)), " ".join(f"{total:.10g}" for total in each.returns)))
-    write_whole(path, csv_text(rows).encode())
-    return path
+    rows = [
+        {
+            "pair": each.group,
+            "method": each.method,
+            "seed": each.seed,
+            "n_steps": each.n_steps,
+            "known_share": each.more.get("known_share"),
+            "mapping_steps": each.more.get("mapping_steps"),
+            "misfit": each.more.get("misfit"),
+            "error": each.error,
+            "steps_of_episodes": " ".join(map(str, each.steps)),
+            "returns_of_episodes": " ".join(f"{total:.10g}" for total in each.returns),
+        }
+        for each in sorted(results, key=lambda one: (one.group, one.method, one.seed))
+    ]
+    return write_csv(pd.DataFrame(rows, dtype=object), path)

@@ -2,118 +2,80 @@
 
 from __future__ import annotations
 
-import json
-import time
-import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, cast
 
-import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.benchmark.methods import Method, Sources, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.result_files import run_name
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
-from sb3_combrel.runs.episodes import EpisodeRecorder
-from sb3_combrel.runs.job import UNLIMITED, chosen_on_purpose
-from sb3_combrel.transfer.base import Transfer
-
-# Limit of the episodes of a run that is made for compiling: some must end.
-COMPILED_EPISODE = 30
-# Pairs and methods that this process has learnt before.
-_COMPILED: set[tuple[str, str]] = set()
+from sb3_combrel.runs.job import Job, Result, TransferLike, chosen_on_purpose
 
 
-@dataclass(frozen=True)
-class Outcome:
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkRun(Job):
     """
-    What came of a run. All but ``seconds`` is the same wherever it is carried out.
+    A pair's target that is learnt from nothing with one method and one seed.
 
-    :param name: of the run; ``pair``, ``method`` and ``seed``: of its job
-    :param steps: environment steps of each episode that has ended
-    :param returns: undiscounted sum of rewards of each
-    :param terminated: whether each ended in a terminal state, not at its time limit
-    :param n_steps: environment steps of the run, with those of an episode that had not ended
-    :param known_share: in which part of the decisions, those where something was transferred, the known mapping was chosen;
-        None where nobody knows it or the method does not say what it chooses
-    :param mapping_steps: target steps until the method had a mapping; None for one that has it from the start
-    :param misfit: why the method does not fit the pair, or ""
-    :param error: what was raised, in one line, or ""
-    :param traceback: of the error
-    :param seconds: processor time of learning, and of making the learner
-    """
-
-    name: str
-    pair: str
-    method: str
-    seed: int
-    steps: list[int] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-    terminated: list[bool] = field(default_factory=list)
-    n_steps: int = 0
-    known_share: float | None = None
-    mapping_steps: int | None = None
-    misfit: str = ""
-    error: str = ""
-    traceback: str = ""
-    seconds: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether the target was learnt for all of its budget."""
-        return not (self.misfit or self.error)
-
-    def text(self) -> str:
-        """Return all but the times as JSON, the same to the byte for the same run."""
-        return json.dumps({key: value for key, value in vars(self).items() if key != "seconds"}) + "\n"
-
-
-@dataclass(frozen=True)
-class BenchmarkJob:
-    """
-    A pair's target that is learnt from nothing with one method and one seed. It has all that a worker needs.
+    Its result has in ``more``: "known_share", in which part of the decisions, where something was transferred, the known
+    mapping was chosen, None where nobody knows it or the method does not say what it chooses; "mapping_steps", target steps
+    until the method had a mapping, None for one that has it from the start; "misfit", why the method does not fit the pair.
 
     :param pair: the pair
-    :param method: the method
-    :param seed: seed of the learner and its environment
+    :param of_method: the method
     :param sources: instances of the pair's sources
     """
 
     pair: Pair
-    method: Method
-    seed: int
+    of_method: Method
     sources: tuple[SourceInstances, ...]
 
     @property
-    def name(self) -> str:
-        """Name of the run in files."""
-        return run_name(self.pair.name, self.method.name, self.seed)
+    def compiled_steps(self) -> int:  # type: ignore[override]
+        """Steps of a run after which all that the method needs is compiled and imported."""
+        return self.of_method.compiled_steps
 
-    @property
-    def title(self) -> str:
-        """What the run is called in messages."""
-        return f"{self.pair.name}, {self.method.name}, seed {self.seed}"
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on."""
+        return {**self.pair.settings(), "method": self.of_method.name, "digest of the method": self.of_method.digest}
 
-    def answered_by(self, result: Outcome) -> bool:
-        """Whether a result is that of this job. A run that failed is tried again, for the reason may have gone."""
-        return result.succeeded and (result.pair, result.method) == (self.pair.name, self.method.name)
-
-    def outcome(self, **found: Any) -> Outcome:
-        """Make an outcome of this job."""
-        return Outcome(self.name, self.pair.name, self.method.name, self.seed, **found)
-
-    def make_model(self, env: gym.Env, transfer: Transfer | None) -> FittedRMax:
-        """Make the learner, which has learnt nothing yet."""
-        return FittedRMax(env, transfer=transfer, seed=self.seed, **self.pair.learner)
-
-    def make_transfer(self) -> Transfer | None:
+    def make_transfer(self) -> TransferLike:
         """Make the transfer method."""
         sources: Sources = self.sources[0] if len(self.sources) == 1 else list(self.sources)
-        return self.method.make(sources, self.pair)
+        return self.of_method.make(sources, self.pair)
+
+    def callbacks(self) -> list[BaseCallback]:
+        """Count the steps until there is a mapping."""
+        return [MappingRecorder()] if self.of_method.finds_mapping else []
+
+    def carry_out(self) -> Result:
+        """
+        Learn, if the method fits the pair.
+
+        :raises RuntimeError: if no episode has ended
+        """
+        with chosen_on_purpose():
+            # If the learner alone cannot be made, it is not the method that does not fit.
+            with closing(self.make_env()) as env:
+                FittedRMax(env, seed=self.seed, **self.learner)
+            try:
+                with closing(self.make_env()) as env:
+                    self.make_model(env)
+            except ValueError as error:
+                return self.result(more={"misfit": " ".join(str(error).split())})
+        result = super().carry_out()
+        if not result.steps:
+            raise RuntimeError(f"no episode has ended within n_steps={self.n_steps}: the pair's target needs a shorter limit")
+        return result
+
+    def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
+        """Tell which mappings the method has chosen."""
+        transfer: Any = model.agent.transfer
+        return {"known_share": known_share(self.pair, transfer), "mapping_steps": _mapping_steps(transfer, result, callbacks)}
 
 
 def has_mapping(transfer: Any) -> bool:
@@ -135,67 +97,10 @@ class MappingRecorder(BaseCallback):
         self.steps: int | None = None
 
     def _on_step(self) -> bool:
-        if self.steps is None and has_mapping(self.model.agent.transfer):  # type: ignore[attr-defined]
+        transfer = self.model.agent.transfer  # type: ignore[attr-defined]
+        if self.steps is None and hasattr(transfer, "uses") and has_mapping(transfer):
             self.steps = self.num_timesteps
         return True
-
-
-def carry_out(job: BenchmarkJob) -> Outcome:
-    """
-    Learn as a job says. Nothing is written: a worker may have no folder in common with the caller.
-
-    :return: the outcome; what the method or the pair raises is in it
-    """
-    try:
-        with chosen_on_purpose():
-            # If the learner alone cannot be made, it is not the method that does not fit.
-            with closing(job.pair.make_target()) as env:
-                job.make_model(env, None)
-            try:
-                with closing(job.pair.make_target()) as env:
-                    job.make_model(env, job.make_transfer())
-            except ValueError as error:
-                return job.outcome(misfit=_line(error))
-            _compile(job)
-            return _learn(job)
-    except Exception as error:  # a third party's code raises what it likes, and the other runs must go on
-        return job.outcome(error=f"{type(error).__name__}: {_line(error)}", traceback=traceback.format_exc())
-
-
-def _compile(job: BenchmarkJob) -> None:
-    """Learn for some steps, so that compiling is not in the time of learning."""
-    key = (job.pair.name, job.method.name)
-    if key in _COMPILED:
-        return
-    with closing(job.pair.make_target()) as env:
-        model = job.make_model(gym.wrappers.TimeLimit(env, COMPILED_EPISODE), job.make_transfer())
-        model.learn(job.method.compiled_steps, log_interval=None)
-    _COMPILED.add(key)
-
-
-def _learn(job: BenchmarkJob) -> Outcome:
-    episodes, mapping = EpisodeRecorder(job.pair.n_episodes), MappingRecorder()
-    with closing(job.pair.make_target()) as env:
-        start = time.process_time()
-        model = job.make_model(env, job.make_transfer())
-        made = time.process_time()
-        callbacks: list[BaseCallback] = [episodes]
-        if job.method.finds_mapping and hasattr(model.agent.transfer, "uses"):
-            callbacks.append(mapping)
-        model.learn(job.pair.n_steps or UNLIMITED, callbacks, log_interval=None)
-        learnt = time.process_time()
-    rows = episodes.episodes
-    if not len(rows.steps):
-        raise RuntimeError(f"no episode has ended within n_steps={job.pair.n_steps}: the pair's target needs a shorter limit")
-    return job.outcome(
-        steps=rows.steps.tolist(),
-        returns=rows.returns.tolist(),
-        terminated=rows.terminated.tolist(),
-        n_steps=int(model.num_timesteps),
-        known_share=known_share(job.pair, model.agent.transfer),
-        mapping_steps=_mapping_steps(job.method, model, mapping),
-        seconds=(learnt - start, made - start),
-    )
 
 
 def known_share(pair: Pair, transfer: Any) -> float | None:
@@ -218,36 +123,43 @@ def known_share(pair: Pair, transfer: Any) -> float | None:
     return sum(n for number, n in uses.items() if pair.agrees(transfer.mapped_variables(number))) / total
 
 
-def _mapping_steps(method: Method, model: Any, mapping: MappingRecorder) -> int | None:
+def _mapping_steps(transfer: Any, result: Result, callbacks: list[BaseCallback]) -> int | None:
     """What the method says of itself; or the steps until it first had a mapping, all if it never had."""
-    transfer = model.agent.transfer
     if hasattr(transfer, "mapping_steps"):
         return int(transfer.mapping_steps())
-    if not (method.finds_mapping and hasattr(transfer, "uses")):
+    if not (callbacks and hasattr(transfer, "uses")):
         return None
-    return int(model.num_timesteps) if mapping.steps is None else mapping.steps
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+    steps = cast(MappingRecorder, callbacks[0]).steps
+    return result.n_steps if steps is None else steps
 
 
 def jobs_of(
-    pairs: Sequence[Pair], methods: Sequence[Method], seeds: Sequence[int], sources: dict[str, tuple[SourceInstances, ...]]
-) -> list[BenchmarkJob]:
+    pairs: Sequence[Pair], methods: Sequence[Method], seeds: Sequence[int], sources: Mapping[str, tuple[SourceInstances, ...]]
+) -> list[BenchmarkRun]:
     """
-    Make the jobs, seed by seed, so that methods can be compared before all are complete; equal ones once.
+    Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once.
 
     :param pairs: the pairs
     :param methods: the methods
     :param seeds: the seeds
-    :param sources: instances of each pair's sources, by name; a pair without them has no jobs
+    :param sources: instances of each pair's sources, by name; () where they could not be learned
     """
     by_name = {method.name: method for method in methods}
-    jobs: dict[str, BenchmarkJob] = {}
+    jobs: dict[str, BenchmarkRun] = {}
     for seed in seeds:
-        for pair in (pair for pair in pairs if pair.name in sources):
+        for pair in pairs:
             for method in methods:
-                job = BenchmarkJob(pair, by_name[run_as(method, methods, pair)], seed, sources[pair.name])
+                job = BenchmarkRun(
+                    group=pair.name,
+                    method=run_as(method, methods, pair),
+                    seed=seed,
+                    env=pair.target,
+                    n_steps=pair.n_steps,
+                    n_episodes=pair.n_episodes,
+                    learner=pair.learner,
+                    pair=pair,
+                    of_method=by_name[run_as(method, methods, pair)],
+                    sources=sources[pair.name],
+                )
                 jobs.setdefault(job.name, job)
     return list(jobs.values())

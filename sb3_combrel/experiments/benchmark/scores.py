@@ -17,11 +17,17 @@ from sb3_combrel.comparison.measures import (
     total_reward,
     total_reward_by_steps,
 )
-from sb3_combrel.comparison.statistics import Estimate, bootstrap_band, interquartile_mean, p_value_of_difference, resampled
+from sb3_combrel.comparison.statistics import (
+    Estimate,
+    bootstrap_band,
+    holm,
+    interquartile_mean,
+    p_value_of_difference,
+    resampled,
+)
 from sb3_combrel.experiments.benchmark.methods import NONE, Method, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.runs import Outcome
-from sb3_combrel.experiments.statistics import holm_by_name
+from sb3_combrel.runs.job import Result
 
 #: With fewer runs of each method there are neither intervals nor tests.
 FEWEST_RUNS = 3
@@ -42,7 +48,7 @@ class Cell:
     :param run_as: name of the method whose runs these are
     """
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[Result, ...]
     misfit: str = ""
     errors: Mapping[int, str] = field(default_factory=dict)
     run_as: str = ""
@@ -69,7 +75,7 @@ class MethodScores(NamedTuple):
     p_values: Mapping[str, float]
 
 
-def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Outcome], seeds: Sequence[int]) -> dict[str, Cell]:
+def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], seeds: Sequence[int]) -> dict[str, Cell]:
     """
     Gather the outcomes of a pair by method.
 
@@ -78,14 +84,14 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Outcome],
     :param outcomes: of any runs
     :param seeds: seeds that count
     """
-    own = sorted((each for each in outcomes if each.pair == pair.name and each.seed in seeds), key=lambda each: each.seed)
+    own = sorted((each for each in outcomes if each.group == pair.name and each.seed in seeds), key=lambda each: each.seed)
     cells = {}
     for method in methods:
         name = run_as(method, methods, pair)
         of_method = [each for each in own if each.method == name]
-        misfits = [each.misfit for each in of_method if each.misfit]
+        misfits = [each.more["misfit"] for each in of_method if each.more.get("misfit")]
         cells[method.name] = Cell(
-            tuple(each for each in of_method if each.succeeded),
+            tuple(each for each in of_method if each.steps),
             misfits[0] if misfits else "",
             {each.seed: each.error for each in of_method if each.error},
             name,
@@ -136,8 +142,8 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
         measures[name] = _measures(pair, cells[name], cells[NONE], floor, n_steps)
         enough = min(len(its_own), len(without)) >= FEWEST_RUNS
         raw[name] = p_value_of_difference(its_own, without, "permutation") if enough else np.nan
-    corrected = holm_by_name(raw)
-    of_measures = {measure: holm_by_name(_p_values(pair, measures, measure)) for measure in MEASURES}
+    corrected = holm(raw)
+    of_measures = {measure: holm(_p_values(pair, measures, measure)) for measure in MEASURES}
     found = {}
     for name, its_own in of_runs.items():
         tested = cells[name].run_as if cells[name].run_as in measures else name
@@ -245,7 +251,7 @@ def mean_ranks(
     drawn: dict[str, list[np.ndarray]] = {}
     for pair, of_pair in distinct.items():
         means = [np.array([interquartile_mean(each)]) for each in of_pair.values()]
-        draws = [resampled(each[:, None], interquartile_mean, n_resamples, rng)[:, 0] for each in of_pair.values()]
+        draws = [resampled((each,), interquartile_mean, n_resamples, rng) for each in of_pair.values()]
         enough = min(map(len, of_pair.values()), default=0) >= FEWEST_RUNS
         of_means, of_draws = (dict(zip(of_pair, _stretched(each, most), strict=True)) for each in (means, draws))
         for name in performance[pair]:
