@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,16 +107,13 @@ def compare(
 
 def _try_out(run: ComparedRun) -> None:
     """Make the model of a run, so that what does not fit is found before anything is learned."""
-    env = run.make_env()
     try:
-        with chosen_on_purpose():
+        with closing(run.make_env()) as env, chosen_on_purpose():
             run.make_model(env)
     except (ValueError, TypeError, OSError) as error:
         # Subclasses may ask for more than a message.
         kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
         raise kind(f"{run.method}: {error}") from error
-    finally:
-        env.close()
 
 
 def check_methods(methods: Any, baseline: Any) -> str:

@@ -202,9 +202,10 @@ def resampled(samples: tuple[np.ndarray, ...], compute: Any, n_resamples: int, r
     """
     if min(map(len, samples)) < 2:
         return np.repeat(np.asarray(compute(*samples, axis=0))[..., None], n_resamples, axis=-1)
-    found = stats.bootstrap(
-        samples, compute, n_resamples=n_resamples, axis=0, vectorized=True, paired=False, method="percentile", rng=rng
-    )
+    with warnings.catch_warnings():
+        # Where all runs agree SciPy has no interval; its draws are all that is needed.
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        found = stats.bootstrap(samples, compute, n_resamples=n_resamples, vectorized=True, method="percentile", rng=rng)
     return np.asarray(found.bootstrap_distribution)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from sb3_combrel.experiments.runs import make_task
 from stable_baselines3 import DQN
 
 from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
@@ -32,7 +33,6 @@ from sb3_combrel.experiments.paper.baselines import (
     prefill,
     translate,
 )
-from sb3_combrel.experiments.runs import make_task
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import TargetTask
 

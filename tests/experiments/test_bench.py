@@ -5,7 +5,7 @@ import pytest
 
 from sb3_combrel.experiments import bench
 
-pytestmark = pytest.mark.integration
+pytestmark = pytest.mark.long
 
 
 def test_what_transfer_adds_is_printed_pair_by_pair_and_in_the_mean(monkeypatch, capsys):

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_combrel.experiments.tasks import icub_arm
 from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB
-from sb3_combrel.experiments.runs import make_task
+from sb3_combrel.experiments.tasks import icub_arm
+from sb3_combrel.runs.job import make_env
 
 CONFIGURATION = Path(__file__).resolve().parents[2] / "zoo_configs" / "combrel.yml"
 
@@ -29,11 +29,11 @@ def test_explore_is_the_setting_of_the_zoo():
 
 @pytest.mark.parametrize("env_id", [icub_arm.SOURCE_ID, icub_arm.TARGET_ID])
 def test_the_cap_is_that_of_the_tasks(env_id):
-    with make_task(env_id) as env:
+    with make_env(env_id) as env:
         assert env.spec.max_episode_steps == icub_arm.MAX_EPISODE_STEPS
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_source_has_hits_and_no_return_exceeds_the_bound():
     source = icub_arm.learn_source(seed=3)
     assert len(source) == icub_arm.N_INSTANCES

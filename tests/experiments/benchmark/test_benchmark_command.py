@@ -1,24 +1,20 @@
 """``sb3-combrel benchmark`` with the method and the pair of a third party, from the files of the page that says how."""
 
 import csv
-import itertools
 import json
 import re
 import shutil
 
 import cloudpickle
 import pytest
-from helpers.benchmark_files import PAGE, call, command, fail, succeed, write_files
+from helpers.benchmark_files import PAGE, command, fail, succeed, write_files
 from helpers.clusters import dask_cluster
 from imageio.v3 import imread
 
-from sb3_combrel.experiments import carrying_out
 from sb3_combrel.experiments.benchmark.methods import METHODS
-from sb3_combrel.experiments.benchmark.page import main as take_into_docs
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
-from sb3_combrel.experiments.pages import include
-from sb3_combrel.experiments.result_files import RESULTS, TIMES
+from sb3_combrel.runs.runner import FOLDER
 
 FAILING = '''
 from sb3_combrel import COMBREL
@@ -107,7 +103,8 @@ def again(copied, files, *args):
 
 def all_but_times(folder):
     """The content of the results."""
-    return {path.name: path.read_bytes() for path in (folder / RESULTS).iterdir()}
+    found = {path.name: json.loads(path.read_text())["result"] for path in (folder / FOLDER).iterdir()}
+    return {name: result | {"seconds": 0.0} for name, result in found.items()}
 
 
 class TestThePage:
@@ -144,25 +141,6 @@ class TestThePage:
         assert rows["oracle"]["jumpstart"].startswith("+") and rows["oracle"]["transfer ratio"].startswith("+")
         assert float(rows["oracle"]["rank"]) < float(rows["none"]["rank"])
 
-    def test_results_are_taken_into_the_documentation(self, made, tmp_path):
-        page = tmp_path / "benchmark.md"
-        page.write_text("before\n<!-- results: results/b/benchmark.md -->\nformer\n<!-- end of results -->\nafter\n")
-        for _ in range(2):
-            take_into_docs(made[0], tmp_path / "results" / "b", page)
-            text = page.read_text()
-            assert text.startswith("before\n") and text.endswith("<!-- end of results -->\nafter\n") and "former" not in text
-            assert "![two-walks](results/b/two-walks.png)" in text
-            copied = {path.name for path in (tmp_path / "results" / "b").iterdir()}
-            assert {"benchmark.md", "two-walks.png", "two-walks.csv"} <= copied
-            # The page has it.
-            assert "two-walks.md" not in copied
-        assert include(page) == 1
-        assert not (tmp_path / "results" / "b" / RESULTS).exists()
-
-    def test_the_documentation_has_a_place_for_results(self, tmp_path):
-        text = (PAGE.parent / "benchmark.md").read_text()
-        assert text.count("<!-- results: results/benchmark/benchmark.md -->") == text.count("<!-- end of results -->") == 1
-
 
 class TestResuming:
     def test_a_second_call_makes_no_run_and_the_same_files(self, copied, files):
@@ -174,8 +152,8 @@ class TestResuming:
 
     def test_only_what_is_missing_is_made_and_it_is_the_same(self, copied, files):
         before = all_but_times(copied)
-        (copied / RESULTS / "two-walks_oracle_seed7001.json").unlink()
-        damaged = copied / RESULTS / "two-walks_none_seed7000.json"
+        (copied / FOLDER / "two-walks_oracle_seed7001.json").unlink()
+        damaged = copied / FOLDER / "two-walks_none_seed7000.json"
         damaged.write_text(damaged.read_text()[:50])
         assert sorted(again(copied, files)) == ["two-walks, none, seed 7000", "two-walks, oracle, seed 7001"]
         assert all_but_times(copied) == before
@@ -187,28 +165,6 @@ class TestResuming:
             *(f"two-walks, random-by-run, seed {s}" for s in range(7000, 7004)),
         ]
         assert [row["method"] for row in rows_of(copied / "two-walks.csv")] == ["none", "random-by-run"]
-
-    def test_an_interrupted_call_is_continued(self, made, files, monkeypatch, tmp_path):
-        real = carrying_out.carry_out_on
-
-        def interrupted(engine, function, jobs, **options):
-            results = real(engine, function, jobs, **options)
-
-            def until_then():
-                yield from itertools.islice(results, 2)
-                results.close()
-                raise KeyboardInterrupt
-
-            return until_then()
-
-        args = ["--pairs", files / "two_walks.py", "--methods", "none", "oracle", "--seeds", 2, "--jobs", 1]
-        args += ["--output", tmp_path / "out"]
-        monkeypatch.setattr(carrying_out, "carry_out_on", interrupted)
-        assert call(*args)[0] == 130
-        assert len(all_but_times(tmp_path / "out")) == 2
-        monkeypatch.undo()
-        assert "2 of 4 runs were complete already" in succeed(*args)
-        assert all_but_times(tmp_path / "out").items() <= all_but_times(made[0]).items()
 
 
 @pytest.fixture(scope="module")
@@ -222,11 +178,10 @@ def failed(files, tmp_path_factory):
 
 class TestFailures:
     def test_what_does_not_fit_has_an_empty_cell_and_a_reason(self, failed):
-        folder, printed, _ = failed
+        folder, _printed, _ = failed
         row = {row["method"]: row for row in rows_of(folder / "two-walks.csv")}["picky"]
         assert row.pop("note") == "does not fit: it takes two to walk"
         assert set(row.values()) == {"picky", ""}
-        assert "two-walks, picky, seed 7000: does not fit: it takes two to walk" in printed
 
     def test_a_run_that_fails_has_its_error_in_the_table_and_the_others_go_on(self, failed):
         folder, printed, _ = failed
@@ -236,14 +191,14 @@ class TestFailures:
         assert "Sulking, seed 7000: failed: RuntimeError: no | more" in printed
         overview = rows_of(folder / "overview_2.csv")
         assert [row["two-walks"].split(" ")[0] for row in overview][1:3] == ["failed", ""]
-        kept = json.loads((folder / RESULTS / "two-walks_sulking_seed7000.json").read_text())
+        kept = json.loads((folder / FOLDER / "two-walks_sulking_seed7000.json").read_text())["result"]
         assert "in end_episode" in kept["traceback"]
 
     def test_it_is_tried_again(self, failed):
         _, _, args = failed
         printed = succeed(*args)
-        assert "2 of 4 runs were complete already" in printed
-        assert re.findall(r"two-walks, (\S+), seed 7000:", printed) == ["Sulking", "picky"]
+        assert "3 of 4 runs were complete already" in printed
+        assert re.findall(r"two-walks, (\S+), seed 7000:", printed) == ["Sulking"]
 
     def test_one_seed_is_too_few_for_intervals(self, failed):
         folder, printed, _ = failed
@@ -252,10 +207,10 @@ class TestFailures:
         row = rows_of(folder / "two-walks.csv")[-1]
         assert re.fullmatch(r"-\d+\.\d", row["performance"]) and row["p"] == "-" and "(" not in row["jumpstart"]
 
-    @pytest.mark.integration
+    @pytest.mark.long
     def test_a_worker_that_dies(self, files, tmp_path):
         args = ("--pairs", files / "two_walks.py", "--methods", f"{files / 'dying.py'}:Dying", "none", *TINY)
-        succeed(*args, "--output", tmp_path / "out")
+        succeed(*args, "--jobs", 2, "--output", tmp_path / "out")
         rows = {row["method"]: row for row in rows_of(tmp_path / "out" / "two-walks.csv")}
         assert rows["none"]["runs"] == "1"
         assert re.match(r"failed \(seed 7000\): .*died", rows["Dying"]["note"])
@@ -283,12 +238,12 @@ class TestBadInput:
             (("--methods", "failing.py:NUMBER"), "methods: failing.py:NUMBER must be a Method, .* got 3"),
             (("--methods", "failing.py:NoMethod"), "methods: failing.py:NoMethod lacks observe, transferred"),
             (("--pairs", "failing.py"), "pairs: failing.py defines no PAIR"),
-            (("--methods", "none", "none"), "methods must have different names, got none twice"),
+            (("--methods", "none", "none"), "methods must have different names, got none, none"),
             (("--seeds", "0"), "seeds must be .* got 0"),
             (("--first-seed", "-1"), "first_seed must be .* got -1"),
             (("--jobs", "0"), "jobs must be .* got 0"),
             (("--backend", "slurm"), "backend must be one of .* got 'slurm'"),
-            (("--backend", "dask"), "backend dask needs the address of a running cluster"),
+            (("--backend", "dask"), "address of dask must be a host and a port of a running cluster"),
         ],
     )
     def test_nothing_is_learned_or_written(self, options, words, files, tmp_path, monkeypatch):
@@ -310,7 +265,10 @@ class TestBadInput:
         changed = tmp_path / "two_walks.py"
         changed.write_text((files / "two_walks.py").read_text().replace("n_episodes=6", "n_episodes=7"))
         message = fail("--pairs", changed, "--methods", "none", "--output", copied)
-        assert "has results of other settings (pair two-walks was" in message and "use another --output" in message
+        assert (
+            "has results of other settings (two-walks, none, seed 7000: n_episodes was 6 and is 7" in message
+            and "use another --output" in message
+        )
 
     def test_two_sources_of_one_name(self, files, tmp_path):
         text = (files / "two_walks.py").read_text().replace("two-walks", "other").replace("n_episodes=5", "n_episodes=4")
@@ -318,27 +276,12 @@ class TestBadInput:
         message = fail("--pairs", files / "two_walks.py", tmp_path / "other.py", "--output", tmp_path / "out")
         assert "other: another pair has a source of the name 'walk' that is recorded in another way" in message
 
-    def test_two_sources_of_one_name_in_two_calls(self, copied, files, tmp_path):
-        text = (files / "two_walks.py").read_text().replace("two-walks", "other").replace("n_episodes=5", "n_episodes=4")
-        (tmp_path / "other.py").write_text(text)
-        message = fail("--pairs", tmp_path / "other.py", "--methods", "none", *TINY, "--output", copied)
-        assert "has results of other settings (source walk was" in message
-
-    def test_runs_that_would_have_the_same_files(self, files, tmp_path):
-        for name in ("a", "a_b"):
-            (tmp_path / f"{name}.py").write_text((files / "two_walks.py").read_text().replace("two-walks", name))
-        methods = "from sb3_combrel import COMBREL\nb_c, c = (lambda source, pair: COMBREL(source) for _ in range(2))\n"
-        (tmp_path / "methods.py").write_text(methods)
-        args = ("--pairs", tmp_path / "a.py", tmp_path / "a_b.py", "--methods")
-        message = fail(*args, *(f"{tmp_path / 'methods.py'}:{name}" for name in ("b_c", "c")), "--output", tmp_path / "out")
-        assert "the runs of c on a_b and of b_c on a would have the same files" in message
-
     def test_what_the_package_has_is_sent_by_name(self):
         load_attribute("methods", "sb3_combrel:COMBREL")
         assert "sb3_combrel" not in cloudpickle.list_registry_pickle_by_value()
 
 
-@pytest.mark.integration
+@pytest.mark.long
 def test_a_cluster_gives_the_same_results(made, files, tmp_path):
     """What the files define goes to workers that do not have them."""
     with dask_cluster(1) as address:
@@ -346,10 +289,6 @@ def test_a_cluster_gives_the_same_results(made, files, tmp_path):
         succeed(*args, "--seeds", 1, "--backend", "dask", "--address", address, "--output", tmp_path / "out")
     found = all_but_times(tmp_path / "out")
     assert len(found) == 2 and found.items() <= all_but_times(made[0]).items()
-
-
-def test_times_are_kept_apart(made):
-    assert {path.name for path in (made[0] / TIMES).iterdir()} == set(all_but_times(made[0]))
 
 
 def test_help_and_documentation_name_what_there_is():

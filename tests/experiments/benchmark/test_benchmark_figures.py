@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from sb3_combrel.comparison.curves import LearningCurves
 from sb3_combrel.experiments.benchmark.figures import WINDOW, _by_episodes, _by_steps, draw_pair
 from sb3_combrel.experiments.benchmark.methods import NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.runs import Outcome
 from sb3_combrel.experiments.benchmark.scores import cells_of, compare
 from sb3_combrel.experiments.suite.tasks import Source
-from sb3_combrel.experiments.transfer_measures import LearningCurves
+from sb3_combrel.runs.job import Result
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def drawn_of(names, tmp_path, monkeypatch, n_seeds=4):
     pair = Pair("made-up", "Made up.", (Source("nothing", None),), "CartPole-v1", n_steps=60)
     rng = np.random.default_rng(0)
     outcomes = [
-        Outcome("run", pair.name, name, seed, [10] * 6, rng.normal(10.0 * number, 1.0, 6).tolist(), [True] * 6)
+        Result("run", pair.name, name, seed, [10] * 6, rng.normal(10.0 * number, 1.0, 6).tolist(), [True] * 6)
         for number, name in enumerate(names)
         for seed in range(n_seeds)
     ]

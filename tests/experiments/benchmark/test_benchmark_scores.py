@@ -4,9 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
-from helpers.paper_results import quiet
+from rich.console import Console
 from scipy import stats
 
+from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.report import (
@@ -17,10 +18,10 @@ from sb3_combrel.experiments.benchmark.report import (
     rank_table,
     write_report,
 )
-from sb3_combrel.experiments.benchmark.runs import Outcome, jobs_of
+from sb3_combrel.experiments.benchmark.runs import jobs_of
 from sb3_combrel.experiments.benchmark.scores import Cell, cells_of, compare, interquartile, mean_ranks, performances, ranks
-from sb3_combrel.experiments.statistics import holm
 from sb3_combrel.experiments.suite.tasks import Source
+from sb3_combrel.runs.job import Result
 
 
 def pair_of(name="made-up", **options):
@@ -33,10 +34,11 @@ def method_of(name, same_as=None):
     return Method(name, f"Made-up {name}.", None, same_as=None if same_as is None else lambda pair: same_as)
 
 
-def outcome(pair, method, seed, returns, steps=None, **others):
+def outcome(pair, method, seed, returns, steps=None, misfit="", error=""):
     steps = [10] * len(returns) if steps is None else steps
-    found = {"known_share": 0.5, "mapping_steps": 3, "seconds": (1.5, 0.5)} | others
-    return Outcome(f"{pair}_{method}_{seed}", pair, method, seed, list(steps), list(returns), [True] * len(steps), **found)
+    more = {"known_share": 0.5, "mapping_steps": 3, **({"misfit": misfit} if misfit else {})}
+    ends = [True] * len(steps)
+    return Result("run", pair, method, seed, list(steps), list(returns), ends, sum(steps), more, 1.5, error)
 
 
 def made_up(levels, pair="made-up", n_seeds=5, n_episodes=8, seed=0):
@@ -109,8 +111,8 @@ class TestRanks:
     def test_a_method_is_run_by_itself_where_the_one_that_makes_the_same_is_not_chosen(self):
         pair, methods = pair_of(), [method_of(NONE), method_of("b", same_as="c")]
         jobs = jobs_of([pair], methods, range(5), {pair.name: ()})
-        assert [job.method.name for job in jobs[:2]] == [NONE, "b"]
-        outcomes = [job.outcome(returns=[1.0], steps=[1 + job.seed], terminated=[True]) for job in jobs]
+        assert [job.method for job in jobs[:2]] == [NONE, "b"]
+        outcomes = [job.result([1 + job.seed], [1.0], [True], 1) for job in jobs]
         cells = cells_of(pair, methods, outcomes, range(5))
         assert len(cells["b"].outcomes) == 5 and note_of("b", cells["b"]) == ""
 
@@ -187,7 +189,7 @@ class TestComparison:
                 for s in splits
             ]
             raw.append(np.mean(np.array(means) >= difference - 1e-12))
-        np.testing.assert_allclose([found[name].p_value for name in "abc"], holm(np.array(raw)))
+        np.testing.assert_allclose([found[name].p_value for name in "abc"], list(holm(dict(enumerate(raw))).values()))
         assert np.isnan(found[NONE].p_value) and found[NONE].measures is None
         assert [found[name].better for name in "ac"] == [True, False]
 
@@ -262,7 +264,7 @@ class TestTables:
     def test_a_report_without_any_run(self, tmp_path):
         pair = pair_of()
         outcomes = [outcome("made-up", each.name, 0, [], error="RuntimeError: never") for each in self.METHODS]
-        made = write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], quiet())
+        made = write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], Console(quiet=True))
         assert all(path.exists() for path in made) and "RuntimeError: never" in (tmp_path / "made-up.md").read_text()
 
     def test_only_the_seeds_asked_for_count(self):

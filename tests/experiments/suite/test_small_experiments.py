@@ -1,11 +1,20 @@
-"""The two models that are compared on random outcomes: against NumPy's least squares, and with each other."""
+"""Two small experiments: the iCub at several breadths, and models with one or several successors."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from helpers.kernel_models import random_transitions
 
-from sb3_combrel.experiments import residual_successors
-from sb3_combrel.experiments.suite.residual_successors import LAST_EXPONENT, RIDGE, MeanSuccessor, ResidualSuccessors
+from sb3_combrel.experiments.suite import breadths as breadths_module
+from sb3_combrel.experiments.suite import residual_successors as residual_module
+from sb3_combrel.experiments.suite.breadths import breadths, jobs_of, summary_of
+from sb3_combrel.experiments.suite.residual_successors import (
+    LAST_EXPONENT,
+    RIDGE,
+    MeanSuccessor,
+    ResidualSuccessors,
+    residual_successors,
+)
 from sb3_combrel.models.base import ModelSettings
 from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.planning.mdp import FiniteMDP
@@ -58,15 +67,38 @@ def test_several_successors_have_the_mean_of_the_one_unless_they_are_clipped():
     assert found.effect[inside].std(axis=1).min() > 0.0
 
 
-def test_the_comparison_prints_a_row_a_run(monkeypatch, capsys):
-    monkeypatch.setattr(residual_successors, "STEPS", {"ICubTorso-noisy": 420})
-    monkeypatch.setattr(residual_successors, "EVALUATION_EPISODES", 1)
-    residual_successors.main(["--seeds", "1"])
+@pytest.mark.long
+def test_the_comparison_of_models_prints_a_row_a_run(monkeypatch, capsys):
+    monkeypatch.setattr(residual_module, "STEPS", {"ICubTorso-noisy": 420})
+    monkeypatch.setattr(residual_module, "EVALUATION_EPISODES", 1)
+    residual_successors(seeds=1)
     rows = capsys.readouterr().out.strip().split("\n")
     assert len(rows) == 2 + 2 and "ResidualSuccessors" in rows[-1]
 
 
-def test_no_seeds_are_refused(capsys):
-    with pytest.raises(SystemExit):
-        residual_successors.main(["--seeds", "0"])
-    assert "--seeds must be at least 1, got 0" in capsys.readouterr().err
+def test_of_the_breadths_there_is_a_line_for_each_run_and_a_table(tmp_path, monkeypatch):
+    made = []
+
+    def run_missing(jobs, *_):
+        made.extend(jobs)
+        steps = {"torso": [400, 30, 26, 25, 27, 27, 25], "arm": [400] * 7}
+        return [job.result(steps[job.group], [0.0] * 7, [True] * 7, 930, seconds=1.0) for job in jobs]
+
+    monkeypatch.setattr(breadths_module, "run_missing", run_missing)
+    breadths(tmp_path, seeds=1, episodes=7, breadths=(0.2,))
+    summary = pd.read_csv(tmp_path / "summary.csv")
+    assert summary["setting"].tolist() == ["torso 0.2", "torso 0.2 noisy", "arm 0.2", "arm 0.2 noisy"]
+    assert summary["episodes_until_learnt"].tolist() == [5.0, 5.0, np.inf, np.inf] and summary["steps"][0] == 560
+    table = (tmp_path / "tables.md").read_text()
+    assert "| torso 0.2 | 1 of 1 | 5 (5 to 5) | 27 (27 to 27) | 560 |" in table and "| arm 0.2 | 0 of 1 |" in table
+    assert [job.env for job in made][1:3] == ["combrel/ICubTorsoStrikeNoisy-v0", "combrel/ICubArmStrike-v0"]
+    assert made[0].learner == {"degree": 0, "max_value": 100.0, "model_breadth": 0.2}
+    for change in (dict(seeds=0), dict(episodes=-1), dict(breadths=(0.1, 0.0))):
+        with pytest.raises(ValueError, match=next(iter(change))):
+            breadths(tmp_path, **change)
+
+
+@pytest.mark.long
+def test_the_torso_is_learnt_within_a_few_episodes():
+    [job, *_] = jobs_of(1, 6, (0.2,))
+    assert summary_of([job.carry_out()])["episodes_until_learnt"][0] == 6.0

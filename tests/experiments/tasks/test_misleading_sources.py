@@ -5,12 +5,12 @@ import pytest
 
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.tasks.misleading_sources import MISLEADING, NOISE
-from sb3_combrel.experiments.runs import make_task
+from sb3_combrel.runs.job import make_env
 
 
 @pytest.fixture(scope="module")
 def source():
-    return SourceInstances.record(None, make_task("MountainCar-v0", disable_env_checker=True), 3000, seed=0)
+    return SourceInstances.record(None, make_env("MountainCar-v0", disable_env_checker=True), 3000, seed=0)
 
 
 def size_of(changed):

@@ -1,22 +1,19 @@
 """The suite: runs that go on where they stopped, measures of hand-made episodes, tables and tests."""
 
-import csv
 import json
 from functools import partial
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from rich.console import Console
 from scipy import stats
-from stable_baselines3.common.monitor import Monitor
 
-from sb3_combrel.experiments import suite, suite_runs
-from sb3_combrel.experiments.tasks.point_robot import make_point_robot
-from sb3_combrel.experiments.runs import make_task
-from sb3_combrel.experiments.statistics import holm, p_value_of_difference
+from sb3_combrel import SourceInstances
+from sb3_combrel.comparison.statistics import holm, p_value_of_difference
+from sb3_combrel.experiments.suite import command as suite
 from sb3_combrel.experiments.suite.measures import (
-    Episodes,
     failures,
     mean_return_in,
     mean_steps_in,
@@ -27,18 +24,17 @@ from sb3_combrel.experiments.suite.measures import (
     summary_of_learning,
 )
 from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
-from sb3_combrel.experiments.suite.runs import SuiteRun, Variant, play
-from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Task, tasks_of
-from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, TRANSFERS, make_transfer, source_for
+from sb3_combrel.experiments.suite.runs import Variant
+from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Source, Task, tasks_of
+from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, TRANSFERS, check_transfer, source_for
+from sb3_combrel.experiments.tasks.point_robot import make_point_robot
+from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.runs.episodes import Episodes
+from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
 SMALL = Task("small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(steps_in(1, 3),), headline="steps_1_to_3")
 SHORT = Task("short", partial(make_point_robot, 2), n_steps=500)
 VARIANTS = [Variant("default"), Variant("narrow", {"model_breadth": 0.05})]
-
-
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def run(folder, tasks=(SMALL, SHORT), variants=VARIANTS, seeds=(5, 6), **arguments):
@@ -47,82 +43,34 @@ def run(folder, tasks=(SMALL, SHORT), variants=VARIANTS, seeds=(5, 6), **argumen
     return console.export_text()
 
 
-def test_a_suite_is_written_run_by_run_and_resumed(tmp_path, monkeypatch):
+def test_a_suite_is_written_run_by_run_and_resumed(tmp_path):
     run(tmp_path, seeds=(5,))
-    first = rows_of(tmp_path / "runs.csv")
-    assert [(row["task"], row["variant"], row["seed"]) for row in first] == [
-        (task, variant, "5") for task in ("short", "small") for variant in ("default", "narrow")
+    first = pd.read_csv(tmp_path / "runs.csv")
+    assert list(zip(first["task"], first["variant"], first["seed"], strict=True)) == [
+        (task, variant, 5) for task in ("short", "small") for variant in ("default", "narrow")
     ]
-    done = []
-    monkeypatch.setattr(suite, "carry_out", lambda run: (done.append((run.name, run.seed)), suite_runs.carry_out(run))[1])
-    shown = run(tmp_path)
-    assert "4 of 8 runs were complete already." in shown
-    assert len(done) == 4 and {seed for _, seed in done} == {6}
-    rows, episodes = rows_of(tmp_path / "runs.csv"), rows_of(tmp_path / "episodes.csv")
+    assert "4 of 8 runs were complete already." in run(tmp_path)
+    rows, episodes = pd.read_csv(tmp_path / "runs.csv"), pd.read_csv(tmp_path / "episodes.csv")
     assert len(rows) == 8
-    assert [row for row in rows if row["seed"] == "5"] == first
-    for row in rows:
-        own = [episode for episode in episodes if episode["run"] == row["run"]]
-        assert [int(episode["episode"]) for episode in own] == list(range(1, int(row["episodes"]) + 1))
-        steps = np.array([int(episode["steps"]) for episode in own])
-        if row["task"] == "small":
-            assert len(own) == 3
-            assert steps.sum() == float(row["steps_1_to_3"]) == int(row["steps"])
+    pd.testing.assert_frame_equal(rows[rows["seed"] == 5].reset_index(drop=True), first)
+    for row in rows.itertuples():
+        own = episodes[episodes["run"] == row.run]
+        assert own["episode"].tolist() == list(range(1, row.episodes + 1))
+        if row.task == "small":
+            assert len(own) == 3 and own["steps"].sum() == row.steps_1_to_3 == row.steps
         else:
-            assert steps.sum() <= int(row["steps"]) == 500 and row["steps_1_to_3"] == ""
-        assert [float(episode["return"]) for episode in own] == (-steps).tolist()
-        assert all(int(episode["terminated"]) + int(episode["truncated"]) == 1 for episode in own)
-        assert float(row["ms_per_step"]) > 0.0
-        assert json.loads(row["settings"])["learner"] == ({"model_breadth": 0.05} if row["variant"] == "narrow" else {})
-    tables = (tmp_path / "tables.md").read_text()
-    samples = [float(row["steps_1_to_3"]) for row in rows if row["task"] == "small" and row["variant"] == "narrow"]
-    mean, error = (format_number(number) for number in (np.mean(samples), stats.sem(samples)))
-    assert f"| steps_1_to_3 | narrow | 2 | {mean} ± {error} |" in tables
-
-
-def test_runs_do_not_depend_on_order_or_process(tmp_path):
-    run(tmp_path / "alone", tasks=[SHORT], variants=VARIANTS[1:], seeds=(6,))
-    run(tmp_path / "among_others")
-    keys = ("steps", "episodes", "last10_return", "greedy_mean", "greedy_worst", "stateless_mean")
-    (alone,) = rows_of(tmp_path / "alone" / "runs.csv")
-    (other,) = (
-        row
-        for row in rows_of(tmp_path / "among_others" / "runs.csv")
-        if (row["task"], row["variant"], row["seed"]) == ("short", "narrow", "6")
-    )
-    assert [alone[key] for key in keys] == [other[key] for key in keys]
-
-
-@pytest.mark.integration
-def test_the_command_line_in_two_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "sys.argv",
-        (
-            "suite --tasks PointRobot2D --variants default coarse:resolution=4 --seeds 0-1 --first-seed 7 --jobs 2 "
-            f"--evaluation-episodes 1 --output {tmp_path}"
-        ).split(),
-    )
-    suite.main()
-    rows = rows_of(tmp_path / "runs.csv")
-    assert [(row["variant"], row["seed"]) for row in rows] == [
-        ("coarse", "7"),
-        ("coarse", "8"),
-        ("default", "7"),
-        ("default", "8"),
-    ]
-    assert all(row["steps"] == "5000" for row in rows)
-
-
-def test_results_of_other_settings_are_not_mixed_in(tmp_path):
-    run(tmp_path, tasks=[SHORT], variants=[Variant("a", {"resolution": 4})], seeds=(0,))
-    with pytest.raises(ValueError, match=r"other settings \(learner was .*4.* and is .*5"):
-        run(tmp_path, tasks=[SHORT], variants=[Variant("a", {"resolution": 5})], seeds=(0,))
+            assert own["steps"].sum() <= row.steps == 500 and np.isnan(row.steps_1_to_3)
+        assert own["return"].tolist() == (-own["steps"]).tolist()
+        assert (own["terminated"] + own["truncated"] == 1).all() and row.ms_per_step > 0.0
+        assert json.loads(row.settings)["learner"] == ({"model_breadth": 0.05} if row.variant == "narrow" else {})
+    narrow = rows[(rows["task"] == "small") & (rows["variant"] == "narrow")]["steps_1_to_3"]
+    mean, error = (format_number(number) for number in (narrow.mean(), narrow.sem()))
+    assert f"| steps_1_to_3 | narrow | 2 | {mean} ± {error} |" in (tmp_path / "tables.md").read_text()
+    with pytest.raises(ValueError, match=r"other settings \(small, narrow, seed 5: learner was .*0.05.* and is .*0.1"):
+        run(tmp_path, variants=[Variant("narrow", {"model_breadth": 0.1})])
 
 
 def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
-    from sb3_combrel import SourceInstances
-    from sb3_combrel.experiments.suite.tasks import Source
-
     calls = []
 
     def learn():
@@ -131,46 +79,21 @@ def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
 
     task = Task("robot", partial(make_point_robot, 3), n_steps=150, source=Source("robot_2d", learn))
     run(tmp_path, tasks=[task], variants=[Variant("combrel", {"gamma": 0.99}, "COMBREL")])
-    assert len(calls) == 1
-    assert len(rows_of(tmp_path / "runs.csv")) == 2
+    assert len(calls) == 1 and len(pd.read_csv(tmp_path / "runs.csv")) == 2
+    assert SourceInstances.load(tmp_path / "sources" / "robot_2d.npz").n_variables == 2
     # Neither the right mapping nor a source of another domain is known for a task of our own.
     unknown = {"oracle": "nobody knows the mapping of robot", "oracle-instances": "nobody knows the mapping of robot"}
     unknown["COMBREL@other-domain"] = "robot no source of another domain"
     for name in TRANSFERS:
         if name not in unknown:
-            assert make_transfer(name, task, tmp_path / "sources" / "robot_2d.npz") is not None
+            check_transfer(name, task)
             continue
         with pytest.raises(ValueError, match=unknown[name]):
-            make_transfer(name, task, tmp_path / "sources" / "robot_2d.npz")
+            check_transfer(name, task)
     with pytest.raises(ValueError, match="no source task"):
         run(tmp_path, tasks=[SHORT], variants=[Variant("combrel", {}, "COMBREL")])
     with pytest.raises(ValueError, match="transfer must be one of"):
         run(tmp_path, tasks=[task], variants=[Variant("other", {}, "OTHER")])
-
-
-def test_a_source_of_another_domain_is_learnt_in_place_of_the_own(tmp_path, monkeypatch):
-    from sb3_combrel import SourceInstances
-    from sb3_combrel.experiments import suite_transfers
-    from sb3_combrel.experiments.suite.tasks import Source
-
-    calls = []
-
-    def learn(name, make):
-        calls.append(name)
-        return SourceInstances.record(None, make(), n_instances=100, seed=0)
-
-    own = Source("robot_2d", partial(learn, "own", partial(make_point_robot, 2)))
-    other = Source("car", partial(learn, "other", partial(make_task, "MountainCar-v0", disable_env_checker=True)))
-    monkeypatch.setitem(suite_transfers.OTHER_DOMAINS, own.name, other)
-    task = Task("robot", partial(make_point_robot, 3), n_steps=150, source=own)
-    variants = [Variant("none", {"degree": 1}), Variant("other", {}, "COMBREL@other-domain")]
-    run(tmp_path, tasks=[task], variants=variants)
-    assert calls == ["other"], "once, and the task's own source is not needed"
-    assert [path.name for path in (tmp_path / "sources").iterdir()] == ["car.npz"]
-    used = SuiteRun(tmp_path, task, variants[1], 0, 1).make_model(task.make())
-    assert used.transfer.source.origin["env"] == "MountainCar-v0"
-    run(tmp_path, tasks=[task], variants=[*variants, Variant("own", {}, "COMBREL")])
-    assert calls == ["other", "own"]
 
 
 def test_the_other_domain_is_the_torso_for_cars_and_the_car_for_the_arm():
@@ -255,7 +178,7 @@ def test_unknown_tasks_are_refused():
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_every_task_can_be_learnt_and_has_its_headline(name, tmp_path):
+def test_every_task_can_be_learnt_and_has_its_headline(name):
     task = TASKS[name]
     assert task.headline in columns_of(task)
     env = task.make()
@@ -263,7 +186,8 @@ def test_every_task_can_be_learnt_and_has_its_headline(name, tmp_path):
     wrapper = env
     while not isinstance(wrapper, gym.wrappers.TimeLimit):
         wrapper = wrapper.env
-    model = SuiteRun(tmp_path, task, Variant("default"), 0, 1).make_model(env)
+    with chosen_on_purpose():
+        model = FittedRMax(env, **task.learner)
     assert model.gamma == task.learner.get("gamma", 1.0)
     env.close()
 
@@ -304,45 +228,8 @@ def test_failures_and_summaries_of_hand_made_episodes():
     assert summary_of_evaluation(played, None, np.nan)["as_good"] == 0.0, "there is nothing to compare with"
 
 
-class Counting:
-    """A policy that moves along the first axis and whose state counts the calls of an episode."""
-
-    def __init__(self):
-        self.calls = []
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        assert deterministic
-        self.calls.append((state, None if episode_start is None else bool(episode_start[0])))
-        count = 0 if state is None or episode_start[0] else state[0]
-        return np.int64(1), (count + 1,)
-
-
-def test_the_state_of_predict_is_handed_on_or_dropped():
-    env = gym.wrappers.TimeLimit(make_point_robot(2), 3)
-    model = Counting()
-    episodes = play(model, env, 2, 0, keeps_state=True)
-    assert model.calls == [(None, True), ((1,), False), ((2,), False), ((3,), True), ((1,), False), ((2,), False)]
-    np.testing.assert_array_equal(episodes.steps, [3, 3])
-    np.testing.assert_array_equal(episodes.returns, [-3.0, -3.0])
-    assert not episodes.terminated.any()
-    model = Counting()
-    play(model, env, 2, 0, keeps_state=False)
-    assert model.calls == [(None, None)] * 6
-
-
-def test_recorded_episodes_are_those_of_the_monitor(tmp_path):
-    env = Monitor(make_task("MountainCar-v0"), str(tmp_path / "log"))
-    recorder = suite_runs.EpisodeRecorder(4)
-    model = suite_runs.FittedRMax(env, seed=0).learn(10**6, recorder, log_interval=None)
-    env.close()
-    assert model.num_timesteps == recorder.episodes.steps.sum()
-    assert recorder.episodes.steps.tolist() == env.get_episode_lengths()
-    assert recorder.episodes.returns.tolist() == env.get_episode_rewards()
-    np.testing.assert_array_equal(recorder.episodes.terminated, recorder.episodes.steps < 200)
-
-
 def test_noisy_actions_are_drawn_by_the_environments_seed():
-    env = NoisyActions(make_task("MountainCar-v0"), 0.3)
+    env = NoisyActions(make_env("MountainCar-v0"), 0.3)
 
     def taken(seed):
         env.reset(seed=seed)
@@ -354,23 +241,6 @@ def test_noisy_actions_are_drawn_by_the_environments_seed():
     assert set(taken(0)) == {0, 1, 2}
     with pytest.raises(ValueError, match="probability"):
         NoisyActions(env, 1.5)
-
-
-def test_holms_correction_is_the_sequential_test():
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        p_values = rng.random(rng.integers(1, 8)) ** 3
-        corrected = holm(p_values)
-        # Holm's own words: compare the smallest with alpha / n, the next with alpha / (n - 1), stop at the first that fails.
-        for alpha in (0.01, 0.05, 0.3):
-            rejected = np.zeros(len(p_values), dtype=bool)
-            for rank, index in enumerate(np.argsort(p_values)):
-                if p_values[index] > alpha / (len(p_values) - rank):
-                    break
-                rejected[index] = True
-            np.testing.assert_array_equal(corrected <= alpha, rejected)
-    np.testing.assert_allclose(holm(np.array([np.nan, 0.01, 0.04])), [np.nan, 0.02, 0.04])
-    assert holm(np.array([])).shape == (0,)
 
 
 def test_p_values_are_scipys_and_defined_where_means_are_not():
@@ -398,7 +268,7 @@ def test_tables_of_hand_made_runs():
         stats.mannwhitneyu(steps["a"], steps["c"]).pvalue,
     ]
     found = [cells["small", "steps_1_to_3", name].p_value for name in ("b", "c")]
-    np.testing.assert_allclose(found, holm(np.array(raw)))
+    np.testing.assert_allclose(found, list(holm(dict(enumerate(raw))).values()))
     table = {(line[0], line[1]): line[2:] for line in task_table(cells, SMALL, list(steps), "p against a").rows}
     assert table["steps_1_to_3", "a"] == ("3", "102.0 ± 1.15", "102.0", "104.0", "")
     assert table["steps_1_to_3", "c"][:4] == ("3", "2 of 3 reached it", "103.0", "never")

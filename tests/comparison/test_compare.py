@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -11,11 +10,12 @@ from helpers.walk import Walk, walk_source
 
 import sb3_combrel
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
-from sb3_combrel.experiments import compare as module
-from sb3_combrel.experiments.compare import RunResult, compare, returns_over_steps, smallest_p_value
-from sb3_combrel.experiments.engine_jobs import JobError
-from sb3_combrel.experiments.suite.runs import EpisodeRecorder
-from sb3_combrel.experiments.transfer_measures import LearningCurves, compare_learning
+from sb3_combrel.comparison import compare as module
+from sb3_combrel.comparison.compare import compare
+from sb3_combrel.comparison.curves import LearningCurves, returns_over_steps
+from sb3_combrel.comparison.measures import compare_learning
+from sb3_combrel.runs.episodes import EpisodeRecorder
+from sb3_combrel.runs.runner import JobError
 
 LEARNER = dict(model_breadth=0.15, resolution=3, degree=0)
 METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1)))}
@@ -86,7 +86,13 @@ def test_returns_over_steps_are_those_of_the_episode_under_way():
 
 def made_up(monkeypatch, returns, **arguments):
     """Compare methods whose episodes have these returns, of 10 steps each; one row a seed."""
-    monkeypatch.setattr(module, "carry_out", lambda run: RunResult(tuple(returns[run.method][run.seed]), (10.0,) * 12, None))
+
+    def run_missing(jobs, **_):
+        return [
+            job.result([10] * 12, returns[job.method][job.seed].tolist(), [True] * 12, 120, {"report": None}) for job in jobs
+        ]
+
+    monkeypatch.setattr(module, "run_missing", run_missing)
     n = len(next(iter(returns.values())))
     # The learner itself is not asked.
     return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
@@ -138,18 +144,6 @@ def test_the_threshold_may_be_given(monkeypatch):
     assert "steps to a return of -10 | COMBREL | inf | 50 |" in found.table
 
 
-@pytest.mark.parametrize(("n_first", "n_second"), [(2, 2), (3, 3), (4, 4), (2, 5), (3, 4)])
-def test_the_smallest_p_value_is_that_of_the_most_extreme_groups(n_first, n_second):
-    values = np.arange(n_first + n_second, dtype=float) ** 1.3
-    observed = abs(values[:n_first].mean() - values[n_first:].mean())
-    apart = [
-        abs(values[list(group)].mean() - np.delete(values, list(group)).mean())
-        for group in combinations(range(len(values)), n_first)
-    ]
-    assert smallest_p_value(n_first, n_second, 1) <= np.mean(np.array(apart) >= observed - 1e-12)
-    assert smallest_p_value(1, 5, 1) == 1.0
-
-
 GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
 
 
@@ -193,10 +187,10 @@ GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
     ],
 )
 def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
-    def refuse(run):
+    def refuse(*_, **__):
         raise AssertionError("the error should have come before")
 
-    monkeypatch.setattr(module, "carry_out", refuse)
+    monkeypatch.setattr(module, "run_missing", refuse)
     with pytest.raises(ValueError, match=message):
         compare(**{**GOOD, **change})
 
@@ -214,22 +208,31 @@ def test_a_run_that_is_too_short_for_an_episode_is_named():
         compare(**{**GOOD, "steps": 3})
 
 
-@pytest.mark.integration
+@pytest.mark.long
 def test_in_processes_the_results_are_the_same(result):
     here = compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER, n_jobs=2)
     assert str(here) == str(result)
     assert list(map(str, here.reports["TIMBREL"])) == list(map(str, result.reports["TIMBREL"]))
-    with pytest.raises(JobError, match=r"none, seed \d: ValueError: steps=3 is too few"):
-        compare(**{**GOOD, "steps": 3, "n_jobs": 2})
 
 
-@pytest.mark.integration
+class Breaking(Walk):
+    """A walk that breaks in the first step."""
+
+    def step(self, action):
+        raise OSError("broken")
+
+
+def test_an_error_within_a_run_is_named_with_its_run_and_traceback():
+    with pytest.raises(JobError, match=r"(?s)^none, seed 0: OSError: broken \(3 other runs failed, too\)\nTraceback.*step"):
+        compare(**{**GOOD, "env": Breaking})
+
+
 def test_it_is_exported_and_imported_only_when_asked_for():
     assert sb3_combrel.compare is compare
     assert "compare" in sb3_combrel.__all__
     code = (
-        "import sys, sb3_combrel; assert 'sb3_combrel.experiments' not in sys.modules; "
-        "assert 'scipy.stats' not in sys.modules; sb3_combrel.compare; assert 'sb3_combrel.experiments.compare' in sys.modules"
+        "import sys, sb3_combrel; assert 'sb3_combrel.comparison.compare' not in sys.modules; "
+        "assert 'scipy.stats' not in sys.modules; sb3_combrel.compare; assert 'sb3_combrel.comparison.compare' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
     with pytest.raises(AttributeError, match="has no attribute 'contrast'"):

@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_combrel.experiments.tasks import cart_pole
 from sb3_combrel.experiments.suite.tasks import TASKS
+from sb3_combrel.experiments.tasks import cart_pole
 
 # Gymnasium's constants, of a cart of 1 kg and a pole of 0.1 kg.
 GRAVITY, CART, POLE, FORCE, DT = 9.8, 1.0, 0.1, 10.0, 0.02
@@ -79,7 +79,7 @@ def test_bad_input_is_refused(arguments):
         cart_pole.make_cart_pole(**arguments)
 
 
-@pytest.mark.integration
+@pytest.mark.long
 def test_the_source_balances_and_has_falls():
     source = cart_pole.learn_source()
     assert len(source) == cart_pole.N_INSTANCES

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sb3_combrel.experiments.icub import TASK_IDS, film_strike, learn
+from sb3_combrel.experiments.film import TASK_IDS, film_strike, learn
 
 
-@pytest.mark.integration
+@pytest.mark.long
 def test_the_torso_is_learnt_and_filmed(tmp_path):
     model = learn("torso", n_episodes=20)
     env = gymnasium.make(TASK_IDS["torso"], render_mode="rgb_array", width=160, height=128)

@@ -1,0 +1,177 @@
+"""The demonstration, end to end, with budgets too small to learn anything."""
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium
+import pytest
+from helpers.command_line import call_for_all_output
+from imageio.v3 import imread
+
+import combrel_envs  # noqa: F401 - registers the tasks
+from sb3_combrel import FittedRMax, SourceInstances
+from sb3_combrel.experiments import demo
+from sb3_combrel.experiments.demo import OUTPUTS
+
+TINY = ("--seeds", "2", "--episodes", "2", "--max-episode-steps", "60")
+METHODS = ("no_transfer", "random_mapping", "timbrel", "combrel")
+
+
+def run_tiny_demo(folder, *more):
+    return call_for_all_output("demo", "--output", folder, *TINY, "--workers", "1", *more)
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def first_call(tmp_path_factory):
+    """Folder, status and output of a call; without a film, which one long test makes: software rendering takes seconds."""
+    folder = tmp_path_factory.mktemp("demo") / "output"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "_film", lambda *args: None)
+        return folder, *run_tiny_demo(folder)
+
+
+@pytest.fixture()
+def folder(first_call, tmp_path):
+    """What the first call has left, to do something with."""
+    return shutil.copytree(first_call[0], tmp_path / "output")
+
+
+@pytest.fixture()
+def no_film(monkeypatch):
+    """Software rendering takes seconds, and one test looks at a video."""
+    monkeypatch.setattr(demo, "_film", lambda *args: None)
+
+
+class TestDemo:
+    def test_the_demo_writes_all_listed_outputs(self, first_call):
+        folder, status, written = first_call
+        assert status == 0, written
+        assert sorted(path.name for path in folder.iterdir()) == sorted(set(OUTPUTS) - {"car.mp4"})
+        assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
+        assert len(SourceInstances.load(folder / "source.npz")) == 1000
+        for method in METHODS:
+            for seed in range(2):
+                assert list(folder.glob(f"tensorboard/{method}_seed{seed}_*/events.out.tfevents.*"))
+
+    def test_every_episode_of_every_run_is_in_the_results(self, first_call):
+        rows = rows_of(first_call[0] / "results.csv")
+        assert [(row["method"], row["seed"], row["episode"]) for row in rows] == [
+            (method, str(seed), str(episode))
+            for seed in range(2)
+            for method in ("no transfer", "random mapping", "TIMBREL", "COMBREL")
+            for episode in (1, 2)
+        ]
+        assert {(row["steps"], row["reached_goal"]) for row in rows} == {("60", "0")}
+
+    def test_the_tables_are_shown_and_kept(self, first_call):
+        folder, _, written = first_call
+        tables = (folder / "tables.md").read_text()
+        for text in ("Steps to goal", "steps saved", "no transfer", "East<-Right + Neutral", "(x, vx) + (y, vy)"):
+            assert text in tables
+            assert text in written
+
+    def test_the_model_drives(self, first_call):
+        model = FittedRMax.load(first_call[0] / "car.zip")
+        env = gymnasium.make("combrel/MountainCar4D-v0")
+        action, _ = model.predict(env.reset(seed=0)[0], deterministic=True)
+        assert env.action_space.contains(int(action))
+
+    def test_the_demo_ends_with_the_paths_of_its_outputs_and_further_commands(self, first_call):
+        folder, _, written = first_call
+        ending = written[written.index("Everything is in") :]
+        assert str(folder) in ending
+        assert all(name in ending for name in set(OUTPUTS) - {"car.mp4"})
+        assert "What to try next" in ending
+
+    def test_a_second_call_learns_nothing_again(self, folder, no_film):
+        before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")}
+        status, written = run_tiny_demo(folder)
+        assert status == 0
+        assert "8 of 8 runs were complete already" in written
+        assert {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")} == before
+
+    def test_more_runs_are_added_to_those_that_are_there(self, folder, no_film):
+        status, written = run_tiny_demo(folder, "--seeds", "3")
+        assert status == 0
+        assert "8 of 12 runs were complete already" in written
+        assert len(rows_of(folder / "results.csv")) == 24
+
+    def test_results_of_other_settings_are_not_mixed_with_new_ones(self, folder):
+        status, written = run_tiny_demo(folder, "--max-episode-steps", "50")
+        assert status == 1
+        assert "max_episode_steps was 60 and is 50" in written
+
+    def test_fresh_deletes_earlier_results_and_nothing_of_the_users(self, folder, no_film):
+        (folder / "notes.txt").write_text("mine")
+        status, written = run_tiny_demo(folder, "--fresh", "--max-episode-steps", "50")
+        assert status == 0
+        assert "complete already" not in written
+        assert {row["steps"] for row in rows_of(folder / "results.csv")} == {"50"}
+        assert (folder / "notes.txt").read_text() == "mine"
+
+    @pytest.mark.parametrize("fresh", [(), ("--fresh",)])
+    def test_a_folder_of_other_things_is_left_alone(self, tmp_path, fresh):
+        (tmp_path / "source.npz").write_text("mine")
+        status, written = run_tiny_demo(tmp_path, *fresh)
+        assert status == 1
+        assert "--output" in written
+        assert [path.name for path in tmp_path.iterdir()] == ["source.npz"]
+
+    @pytest.mark.parametrize("option", ["--seeds", "--episodes", "--max-episode-steps", "--workers"])
+    def test_numbers_below_one_are_refused(self, tmp_path, option):
+        status, written = call_for_all_output("demo", "--output", tmp_path / "new", option, "0")
+        assert status == 1
+        assert "must be at least 1, got 0" in written
+        assert not (tmp_path / "new").exists()
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("renderer", ["egl", "disable"])
+    def test_the_film_shows_the_episode_or_names_what_to_install(self, folder, renderer):
+        command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY]
+        environment = {**os.environ, "MUJOCO_GL": renderer}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        if renderer == "disable":
+            assert "libegl1" in done.stdout and not (folder / "car.mp4").exists()
+            return
+        frames = imread(folder / "car.mp4")
+        # 60 steps: each fourth from the first on, and the last.
+        assert frames.shape[1:] == (360, 480, 3) and len(frames) == 16
+
+    @pytest.mark.long
+    @pytest.mark.skipif(sys.platform == "win32", reason="no process groups")
+    def test_an_interrupted_demo_continues_where_it_stopped(self, tmp_path, no_film):
+        folder = tmp_path / "output"
+        command = [sys.executable, "-m", "sb3_combrel.cli", "demo", "--output", folder, *TINY, "--episodes", "10"]
+        process = subprocess.Popen(
+            [*command, "--workers", "2"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            # Whoever runs the tests in a shell's background has them, and all they start, ignore the signal.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        deadline = time.monotonic() + 300
+        while not list(folder.glob("runs/*.json")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        # As the terminal does at Ctrl-C: all of the command's processes get the signal.
+        os.killpg(process.pid, signal.SIGINT)
+        written, _ = process.communicate(timeout=60)
+        assert process.returncode == 130, written
+        assert "goes on from here" in written
+        finished = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*.json")}
+        assert 0 < len(finished) < 8
+        status, written = run_tiny_demo(folder, "--episodes", "10")
+        assert status == 0 and f"{len(finished)} of 8 runs were complete already" in written
+        assert finished.items() <= {path: path.stat().st_mtime_ns for path in folder.glob("runs/*.json")}.items()
