@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_combrel._moved import keep_old_names
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
 from sb3_combrel.sources.fitted_rmax_source import register_fitted_rmax
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from sb3_combrel.experiments.compare import compare
 
 FittedRMax.default_callbacks.append(with_dashboard)
-keep_old_names()
 register_fitted_rmax(FittedRMax)
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()

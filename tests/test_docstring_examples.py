@@ -32,7 +32,6 @@ def test_examples_are_found():
     assert examples_of("Text::\n\n    a = 1\n\n    b = 2\n\nMore.") == ["a = 1\n\nb = 2\n\n"]
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize("name", sb3_combrel.__all__)
 def test_whatever_is_exported_has_an_example_that_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
