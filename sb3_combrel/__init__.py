@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sb3_combrel._moved import keep_old_names
 from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from sb3_combrel.comparison.compare import compare
 
 FittedRMax.default_callbacks.append(with_dashboard)
-keep_old_names()
 register_fitted_rmax(FittedRMax)
 
 __all__ = [

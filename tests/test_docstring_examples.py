@@ -13,6 +13,8 @@ import combrel_envs  # noqa: F401 - registers the environments
 import sb3_combrel
 
 SHORT_CAR = "ShortMountainCar4D-v0"
+# Worker processes, and what is fitted by gradient descent.
+TAKE_LONG = {"compare", "SoftHomomorphism", "SparseCodingMapping", "ThreeWayRBM"}
 
 
 def examples_of(docstring):
@@ -32,8 +34,9 @@ def test_examples_are_found():
     assert examples_of("Text::\n\n    a = 1\n\n    b = 2\n\nMore.") == ["a = 1\n\nb = 2\n\n"]
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize("name", sb3_combrel.__all__)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in TAKE_LONG)) for name in sb3_combrel.__all__]
+)
 def test_whatever_is_exported_has_an_example_that_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     documented = getattr(sb3_combrel, name)

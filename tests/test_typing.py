@@ -22,26 +22,15 @@ result.figure().savefig("curves.png")
 """
 
 
-@pytest.mark.integration
+@pytest.mark.long
 def test_the_lines_of_the_readme_and_the_results_pass_mypy_strict(tmp_path):
     pytest.importorskip("mypy")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
     file = tmp_path / "users_code.py"
     file.write_text("\n".join([*blocks, "from sb3_combrel import COMBREL, InterTaskMapping\n", MORE]))
     # Only what a user writes is judged, against the types that this package declares.
-    command = [
-        sys.executable,
-        "-m",
-        "mypy",
-        "--strict",
-        "--follow-imports=silent",
-        "--config-file=",
-        f"--cache-dir={os.devnull}",
-        str(file),
-    ]
-    done = subprocess.run(command, cwd=tmp_path, env=_with_package(), capture_output=True, text=True, timeout=300)
+    options = ["--strict", "--follow-imports=silent", "--config-file=", f"--cache-dir={os.devnull}"]
+    with_package = {**os.environ, "MYPYPATH": f"{ROOT}:{ROOT / 'envs'}"}
+    command = [sys.executable, "-m", "mypy", *options, str(file)]
+    done = subprocess.run(command, cwd=tmp_path, env=with_package, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-def _with_package():
-    return {**os.environ, "MYPYPATH": f"{ROOT}:{ROOT / 'envs'}"}

@@ -8,16 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sb3_combrel.common.checks import check_resolution
+from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.task import Task
-from sb3_combrel.fitted_rmax.loop_detection import (
-    EXPLOIT,
-    EXPLORE,
-    OPTIMISTIC,
-    ORDER,
-    ORDER_WITH_BOUNDS,
-    EpisodeMemory,
-    small_cell,
-)
+from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory, manner, small_cell
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
@@ -72,22 +66,22 @@ class FittedRMaxAgent:
         self.transfer = transfer
         self.model_class = MODELS[settings.degree] if model_class is None else model_class
         self.rng = np.random.default_rng() if rng is None else rng
-        self._prediction_rng = np.random.default_rng(self.rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
+        self._prediction_rng = self.rng.spawn(1)[0]
         d = task.n_variables
         self.max_backups = settings.backups_for(d)
         #: Which state variables are periodic.
-        self.periodic = settings.periodic_for(d)
+        self.periodic = periodic_flags(settings.periodic, d)
         self.model_settings = settings.model_settings(d)
         breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
-        self.grid = fitting_grid(d, task.n_actions, settings.resolution_for(d), breadth, min_weight, self.periodic)
+        check_resolution(settings.resolution, d)
+        self.grid = fitting_grid(d, task.n_actions, settings.resolution, breadth, min_weight, self.periodic)
         transfers = transfer is not None and transfer.informs_model
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
         warn_if_long(self.workload, self.grid)
-        self.n_truncated = 0
-        self.n_backups = 0
+        self.n_truncated = self.n_backups = 0
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
-        # Measure the time of planning, which takes some itself.
+        #: Whether to measure the time of planning, which takes some itself.
         self.timed = False
         self.planning_seconds = 0.0
         # One thread at a time: predicting in one while another learns must be safe.
@@ -97,13 +91,14 @@ class FittedRMaxAgent:
         self._transfer_decides = transfer is not None and type(transfer).action is not Transfer.action
         if transfer is not None:
             transfer.check_degree(1 if self.model_class.takes_prior else 0)
-            self.target = self._target_task(transfer)
+            self.target = self._target_task()
+            transfer.bind(self.target, self.rng)
         self._build()
         if transfer is not None:
             self._widen(transfer.lowest_reward())
 
-    def _target_task(self, transfer: Transfer) -> TargetTask:
-        target = TargetTask(
+    def _target_task(self) -> TargetTask:
+        return TargetTask(
             scaling=self.task.scaling,
             n_actions=self.task.n_actions,
             sample_states=self.grid.points(),
@@ -117,18 +112,14 @@ class FittedRMaxAgent:
             gamma=self.settings.gamma,
             max_value=float(self.settings.max_value),
         )
-        transfer.bind(target, self.rng)
-        return target
 
     def _build(self) -> None:
         """Make model and planner, without any instances."""
-        max_value = float(self.settings.max_value)
+        max_value, tolerance = float(self.settings.max_value), self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.settings.gamma)
-        of_model = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        self.model = self.model_class(self.mdp, self.model_settings, of_model)
-        self.planner = Planner(
-            self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=self.settings.planning_tolerance
-        )
+        self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
+        self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
+        self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self._set_corrections(CorrectionArrays.empty(self.task.n_variables))
         self.visits = Visits(self.task.n_variables, self.grid.n_points)
         self._outdated: list[np.ndarray] = []
@@ -140,7 +131,7 @@ class FittedRMaxAgent:
         """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
         # The generator itself stays the same, as the transfer method has it too.
         self.rng.bit_generator.state = rng.bit_generator.state
-        self._prediction_rng = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])  # type: ignore[attr-defined]
+        self._prediction_rng = rng.spawn(1)[0]
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_lock"}
@@ -162,11 +153,9 @@ class FittedRMaxAgent:
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
             first. Otherwise the best action of those that are known; where none is, of those that are modelled with
-            transferred instances: an evaluation must not depend on trying things out. Where a source bounds the values, the
-            best of all actions, the first of several: what is unknown is then worth no more than the source allows.
+            transferred instances. Where a source bounds the values, the best of all actions, the first of several.
         :param episode: in learning, a number that tells the episodes of all environments apart
-        :param memory: in evaluation, what is stored of the episode so far; where it is caught in a loop, other actions
-            are tried
+        :param memory: in evaluation, what is stored of the episode so far; in a loop other actions are tried
         :param environment: in learning, the number of the environment, for a transfer method that decides actions
         :return: the action, from 0 on
         :raises ValueError: if a transfer method decides on something that is no action
@@ -194,8 +183,7 @@ class FittedRMaxAgent:
         if self.corrections.n_states[0] == len(self.corrections.key):
             self._set_corrections(self.corrections.with_room())
         prediction, given = self.model.predict_at(state)
-        if given is not None:
-            assert self.transfer is not None
+        if given is not None and self.transfer is not None:
             self.transfer.note_use(given)
         elif self.model.accepts_visited:
             self._note_visit(state, prediction)
@@ -217,8 +205,7 @@ class FittedRMaxAgent:
             self._outdated.append(self.model.accept(pairs))
 
     def _exploit(self, state: np.ndarray, memory: EpisodeMemory | None) -> int:
-        order = ORDER_WITH_BOUNDS if self.planner.is_bounded else ORDER
-        mode = order[0 if memory is None else memory.attempt]
+        mode = manner(memory, self.planner.is_bounded)
         prediction = self._evaluate(state, self.planner.exploitation_values() if mode == EXPLOIT else None)
         q = self._q.q
         eligible = prediction.weight >= self.model.exploration_threshold
@@ -226,7 +213,7 @@ class FittedRMaxAgent:
             eligible = prediction.modelled
         if mode == EXPLORE or (mode == OPTIMISTIC and not eligible.any()):
             eligible = np.ones(len(q), dtype=np.bool_)
-        action = int(np.where(eligible, q, -np.inf).argmax()) if eligible.any() else 0
+        action = int(np.where(eligible, q, -np.inf).argmax())
         if memory is not None:
             memory.note(small_cell(state, self.grid), float(q[action]), float(prediction.reward[action]), self.settings.gamma)
         return action
@@ -259,13 +246,7 @@ class FittedRMaxAgent:
         return values, self._plain_corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.upper
 
     def update(
-        self,
-        state: np.ndarray,
-        action: int,
-        reward: float,
-        next_state: np.ndarray,
-        terminated: bool,
-        environment: int = 0,
+        self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
     ) -> None:
         """
         Learn from one transition, and plan.
@@ -302,11 +283,7 @@ class FittedRMaxAgent:
             self._plan(AT_EPISODE_END * self.max_backups)
 
     def complete(self) -> None:
-        """
-        Bring the model up to date with all transitions, as at an episode's end.
-
-        What is then saved is what is predicted with.
-        """
+        """Bring the model up to date with all transitions, as at an episode's end: what is saved is what is predicted with."""
         with self._lock:
             pairs = self.model.end_episode()
             if len(pairs):
@@ -314,11 +291,8 @@ class FittedRMaxAgent:
                 self._plan(0)
 
     def _lowered_threshold(self) -> float:
-        """The threshold after so many episodes that ran into their time limit.
-
-        Where the kernel is so narrow that all that is within an episode's reach cannot become known, exploration would
-        otherwise go on for ever. In the end any instance that counts at all suffices.
-        """
+        # Where the kernel is so narrow that all that is within an episode's reach cannot become known, exploration would
+        # otherwise go on for ever. In the end any instance that counts at all suffices.
         full, min_weight = self.model_settings.exploration_threshold, self.model_settings.min_weight
         return max(full * THRESHOLD_DECAY ** max(0, self.n_truncated - DECAY_AFTER_EPISODES), min(full, min_weight))
 
@@ -328,26 +302,14 @@ class FittedRMaxAgent:
             # Episodes are numbered from 0 again.
             self.corrections.visits.fill(0)
             self._plan(0)
-            if self.transfer is None and self.model.n_instances == 0:
-                return
-            self.planner.restart()
-            self.n_backups += self.planner.sweep_all(BEFORE_FIRST_STEP)
+            if self.transfer is not None or self.model.n_instances > 0:
+                self.planner.restart()
+                self.n_backups += self.planner.sweep_all(BEFORE_FIRST_STEP)
 
     def _plan(self, max_backups: int, around: np.ndarray = NOWHERE) -> None:
-        """Plan, and measure the time that it takes if that is wanted."""
-        if not self.timed:
-            return self._update_and_plan(max_backups, around)
-        began = perf_counter()
-        self._update_and_plan(max_backups, around)
-        self.planning_seconds += perf_counter() - began
-
-    def _update_and_plan(self, max_backups: int, around: np.ndarray) -> None:
         """Update the rows of the pairs that changed, and plan; longer where transfer changed many pairs at once."""
-        changed = NO_PAIRS if self.transfer is None else self._changed_by(self.transfer)
-        if self.transfer is not None and self.transfer.use == "prior":
-            changed = self.model.renew_prior()
-            if len(changed):
-                self.planner.set_upper(self.transfer.value_bound())
+        began = perf_counter() if self.timed else None
+        changed = NO_PAIRS if self._model_transfer is None else self._changed_by(self._model_transfer)
         passes = 0
         if len(changed):
             self._outdated.append(changed)
@@ -366,22 +328,25 @@ class FittedRMaxAgent:
         self._outdated.clear()
         if passes:
             self.n_backups += self.planner.sweep_all(passes)
+        if began is not None:
+            self.planning_seconds += perf_counter() - began
 
     def _changed_by(self, transfer: Transfer) -> np.ndarray:
-        """The pairs, not known, for which the transfer method may have other instances than when it was last asked."""
-        if not transfer.informs_model:
-            return NO_PAIRS
+        """The pairs for which transfer has changed: all for a new prior, or those, not known, that may have new instances."""
+        if transfer.use == "prior":
+            pairs = self.model.renew_prior()
+            if len(pairs):
+                self.planner.set_upper(transfer.value_bound())
+            return pairs
         changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
-        if isinstance(changed, bool | np.bool_):
-            return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
-        return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
+        if not np.any(changed):
+            return NO_PAIRS
+        return np.flatnonzero(np.broadcast_to(np.ravel(changed), self.model.known.shape) & ~self.model.known)
 
     def _widen(self, reward: float) -> None:
         """Keep the lower bound of the values below what the worst reward seen could add up to."""
         low, high = self.planner.bounds
-        lowest = min(0.0, high) + LONGEST_PLAN * min(0.0, reward)
-        if lowest < low:
-            self.planner.bounds = (lowest, high)
+        self.planner.bounds = (min(low, min(0.0, high) + LONGEST_PLAN * min(0.0, reward)), high)
 
     def get_state(self) -> dict[str, np.ndarray]:
         """
@@ -409,8 +374,7 @@ class FittedRMaxAgent:
             if self.transfer is not None:
                 self.transfer.bind(self.target, self.rng)
                 prefix = "transfer_"
-                given = {name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)}
-                self.transfer.set_state(given)
+                self.transfer.set_state({name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)})
             self.model.lower_threshold(self._lowered_threshold())
             self.model.set_state(state)
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
@@ -423,8 +387,7 @@ class FittedRMaxAgent:
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""
         with self._lock:
-            modelled = float(self.mdp.arrays.modelled.mean())
-            known = float(self.model.known.mean())
+            modelled, known = float(self.mdp.arrays.modelled.mean()), float(self.model.known.mean())
             figures = {
                 "model/instances": self.model.n_instances,
                 "model/known": known,

@@ -1,23 +1,19 @@
-"""Arguments of the constructor and of ``learn`` that Stable-Baselines3 defines: order and checks."""
+"""Arguments of the constructor that Stable-Baselines3 defines: order and checks."""
 
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_combrel.common.checks import as_count, check_count, count_text
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
 DEFAULT_POLICY = "FittedRMaxPolicy"
 # NumPy's and PyTorch's generators take no larger seeds.
 MAX_SEED = 2**32 - 1
-# Thousands of years: larger numbers, such as 1e308, are mistakes.
-MAX_TIMESTEPS = 10**15
 
 
 def policy_and_env(policy: Any, env: Any, aliases: Container[str]) -> tuple[Any, Any]:
@@ -57,13 +53,6 @@ def check_actions(action_space: spaces.Space[Any]) -> int:
     raise ValueError(message)
 
 
-def check_seed(seed: object) -> None:
-    """
-    :raises ValueError: unless ``seed`` is a whole number that all generators take, or None
-    """
-    check_count("seed", seed, min=0, max=MAX_SEED, none_allowed=True)
-
-
 def check_type(name: str, value: object, types: tuple[type, ...], right: str) -> None:
     """
     :param right: what the argument must be, for the message
@@ -73,62 +62,20 @@ def check_type(name: str, value: object, types: tuple[type, ...], right: str) ->
         raise ValueError(f"{name} must be {right}, got {value!r}")
 
 
-def check_total_timesteps(total_timesteps: object) -> int:
+def check_policy(policy: type[BasePolicy], policy_kwargs: object, taken: Sequence[str]) -> None:
     """
-    Check a number of steps, which may have been written as a float, such as 1e5.
+    Check a policy and the arguments for it.
 
-    :return: the number as an int
-    :raises ValueError: unless it is a whole number of at least 1, and not absurdly large
-    """
-    number = as_count("total_timesteps", total_timesteps)
-    if number > MAX_TIMESTEPS:
-        raise ValueError(f"total_timesteps must be at most {MAX_TIMESTEPS:,}, got {count_text(number)}")
-    return number
-
-
-def check_policy_kwargs(policy_kwargs: object, policy: type[BasePolicy], taken: Sequence[str]) -> None:
-    """
-    Check arguments for the policy.
-
-    :param policy_kwargs: what the user gave
-    :param policy: the class of the policy
     :param taken: arguments of the policy that the algorithm itself passes
-    :raises ValueError: if it is no dict, or has arguments that the policy does not take or that the algorithm passes
+    :raises ValueError: if it is no policy of this algorithm, or ``policy_kwargs`` are no dict of arguments that it takes
     """
-    if not isinstance(policy_kwargs, Mapping):
-        raise ValueError(f"policy_kwargs must be a dict of arguments of the policy or None, got {policy_kwargs!r}")
-    policies: tuple[type[BasePolicy], ...] = (policy, FittedRMaxPolicy)
-    known = [
-        name
-        for each in policies
-        for name, parameter in inspect.signature(each).parameters.items()
-        if parameter.kind is not inspect.Parameter.VAR_KEYWORD and name not in taken
-    ]
-    for name in policy_kwargs:
+    if not issubclass(policy, FittedRMaxPolicy):
+        raise ValueError(f"policy must be FittedRMaxPolicy or a subclass, got {policy.__name__}")
+    check_type("policy_kwargs", policy_kwargs, (Mapping,), "a dict of arguments of the policy or None")
+    parameters = {**inspect.signature(policy).parameters, **inspect.signature(FittedRMaxPolicy).parameters}
+    known = [name for name, each in parameters.items() if each.kind is not each.VAR_KEYWORD and name not in taken]
+    for name in policy_kwargs:  # type: ignore[attr-defined]
         if name in taken:
             raise ValueError(f"policy_kwargs must not have {name!r}: pass {name}=... to FittedRMax itself")
         if name not in known:
-            raise ValueError(f"policy_kwargs must have names out of {', '.join(dict.fromkeys(known))}, got {name!r}")
-
-
-def warn_of_max_value(max_value: float, rewards: Sequence[float], gamma: float) -> bool:
-    """
-    Warn if a return exceeds ``max_value``: then it is no upper bound, and exploration ends too soon.
-
-    :param max_value: the upper bound on returns that the user gave
-    :param rewards: rewards of an episode, or of the end of one
-    :param gamma: discount factor
-    :return: whether there was anything to warn of
-    """
-    best, value = -float("inf"), 0.0
-    for reward in reversed(rewards):
-        value = reward + gamma * value
-        best = max(best, value)
-    if best <= max_value + 1e-6 * max(1.0, abs(max_value)):
-        return False
-    warnings.warn(
-        f"max_value={max_value:g} must be an upper bound on the return (discounted with gamma={gamma:g}), "
-        f"but a return of {best:g} was observed; pass a larger max_value, or the agent will stop exploring too soon",
-        stacklevel=3,
-    )
-    return True
+            raise ValueError(f"policy_kwargs must have names out of {', '.join(known)}, got {name!r}")

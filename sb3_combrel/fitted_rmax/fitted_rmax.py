@@ -18,22 +18,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_combrel.common.checks import check_count
-from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.checks import as_count, check_boolean, check_count
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
-from sb3_combrel.fitted_rmax.arguments import (
-    DEFAULT_POLICY,
-    check_actions,
-    check_policy_kwargs,
-    check_seed,
-    check_total_timesteps,
-    check_type,
-    policy_and_env,
-    warn_of_max_value,
-)
-from sb3_combrel.fitted_rmax.persistence import PersistentAlgorithm
+from sb3_combrel.fitted_rmax.arguments import DEFAULT_POLICY, MAX_SEED, check_actions, check_policy, check_type, policy_and_env
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.progress import ProgressWatch
+from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.transfer.base import Transfer
@@ -42,11 +32,13 @@ from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 SelfFittedRMax = TypeVar("SelfFittedRMax", bound="FittedRMax")
 
 DEFAULT_TIMESTEPS = 20_000
+# Thousands of years: larger numbers, such as 1e308, are mistakes.
+MAX_TIMESTEPS = 10**15
 DEFAULTS = FittedRMaxSettings()
 PASSED_TO_POLICY = ("observation_space", "action_space", "transfer", "rng")
 
 
-class FittedRMax(PersistentAlgorithm):
+class FittedRMax(SavedAlgorithm):
     """
     Fitted R-Max: model-based exploration in continuous state spaces.
 
@@ -60,9 +52,8 @@ class FittedRMax(PersistentAlgorithm):
     Deviations from the original, and why:
 
     - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables and the box
-      itself for more: far fewer states, and no worse learning.
-    - What was known once stays known, on the grid and at exact states (the original falls back when a nearer instance
-      shortens the list).
+      itself for more: far fewer states.
+    - What was known once stays known (the original falls back when a nearer instance shortens the list).
     - Planning is bounded by ``max_backups`` a step, points around the agent first; the others are backed up later, most of
       them at an episode's end. Staying in a grid point is summed in closed form.
     - With ``degree=1`` the planner's model leads several steps ahead, until a cell of the grid is left (``max_model_steps``):
@@ -84,9 +75,9 @@ class FittedRMax(PersistentAlgorithm):
         model.save("car")
         action, state = model.predict(np.array([-0.5, 0.0]), deterministic=True)
 
-    Cost: a step's time is about linear in the number of instances near the state, and linear, with a small factor, in the
-    number of all instances (one box is compared for every 8 of them). Memory is about 400 bytes for an instance, and about
-    800 bytes for a known state-action pair of the grid. Both are bounded, by ``max_instances`` and by the grid.
+    Cost: a step's time is about linear in the number of instances near the state, and, with a small factor, in the number of
+    all instances. Memory is about 400 bytes for an instance, and 800 bytes for a known state-action pair of the grid. Both
+    are bounded, by ``max_instances`` and by the grid.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", which means the same); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
@@ -201,13 +192,11 @@ class FittedRMax(PersistentAlgorithm):
         self.max_backups = max_backups
         self.max_instances = max_instances
         self.bounds = bounds
-        # Files of version 0.1.0, which had the kernel average only, say nothing of it: loading sets what they say after this.
-        self.degree = degree if _init_setup_model else 0
+        self.degree = degree
         self.n_neighbors = n_neighbors
         self.outcome_breadth = outcome_breadth
         self.max_model_steps = max_model_steps
         self.periodic = periodic
-        self._warned_of_max_value = False
         self._names: dict[str, Any] = {}
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
@@ -215,25 +204,21 @@ class FittedRMax(PersistentAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        self.transfer = restore_transfer(self.transfer)
         if self.env is not None:
             refuse_normalized_observations(self.env)
             # Saved with the model, for one that is loaded without an environment.
             self._names = names_of(self.env)
-        if self.periodic is None:
-            self.periodic = periodic_of(self.env)
+            self.periodic = periodic_of(self.env) if self.periodic is None else self.periodic
         if self.seed is None:
             # A script that seeds numpy is then reproducible, as with the other algorithms.
             self._rng = np.random.default_rng(np.random.randint(2**31))
         self.set_random_seed(self.seed)
-        # Version 0.1.0 saved it as _chance.
-        saved = self.__dict__.pop("_chance", None) or self._generator_state
-        if saved is not None:
-            self._rng.bit_generator.state, self._generator_state = saved, None
+        if self._generator_state is not None:
+            self._rng.bit_generator.state, self._generator_state = self._generator_state, None
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
-            transfer=make_transfer(self.transfer),
+            transfer=make_transfer(restore_transfer(self.transfer)),
             rng=self._rng,
             **{name: getattr(self, name) for name in FittedRMaxSettings.names()},
             **{**self._names, **self.policy_kwargs},
@@ -256,15 +241,12 @@ class FittedRMax(PersistentAlgorithm):
                 self.agent.reseed(rng)
 
     def _check_arguments(self) -> None:
-        """Refuse what does not fit before anything is built."""
+        """Refuse what the policy does not check before anything is built."""
         check_actions(self.action_space)
-        check_seed(self.seed)
+        check_count("seed", self.seed, min=0, max=MAX_SEED, none_allowed=True)
         check_count("stats_window_size", self._stats_window_size)
         check_type("tensorboard_log", self.tensorboard_log, (str, Path, type(None)), "the path of a folder or None")
-        check_policy_kwargs(self.policy_kwargs, self.policy_class, (*FittedRMaxSettings.names(), *PASSED_TO_POLICY))
-        n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
-        self.settings.resolution_for(n_variables)
-        self.settings.periodic_for(n_variables)
+        check_policy(self.policy_class, self.policy_kwargs, (*FittedRMaxSettings.names(), *PASSED_TO_POLICY))
 
     @property
     def settings(self) -> FittedRMaxSettings:
@@ -301,11 +283,11 @@ class FittedRMax(PersistentAlgorithm):
         :param progress_bar: display a progress bar using tqdm and rich
         :raises ValueError: if an argument is out of its range, or the environment returns something that is not finite
         """
-        total_timesteps = check_total_timesteps(total_timesteps)
+        total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_TIMESTEPS)
         check_count("log_interval", log_interval, none_allowed=True)
         check_type("tb_log_name", tb_log_name, (str, type(None)), "text or None")
-        for name, value in {"reset_num_timesteps": reset_num_timesteps, "progress_bar": progress_bar}.items():
-            check_type(name, value, (bool, np.bool_), "True or False")
+        check_boolean("reset_num_timesteps", reset_num_timesteps)
+        check_boolean("progress_bar", progress_bar)
         if self.env is None:
             raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")
         run_name = self._run_name() if tb_log_name is None else tb_log_name
@@ -327,10 +309,8 @@ class FittedRMax(PersistentAlgorithm):
         return self
 
     def _run_name(self) -> str:
-        transfer = self.agent.transfer
-        parts = ["FittedRMax", "" if transfer is None else type(transfer).__name__]
-        parts.append("" if self.seed is None else f"seed{self.seed}")
-        return "_".join(filter(None, parts))
+        method = "" if self.transfer is None else f"_{type(self.transfer).__name__}"
+        return f"FittedRMax{method}" + ("" if self.seed is None else f"_seed{self.seed}")
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Make one step of every environment; return False if a callback stops the learning."""
@@ -345,19 +325,18 @@ class FittedRMax(PersistentAlgorithm):
         self.num_timesteps += self.env.num_envs
         self._update_info_buffer(infos, dones)
         raw_rewards = self._raw_rewards(rewards)
-        ended = [e for e, done in enumerate(dones.tolist()) if done]
-        next_obs, terminated = true_outcomes(new_obs, dones, infos, ended)
+        next_obs, terminated = true_outcomes(new_obs, dones, infos)
         next_states = self.policy.to_unit(next_obs)
         for e, choice in enumerate(choices):
             self.agent.update(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]), e)
             self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if ended else next_states
+        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if dones.any() else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         # The end of an episode is processed even if a callback stops the learning at this step.
         going_on = callback.on_step()
-        for e in ended:
+        for e in np.flatnonzero(dones).tolist():
             self._end_episode(e, bool(terminated[e]))
             if log_interval is not None and self._episode_num % log_interval == 0:
                 callback.on_rollout_end()
@@ -385,8 +364,6 @@ class FittedRMax(PersistentAlgorithm):
         self.agent.end_episode(not terminated, env_index)
         rewards = self._episode_rewards[env_index]
         self._episode_rewards[env_index] = []
-        if not self._warned_of_max_value and (terminated or min(rewards) >= 0.0):
-            self._warned_of_max_value = warn_of_max_value(self.max_value, rewards, self.gamma)
         self._progress.note(rewards, terminated, self.agent.n_optimistic_actions)
 
     def dump_logs(self) -> None:

@@ -2,48 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
-from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.common.utils import get_device
 
 from sb3_combrel.common.observations import ObservationScaler
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.loop_detection import EpisodeMemory, memories
-from sb3_combrel.fitted_rmax.saving import misfit
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
-from sb3_combrel.transfer.instances.instance_transfer import ALL_USED
-
-# What was the policy's in version 0.1.0, and where it is in the agent; the old names work for one version.
-MOVED_TO_AGENT = {
-    "model": "model",
-    "planner": "planner",
-    "corrections": "corrections",
-    "q_values": "q_values",
-    "statistics": "statistics",
-    "end_episode": "end_episode",
-    "prepare": "prepare",
-    "rng": "rng",
-    "n_truncated": "n_truncated",
-    "max_backups": "max_backups",
-    "n_actions": "task.n_actions",
-    "state_names": "task.state_names",
-    "action_names": "task.action_names",
-}
-
-SelfFittedRMaxPolicy = TypeVar("SelfFittedRMaxPolicy", bound="FittedRMaxPolicy")
 
 
 class FittedRMaxPolicy(BasePolicy):
@@ -90,14 +66,6 @@ class FittedRMaxPolicy(BasePolicy):
         self._settings = settings
         self._model_class = model_class
 
-    def __getattr__(self, name: str) -> Any:
-        # Called only for what is not there otherwise.
-        if name not in MOVED_TO_AGENT or "agent" not in self.__dict__:
-            return super().__getattr__(name)
-        path = MOVED_TO_AGENT[name]
-        warnings.warn(f"policy.{name} has moved to policy.agent.{path}", DeprecationWarning, stacklevel=2)
-        return attrgetter(path)(self.agent)
-
     @property
     def transfer(self) -> Any:
         """The transfer method, bound to the task; None if there is none. Which class it is, the user knows, not the type."""
@@ -105,27 +73,9 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
-        # The degree is said in any case: see ``load``.
-        settings = {**self._settings, "degree": self.agent.settings.degree}
-        parameters = {**spaces_of_both, **settings, "transfer": describe_transfer(self.transfer)}
+        parameters = {**spaces_of_both, **self._settings, "transfer": describe_transfer(self.transfer)}
         # A class is pickled by its name, and imported by who reads it: only one of the user's own has to be.
         return parameters if self._model_class is None else {**parameters, "model_class": self._model_class}
-
-    @classmethod
-    def load(cls: type[SelfFittedRMaxPolicy], path: str, device: th.device | str = "auto") -> SelfFittedRMaxPolicy:
-        """
-        Load a policy that was saved by itself, by ``policy.save(path)``.
-
-        :param path: path of the file
-        :param device: where its tensors go
-        """
-        place = get_device(device)
-        # As SB3 does: observation spaces are pickled.
-        saved = th.load(path, map_location=place, weights_only=False)
-        # Files of version 0.1.0, which had the kernel average only, do not say the degree.
-        policy = cls(**{"degree": 0, **saved["data"]})
-        policy.load_state_dict(saved["state_dict"])
-        return policy.to(place)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
@@ -208,13 +158,6 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         expected = self.agent.get_state()
-        if self.agent.settings.degree == 0:
-            # Version 0.1.0, which had the kernel average only, did not have them.
-            for name in {"visits", "transfer_check", "transfer_errors"} & expected.keys():
-                state_dict.setdefault(prefix + name, th.zeros(expected[name].shape, dtype=th.float64))
-        if "transfer_relevance_of" in expected:
-            # Version 0.2.0 did not have it.
-            state_dict.setdefault(prefix + "transfer_relevance_of", th.full((1,), ALL_USED, dtype=th.float64))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
@@ -222,9 +165,18 @@ class FittedRMaxPolicy(BasePolicy):
         if missing_keys or unexpected_keys or error_msgs:
             return
         saved = {name: state_dict[prefix + name] for name in expected}
-        problem = misfit(saved, expected)
-        if problem:
-            error_msgs.append(problem)
-        else:
-            arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
-            self.agent.set_state(arrays)
+        problems = [problem for name, tensor in saved.items() if (problem := _misfit(name, tensor, expected[name]))]
+        error_msgs.extend(problems)
+        if not problems:
+            self.agent.set_state({name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()})
+
+
+def _misfit(name: str, tensor: Any, expected: np.ndarray) -> str:
+    """Say in what a saved tensor differs from what a new agent has by that name; arrays may differ in their rows."""
+    if not isinstance(tensor, th.Tensor) or tensor.dtype not in (th.float64, th.float32):
+        return f"{name} must be a tensor of floating-point numbers, got {getattr(tensor, 'dtype', type(tensor).__name__)}"
+    fixed = 1 if expected.ndim > 1 else 0
+    if tensor.ndim != expected.ndim or tuple(tensor.shape[fixed:]) != expected.shape[fixed:]:
+        shape = ", ".join(["any"] * fixed + [str(n) for n in expected.shape[fixed:]])
+        return f"{name} must have shape ({shape}), got {tuple(tensor.shape)}"
+    return "" if th.isfinite(tensor).all() else f"{name} must have finite numbers only"

@@ -12,8 +12,9 @@ EQUAL_RETURNS = 20
 
 class ProgressWatch:
     """
-    Looks at the episodes of learning, and warns once of each of two things that learning would never get out of.
+    Looks at the episodes of learning, and warns once of each of three things.
 
+    - A return above ``max_value``: then that is no upper bound, and exploration ends too soon.
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
       ``max_value`` of what is unknown, and nothing draws the agent to the unknown. An example is MountainCarContinuous with
       gamma 1, where the best known plan is to do nothing.
@@ -43,9 +44,24 @@ class ProgressWatch:
         :param terminated: whether it ended in a terminal state, not by its time limit
         :param n_optimistic_actions: how often an action without a model was chosen since learning began
         """
+        # What follows a time limit may cost more than was gained until then.
+        if terminated or min(rewards) >= 0.0:
+            self._note_best_return(rewards)
         self._note_cost(rewards, terminated)
         explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
         self._note_return(rewards, terminated, explored)
+
+    def _note_best_return(self, rewards: Sequence[float]) -> None:
+        best, value = -float("inf"), 0.0
+        for reward in reversed(rewards):
+            value = reward + self.gamma * value
+            best = max(best, value)
+        if best > self.max_value + 1e-6 * max(1.0, abs(self.max_value)):
+            self._warn(
+                "exceeded",
+                f"max_value={self.max_value:g} must be an upper bound on the return (discounted with gamma={self.gamma:g}), "
+                f"but a return of {best:g} was observed; pass a larger max_value, or the agent will stop exploring too soon",
+            )
 
     def _note_cost(self, rewards: Sequence[float], terminated: bool) -> None:
         keeps_value = self.gamma == 1.0 or abs(self.max_value) <= self.tolerance

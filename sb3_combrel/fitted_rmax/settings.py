@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import Any
 
-import numpy as np
-
-from sb3_combrel.common.checks import check_count, check_finite, check_positive, check_resolution
-from sb3_combrel.common.periodic import periodic_flags
+from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.models.base import Model, ModelSettings
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.models.local_linear import LocalLinear
@@ -58,7 +56,7 @@ class FittedRMaxSettings:
     periodic: Sequence[bool] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.degree, int | np.integer) or isinstance(self.degree, bool) or self.degree not in (0, 1):
+        if isinstance(self.degree, bool) or not isinstance(self.degree, Integral) or self.degree not in MODELS:
             raise ValueError(f"degree must be 0 (kernel average) or 1 (local linear), got {self.degree!r}")
         if self.model_breadth is not None:
             check_positive("model_breadth", self.model_breadth)
@@ -84,60 +82,27 @@ class FittedRMaxSettings:
         """The names of all arguments."""
         return tuple(field.name for field in fields(cls))
 
-    def breadth_for(self, n_variables: int) -> float:
-        """The kernel breadth for so many state variables."""
-        if self.model_breadth is not None:
-            return float(self.model_breadth)
-        return _by_number(DEFAULT_BREADTHS[self.degree], n_variables)
-
-    def neighbors_for(self, n_variables: int) -> int:
-        """The instances of a local linear fit with so many state variables."""
-        return int(_by_number(DEFAULT_NEIGHBORS, n_variables)) if self.n_neighbors is None else int(self.n_neighbors)
-
-    def min_weight_by_degree(self) -> float:
-        """The weight below which instances do not count."""
-        return DEFAULT_MIN_WEIGHTS[self.degree] if self.min_weight is None else float(self.min_weight)
-
-    def model_steps_for(self, n_variables: int) -> int:
-        """Most steps that the planner's model leads ahead with so many state variables."""
-        if self.max_model_steps is not None:
-            return int(self.max_model_steps)
-        return int(_by_number(DEFAULT_MODEL_STEPS, n_variables)) if self.degree else 1
-
     def backups_for(self, n_variables: int) -> int:
         """The backups of a step with so many state variables."""
-        return max(1, CORNERS_A_STEP[self.degree] // 2**n_variables) if self.max_backups is None else int(self.max_backups)
-
-    def resolution_for(self, n_variables: int) -> int | Sequence[int] | None:
-        """
-        The grid's resolution, checked against the number of state variables.
-
-        :raises ValueError: if it is not None, a whole number, or one for each state variable
-        """
-        check_resolution(self.resolution, n_variables)
-        return self.resolution
-
-    def periodic_for(self, n_variables: int) -> tuple[bool, ...]:
-        """
-        Which state variables are periodic, checked against their number.
-
-        :raises ValueError: if it is not None or one bool for each state variable
-        """
-        return periodic_flags(self.periodic, n_variables)
+        return int(_or(self.max_backups, max(1, CORNERS_A_STEP[self.degree] // 2**n_variables)))
 
     def model_settings(self, n_variables: int) -> ModelSettings:
         """What a model of a task with so many state variables needs of them."""
         return ModelSettings(
-            model_breadth=self.breadth_for(n_variables),
-            min_weight=self.min_weight_by_degree(),
+            model_breadth=float(_or(self.model_breadth, _by_number(DEFAULT_BREADTHS[self.degree], n_variables))),
+            min_weight=float(_or(self.min_weight, DEFAULT_MIN_WEIGHTS[self.degree])),
             min_fraction=float(self.min_fraction),
             exploration_threshold=float(self.exploration_threshold),
             max_instances=self.max_instances,
-            n_neighbors=self.neighbors_for(n_variables),
+            n_neighbors=int(_or(self.n_neighbors, _by_number(DEFAULT_NEIGHBORS, n_variables))),
             outcome_breadth=float(self.outcome_breadth),
-            max_model_steps=self.model_steps_for(n_variables),
+            max_model_steps=int(_or(self.max_model_steps, _by_number(DEFAULT_MODEL_STEPS, n_variables) if self.degree else 1)),
         )
 
 
 def _by_number(defaults: Sequence[float], n_variables: int) -> float:
-    return float(defaults[min(n_variables, len(defaults)) - 1])
+    return defaults[min(n_variables, len(defaults)) - 1]
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value

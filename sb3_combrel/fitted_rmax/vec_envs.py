@@ -9,30 +9,26 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
-def names_of(env: VecEnv | None) -> dict[str, Any]:
+def names_of(env: VecEnv) -> dict[str, Any]:
     """Return names of state variables and actions, where the environment has as many of them as it must have."""
-    if env is None:
-        return {}
-    found = {}
-    counts = {"state_names": (env.observation_space.shape or (0,))[0], "action_names": getattr(env.action_space, "n", 0)}
-    for name, n in counts.items():
-        # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
-        if not env.has_attr(name):
-            continue
-        value = env.get_attr(name, 0)[0]
-        if isinstance(value, Sequence) and len(value) == n and all(isinstance(each, str) for each in value):
-            found[name] = list(value)
-    return found
+    lengths = {"state_names": (env.observation_space.shape or (0,))[0], "action_names": getattr(env.action_space, "n", 0)}
+    found = {name: _list_of(env, name, n, (str,)) for name, n in lengths.items()}
+    return {name: names for name, names in found.items() if names is not None}
 
 
-def periodic_of(env: VecEnv | None) -> list[bool] | None:
+def periodic_of(env: VecEnv) -> list[bool] | None:
     """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
-    n = 0 if env is None else (env.observation_space.shape or (0,))[0]
-    if env is None or n == 0 or not env.has_attr("periodic"):
+    flags = _list_of(env, "periodic", (env.observation_space.shape or (0,))[0], (bool, np.bool_))
+    return None if flags is None else [bool(flag) for flag in flags]
+
+
+def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[Any] | None:
+    """Return an attribute of the first environment, if it is ``n`` values of some types."""
+    # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
+    value = env.get_attr(name, 0)[0] if n > 0 and env.has_attr(name) else None
+    if not isinstance(value, Sequence | np.ndarray) or len(value) != n or not all(isinstance(each, types) for each in value):
         return None
-    value = env.get_attr("periodic", 0)[0]
-    is_list = isinstance(value, Sequence | np.ndarray) and len(value) == n
-    return [bool(flag) for flag in value] if is_list and all(isinstance(flag, bool | np.bool_) for flag in value) else None
+    return list(value)
 
 
 def refuse_normalized_observations(env: VecEnv) -> None:
@@ -47,23 +43,17 @@ def refuse_normalized_observations(env: VecEnv) -> None:
         )
 
 
-def true_outcomes(
-    new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]], ended: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray]:
+def true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """
     Find out where each step led before environments reset themselves, and whether that was a terminal state.
 
     :param new_obs: observations after the step, those of the next episode where one is done
     :param dones: bool, shape (n_envs,)
     :param infos: of each environment
-    :param ended: the environments that are done
     :return: observations, and bool, shape (n_envs,); a time limit is no terminal state
     """
-    if not ended:
-        return np.asarray(new_obs), dones
-    next_obs = np.array(new_obs)
-    terminated = np.array(dones, dtype=bool)
-    for e in ended:
+    next_obs, terminated = np.array(new_obs), np.array(dones, dtype=bool)
+    for e in np.flatnonzero(dones):
         next_obs[e] = infos[e]["terminal_observation"]
         terminated[e] = not infos[e].get("TimeLimit.truncated", False)
     return next_obs, terminated

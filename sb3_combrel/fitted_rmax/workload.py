@@ -9,10 +9,10 @@ from typing import NamedTuple
 from sb3_combrel.models.base import ModelSettings
 from sb3_combrel.planning.grid import StateGrid
 
-# Measured with grids of a million points of two and four state variables, in seconds: for each state-action pair until the
-# first step, and for each grid point that an instance reaches in a step. With transfer they differ by a factor of three.
-SETUP_OF_PAIR, SETUP_OF_PAIR_WITH_TRANSFER = 1e-6, 1e-5
-STEP_OF_POINT, STEP_OF_POINT_WITH_TRANSFER = 7e-7, 4e-6
+# In seconds, without and with transfer: for each state-action pair until the first step, and for each grid point that an
+# instance reaches in a step.
+SETUP_OF_PAIR = (1e-6, 1e-5)
+STEP_OF_POINT = (7e-7, 4e-6)
 
 LONG_SETUP_SECONDS = 5.0
 LONG_STEP_SECONDS = 0.05
@@ -33,11 +33,6 @@ class Workload(NamedTuple):
     setup_seconds: float
     step_seconds: float
 
-    @property
-    def is_long(self) -> bool:
-        """Whether a user would wonder what is going on."""
-        return self.setup_seconds > LONG_SETUP_SECONDS or self.step_seconds > LONG_STEP_SECONDS
-
     def __str__(self) -> str:
         return (
             f"{self.n_points:,} grid points and {self.n_pairs:,} state-action pairs: roughly {_time(self.setup_seconds)} "
@@ -57,17 +52,14 @@ def workload(grid: StateGrid, n_actions: int, settings: ModelSettings, transfers
     d = grid.n_variables
     reach = settings.model_breadth * math.sqrt(-math.log(settings.min_weight))
     ball = math.pi ** (d / 2) / math.gamma(d / 2 + 1) * min(reach, 1.0) ** d
-    reached = min(ball, 1.0) * grid.n_points
     n_pairs = grid.n_points * n_actions
-    of_pair, of_point = (SETUP_OF_PAIR, STEP_OF_POINT)
-    if transfers:
-        of_pair, of_point = (SETUP_OF_PAIR_WITH_TRANSFER, STEP_OF_POINT_WITH_TRANSFER)
-    return Workload(grid.n_points, n_pairs, of_pair * n_pairs, of_point * reached)
+    setup, step = SETUP_OF_PAIR[transfers] * n_pairs, STEP_OF_POINT[transfers] * min(ball, 1.0) * grid.n_points
+    return Workload(grid.n_points, n_pairs, setup, step)
 
 
 def warn_if_long(work: Workload, grid: StateGrid) -> None:
     """Warn of a grid that takes long, before it does."""
-    if work.is_long:
+    if work.setup_seconds > LONG_SETUP_SECONDS or work.step_seconds > LONG_STEP_SECONDS:
         warnings.warn(
             f"resolution={list(grid.resolution)} means {work}; a lower resolution takes less time, each number less by one "
             "about half",

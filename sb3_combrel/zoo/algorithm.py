@@ -71,8 +71,8 @@ class ZooFittedRMax(FittedRMax):
             raise ValueError(f'resolution must be a whole number, one for each variable, "coarser" or "finer", got {wanted!r}')
         n_actions = check_actions(self.action_space)
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
-        breadth = self.settings.breadth_for(n_variables)
-        suited, *_ = fitting_grid(n_variables, n_actions, None, breadth, self.settings.min_weight_by_degree()).resolution
+        settings = self.settings.model_settings(n_variables)
+        suited, *_ = fitting_grid(n_variables, n_actions, None, settings.model_breadth, settings.min_weight).resolution
         if wanted == "coarser":
             return max(1, suited - 1)
         n_pairs = (2 ** (suited + 1) + 1) ** n_variables * n_actions

@@ -102,7 +102,3 @@ def test_predict_refuses_a_state_that_it_did_not_return_for_as_many_observations
         with pytest.raises(ValueError, match="state must be None or what predict returned for 2 observation"):
             policy.predict(np.array([HERE, HERE]), wrong, deterministic=True)
     assert policy.predict(np.array([HERE, HERE]), deterministic=True)[0].tolist() == [0, 0]
-
-
-def test_predict_returns_no_state_if_it_is_not_deterministic(policy):
-    assert policy.predict(HERE, deterministic=False)[1] is None

@@ -18,38 +18,44 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.models.local_linear import LocalLinear
 
-BAD_SETTINGS = [
-    ("degree", 2),
-    ("degree", True),
-    ("degree", "linear"),
-    ("model_breadth", -0.1),
-    ("min_fraction", 1.1),
-    ("min_weight", 1.0),
-    ("min_weight", 0.0),
-    ("n_neighbors", 1),
-    ("n_neighbors", 2.5),
-    ("outcome_breadth", 0.0),
-    ("max_model_steps", 0),
-    ("exploration_threshold", 0.0),
-    ("max_value", np.nan),
-    ("gamma", 1.5),
-    ("planning_tolerance", 0.0),
-    ("max_backups", -1),
-    ("max_instances", 0),
+NO_NUMBERS = [True, np.True_, "three", [], 1 + 2j, np.nan, np.inf]
+POSITIVE = ["model_breadth", "outcome_breadth", "min_fraction", "min_weight", "exploration_threshold", "gamma"]
+REFUSED = {
+    **{name: [0.0, -0.1, *NO_NUMBERS] for name in (*POSITIVE, "planning_tolerance")},
+    **{name: [-1, 2.5, *NO_NUMBERS] for name in ("n_neighbors", "max_model_steps", "max_backups", "max_instances")},
+    "max_value": [None, *NO_NUMBERS],
+    "degree": [2, -1, 0.5, None, [1], np.array([1]), *NO_NUMBERS],
+}
+OTHERS_REFUSED = [
+    *[("min_fraction", 1.1), ("min_fraction", None), ("min_weight", 1.0), ("gamma", 1.5), ("outcome_breadth", None)],
+    *[("n_neighbors", 1), ("max_model_steps", 0), ("max_instances", 0)],
 ]
+TOO_LARGE = [("n_neighbors", 10_001), ("max_model_steps", 10_001), ("max_backups", 2**62), ("max_backups", 10**30)]
 
 
-@pytest.mark.parametrize(("name", "value"), BAD_SETTINGS)
+@pytest.mark.parametrize(("name", "value"), [*((n, v) for n, values in REFUSED.items() for v in values), *OTHERS_REFUSED])
 def test_settings_out_of_range_are_refused_by_name_and_value(name, value):
-    with pytest.raises(ValueError, match=f"{name} must be") as error:
+    with pytest.raises(ValueError, match=f"^{name} must be ") as error:
         FittedRMaxSettings(**{name: value})
-    assert repr(value) in str(error.value)
+    assert str(error.value).endswith(f"got {value!r}")
 
 
-@pytest.mark.parametrize("value", [[2, 2, 2], 0, 2.5, "fine"])
+@pytest.mark.parametrize(("name", "value"), TOO_LARGE)
+def test_a_count_that_is_too_large_for_what_it_is_used_for_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be a whole number from"):
+        FittedRMaxSettings(**{name: value})
+
+
+@pytest.mark.parametrize("value", [[2, 2, 2], [2, 0], 0, -2, 2.5, True, "fine", 1 + 2j])
 def test_an_agent_refuses_a_resolution_that_does_not_fit_its_task(value):
     with pytest.raises(ValueError, match="resolution must be"):
         make_agent(2, 4, resolution=value)
+
+
+@pytest.mark.parametrize("flags", [True, [True], [True, 0], "ab"])
+def test_an_agent_refuses_flags_that_do_not_fit_its_task(flags):
+    with pytest.raises(ValueError, match="periodic must be None or 2 booleans"):
+        make_agent(2, 2, periodic=flags)
 
 
 def test_an_agent_refuses_a_transfer_method_that_does_not_fit_its_task():
@@ -57,15 +63,9 @@ def test_an_agent_refuses_a_transfer_method_that_does_not_fit_its_task():
         make_agent(3, 4, TIMBREL(square_source(), SAME))
 
 
-def test_settings_cannot_be_changed_afterwards():
-    with pytest.raises(AttributeError):
-        FittedRMaxSettings().gamma = 0.5
-
-
 def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
     defaults = FittedRMaxSettings()
     of_fitted_rmax = inspect.signature(FittedRMax).parameters
-    assert len(FittedRMaxSettings.names()) == 16
     for name in FittedRMaxSettings.names():
         assert of_fitted_rmax[name].default == getattr(defaults, name), name
     # The policy hands on what it is given, and has no defaults of its own.
@@ -80,26 +80,15 @@ def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
 @pytest.mark.parametrize(
     ("degree", "n_variables", "breadth", "backups"),
     [
-        (0, 1, 0.09, 200),
-        (0, 2, 0.09, 100),
-        (0, 3, 0.15, 50),
-        (0, 4, 0.2, 25),
-        (0, 6, 0.2, 6),
-        (1, 1, 0.15, 800),
-        (1, 2, 0.15, 400),
-        (1, 3, 0.25, 200),
-        (1, 4, 0.4, 100),
-        (1, 5, 0.4, 50),
-        (1, 6, 0.5, 25),
-        (1, 7, 0.5, 12),
+        *[(0, 1, 0.09, 200), (0, 2, 0.09, 100), (0, 3, 0.15, 50), (0, 4, 0.2, 25), (0, 6, 0.2, 6)],
+        *[(1, 1, 0.15, 800), (1, 2, 0.15, 400), (1, 3, 0.25, 200), (1, 4, 0.4, 100), (1, 5, 0.4, 50), (1, 7, 0.5, 12)],
     ],
 )
 def test_breadth_and_backups_depend_on_degree_and_number_of_variables_unless_given(degree, n_variables, breadth, backups):
     defaults = FittedRMaxSettings(degree=degree)
     given = FittedRMaxSettings(degree=degree, model_breadth=0.3, max_backups=0)
-    assert (defaults.breadth_for(n_variables), defaults.backups_for(n_variables)) == (breadth, backups)
-    assert (given.breadth_for(n_variables), given.backups_for(n_variables)) == (0.3, 0)
-    assert defaults.model_settings(n_variables).model_breadth == breadth
+    assert (defaults.model_settings(n_variables).model_breadth, defaults.backups_for(n_variables)) == (breadth, backups)
+    assert (given.model_settings(n_variables).model_breadth, given.backups_for(n_variables)) == (0.3, 0)
 
 
 @pytest.mark.parametrize(("n_variables", "n_neighbors"), [(1, 16), (2, 16), (3, 24), (4, 30), (5, 40), (6, 60), (9, 60)])
@@ -114,14 +103,30 @@ def test_the_least_weight_that_counts_depends_on_the_degree_unless_given(degree,
     assert FittedRMaxSettings(degree=degree, min_weight=0.2).model_settings(2).min_weight == 0.2
 
 
-def test_the_degree_decides_which_model_is_learned():
-    assert type(make_agent(2, 4).model) is LocalLinear
-    assert type(make_agent(2, 4, degree=1).model) is LocalLinear
-    assert type(make_agent(2, 4, degree=0).model) is KernelAverage
+def test_the_original_looks_one_step_ahead():
+    assert FittedRMaxSettings(degree=0).model_settings(2).max_model_steps == 1
+    assert FittedRMaxSettings(max_model_steps=7).model_settings(4).max_model_steps == 7
+    with pytest.raises(ValueError, match="max_model_steps must be 1 or None with degree=0, the original algorithm, got 3"):
+        FittedRMaxSettings(degree=0, max_model_steps=3)
+
+
+def test_the_arguments_reach_the_model():
+    model = FittedRMax(Walk(), degree=1, n_neighbors=7, outcome_breadth=0.02, model_breadth=0.3, resolution=3)
+    settings = model.agent.model_settings
+    assert (settings.n_neighbors, settings.outcome_breadth, settings.model_breadth) == (7, 0.02, 0.3)
+    assert (model.degree, model.n_neighbors, model.outcome_breadth) == (1, 7, 0.02)
+    assert type(model.agent.model) is LocalLinear
+    assert type(FittedRMax(Walk(), degree=0, resolution=3).agent.model) is KernelAverage
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_arguments_may_be_numpy_numbers(degree):
+    floats = {name: np.float32(0.2) for name in ("model_breadth", "outcome_breadth", "gamma")}
+    counts = {name: np.int64(8) for name in ("max_backups", "max_instances", "n_neighbors")}
+    FittedRMax(Walk(), seed=0, degree=np.int64(degree), resolution=np.array([3, 4]), **floats, **counts).learn(20)
 
 
 def test_a_task_has_names_for_its_variables_and_actions():
-    scaling = StateScaling(np.zeros(2), np.ones(2))
-    task = Task(scaling, 3)
+    task = Task(StateScaling(np.zeros(2), np.ones(2)), 3)
     assert (task.n_variables, task.state_names, task.action_names) == (2, ("s0", "s1"), ("a0", "a1", "a2"))
-    assert Task(scaling, 1, ["x", "v"], ["push"]).state_names == ("x", "v")
+    assert Task(task.scaling, 1, ["x", "v"], ["push"]).state_names == ("x", "v")

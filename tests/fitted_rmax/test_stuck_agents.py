@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 import sb3_combrel.fitted_rmax.agent as agent
 from sb3_combrel import FittedRMax
@@ -39,49 +39,22 @@ class TwoJoints(gym.Env):
         return self.joints.copy(), -1.0, bool((np.abs(self.joints - 0.9) <= 0.06).all()), False, {}
 
 
-class EpisodeLengths(BaseCallback):
-    """The lengths of episodes; ends the learning after some of them."""
-
-    def __init__(self, n_episodes):
-        super().__init__()
-        self.n_episodes = n_episodes
-        self.lengths = []
-
-    def _on_step(self):
-        for info in self.locals["infos"]:
-            if "episode" in info:
-                self.lengths.append(info["episode"]["l"])
-        return len(self.lengths) < self.n_episodes
-
-
 def lengths_of_episodes(seed, n_episodes, degree, step=0.05):
     env = gym.wrappers.TimeLimit(TwoJoints(step), STEP_LIMIT)
     with pytest.warns(UserWarning, match="coarse"):
         model = FittedRMax(env, model_breadth=0.04, resolution=3, min_fraction=0.1, degree=degree, seed=seed)
-    episodes = EpisodeLengths(n_episodes)
-    model.learn(n_episodes * STEP_LIMIT, callback=episodes)
-    return np.array(episodes.lengths)
+    monitor = model.get_env().envs[0]
+    model.learn(n_episodes * STEP_LIMIT, callback=StopTrainingOnMaxEpisodes(n_episodes))
+    return np.array(monitor.get_episode_lengths())
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_without_corrections_every_episode_reaches_its_time_limit(seed, monkeypatch):
-    """The trap is real; otherwise the next test would show nothing.
-
-    With degree 1 the agent leaves it now and then: grid points around which it was often enough count as known.
-    """
+def test_with_corrections_the_agent_is_not_stuck_where_it_would_be_without(monkeypatch):
+    assert (lengths_of_episodes(0, 80, 0)[-20:] < STEP_LIMIT).all()
     monkeypatch.setattr(agent, "MAX_VISITS", 10**9)
-    assert (lengths_of_episodes(seed, 40, 0)[-30:] == STEP_LIMIT).all()
+    assert (lengths_of_episodes(0, 25, 0)[-15:] == STEP_LIMIT).all()
 
 
-@pytest.mark.parametrize(("degree", "n_episodes"), [(0, 80), (1, 100)])
-@pytest.mark.parametrize("seed", range(3))
-def test_with_corrections_the_agent_is_never_stuck(seed, degree, n_episodes):
-    lengths = lengths_of_episodes(seed, n_episodes, degree)
-    assert (lengths[-20:] < STEP_LIMIT).all()
-    assert lengths[-20:].mean() < 60
-
-
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("degree", [0, 1])
 @pytest.mark.parametrize("step", [0.05, 1 / 24, 0.043])
 def test_with_corrections_the_agent_is_never_stuck_whatever_the_step_length(step, degree):

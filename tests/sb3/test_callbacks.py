@@ -1,13 +1,11 @@
 """Callbacks: what they are shown, how they stop the learning, and SB3's own."""
 
 import pytest
-from helpers.walk import Recorder, Walk, same_parameters
+from helpers.walk import Recorder, Walk, same_parameters, small
 from stable_baselines3.common.callbacks import (
     CheckpointCallback,
     EvalCallback,
-    EveryNTimesteps,
     StopTrainingOnMaxEpisodes,
-    StopTrainingOnRewardThreshold,
 )
 from stable_baselines3.common.monitor import Monitor
 
@@ -50,9 +48,9 @@ def test_an_interrupt_ends_the_training_and_leaves_a_model_that_saves_and_goes_o
         assert resumed.agent.model.n_instances == 32
 
 
-def test_learn_takes_a_progress_bar_and_a_function_as_callback(make):
+def test_learn_takes_a_progress_bar_and_a_function_as_callback():
     calls = []
-    make().learn(10, callback=lambda local, _: calls.append(local["self"]) or True, progress_bar=True)
+    small().learn(10, callback=lambda local, _: calls.append(local["self"]) or True, progress_bar=True)
     assert len(calls) == 10
 
 
@@ -63,19 +61,3 @@ def test_evaluation_and_checkpoints_in_mid_episode_hold_all_that_was_learned_so_
     for steps in (7, 14, 42):
         assert FittedRMax.load(tmp_path / f"at_{steps}_steps").agent.model.n_instances == steps
     assert FittedRMax.load(tmp_path / "best_model").agent.model.n_instances in (20, 40)
-
-
-def test_a_reward_that_is_reached_stops_the_learning(make):
-    stop = StopTrainingOnRewardThreshold(reward_threshold=-11.0)
-    evaluation = EvalCallback(Monitor(Walk()), callback_on_new_best=stop, eval_freq=50, n_eval_episodes=5, verbose=0)
-    model = make().learn(2000, callback=evaluation)
-    assert evaluation.best_mean_reward >= -11.0
-    assert model.num_timesteps < 2000
-    assert model.num_timesteps % 50 == 0
-
-
-def test_every_n_timesteps_calls_its_callback_every_n_steps(make):
-    inner = Recorder()
-    inner._on_step = lambda: True
-    make().learn(50, callback=EveryNTimesteps(n_steps=10, callback=inner))
-    assert inner.n_calls == 5

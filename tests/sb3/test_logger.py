@@ -2,17 +2,20 @@
 
 import csv
 
+import pytest
+from helpers.walk import METHODS, small
 from stable_baselines3.common.logger import configure
 
 
-def test_logs_have_the_groups_that_sb3_has(make, tmp_path):
+def test_logs_have_the_groups_that_sb3_has_and_those_of_transfer_only_with_it(make, method, tmp_path):
     model = make()
-    model.set_logger(configure(str(tmp_path), ["csv", "json"]))
+    model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(150, log_interval=2)
     header = (tmp_path / "progress.csv").read_text().splitlines()
     assert {"rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps", "time/episodes", "time/total_timesteps"} <= set(
         header[0].split(",")
     )
+    assert ("transfer/instances_used" in header[0]) == (method != "none")
     assert len(header) - 1 == model._episode_num // 2
     model.dump_logs()
     assert len((tmp_path / "progress.csv").read_text().splitlines()) == len(header) + 1
@@ -32,33 +35,27 @@ def test_logged_figures_are_those_of_the_run(make, tmp_path):
         assert abs(sum(shares) - 1.0) < 1e-5
 
 
-def test_logs_have_figures_of_transfer_only_with_a_transfer_method(make, method, tmp_path):
-    model = make()
-    model.set_logger(configure(str(tmp_path), ["csv"]))
-    model.learn(60, log_interval=1)
-    header = (tmp_path / "progress.csv").read_text().splitlines()[0]
-    assert ("transfer/instances_used" in header) == (method != "none")
-
-
-def test_without_a_log_interval_nothing_is_logged(make, tmp_path):
-    model = make()
+def test_without_a_log_interval_nothing_is_logged(tmp_path):
+    model = small()
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(100, log_interval=None)
     assert (tmp_path / "progress.csv").read_text() == ""
 
 
-def test_tensorboard_logs_are_named_after_algorithm_transfer_method_and_seed(make, method, tmp_path):
-    model = make(tensorboard_log=str(tmp_path)).learn(60, log_interval=1)
-    name = "_".join(["FittedRMax", *([type(model.agent.transfer).__name__] if method != "none" else []), f"seed{model.seed}"])
-    model.learn(30, reset_num_timesteps=False)
+@pytest.mark.parametrize(
+    ("method", "seed", "name"), [("none", None, "FittedRMax"), ("COMBREL", 3, "FittedRMax_COMBREL_seed3")]
+)
+def test_tensorboard_logs_are_named_after_algorithm_transfer_method_and_seed(method, seed, name, tmp_path):
+    model = small(transfer=METHODS[method](), seed=seed, tensorboard_log=str(tmp_path)).learn(2)
+    model.learn(2, reset_num_timesteps=False)
     assert [folder.name for folder in tmp_path.iterdir()] == [f"{name}_1"]
     assert len(list((tmp_path / f"{name}_1").glob("events.*"))) == 2
-    model.learn(30)
+    model.learn(2)
     assert {folder.name for folder in tmp_path.iterdir()} == {f"{name}_1", f"{name}_2"}
-    model.learn(60, tb_log_name="again")
+    model.learn(2, tb_log_name="again")
     assert (tmp_path / "again_1").is_dir()
 
 
-def test_verbose_learning_logs_to_the_screen(make, capsys):
-    make(verbose=1).learn(60, log_interval=1)
+def test_verbose_learning_logs_to_the_screen(capsys):
+    small(verbose=1).learn(60, log_interval=1)
     assert "ep_rew_mean" in capsys.readouterr().out
