@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
+from sb3_combrel.common.compiled import remove_outdated
 from sb3_combrel.experiments import mountain_car
 from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 
@@ -26,4 +27,5 @@ def warm_up(relevance: bool = False) -> None:
 
 
 if __name__ == "__main__":
+    remove_outdated()
     warm_up(relevance=True)
