@@ -82,7 +82,7 @@ def test_what_was_asked_for_before_does_not_change_a_prediction():
             np.testing.assert_array_equal(one, other)
 
 
-@settings(slow_and_repeatable, max_examples=30)
+@settings(slow_and_repeatable, max_examples=20)
 @given(problems, all_claims, st.sampled_from([1.0, 0.9]), st.sampled_from([1, 3, 50]), st.booleans())
 def test_what_is_known_sums_fits_and_rows_are_those_of_the_definition(problem, claims, gamma, max_model_steps, small):
     model, naive, prior = with_some_prior(problem, claims, gamma=gamma, max_model_steps=max_model_steps)
