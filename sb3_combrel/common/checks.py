@@ -52,13 +52,8 @@ def check_count(
 
 def as_count(name: str, value: object, *, min: int = 1, max: int | None = None, why_max: str = "") -> int:
     """
-    A whole number that may have been written as a float, such as 1e5.
+    A whole number that may have been written as a float, such as 1e5; for the parameters see :func:`check_count`.
 
-    :param name: name of the argument
-    :param value: its value; bool is refused, it would pass as 0 or 1
-    :param min: smallest value allowed
-    :param max: largest value allowed
-    :param why_max: see :func:`check_count`
     :return: the value as an int
     :raises ValueError: unless it is a whole number from ``min`` to ``max``
     """
@@ -69,11 +64,7 @@ def as_count(name: str, value: object, *, min: int = 1, max: int | None = None, 
 
 
 def count_text(number: int) -> str:
-    """
-    A whole number to be read in a message: with separators, or, of more than 15 digits, as a power of ten.
-
-    Python refuses to write out integers of more than 4300 digits.
-    """
+    """A whole number with separators, or, of more than 15 digits, as a power of ten: Python refuses to write out too many."""
     if abs(number) < 10**15:
         return f"{number:,}"
     return f"{'-' if number < 0 else ''}about 10^{math.log10(abs(number)):.0f}"

@@ -1,8 +1,8 @@
 """How the inner loops are compiled: on first use, cached on disk, with a message while it lasts.
 
 Compiled functions take arrays and NamedTuples of arrays. Those that Python calls are wrapped in :class:`EntryPoint`. Numba
-finds the types of arrays and plain tuples in C, of each NamedTuple in Python, which takes a microsecond: functions that are
-called at every environment step take plain tuples (``..._plain``), and make NamedTuples of them.
+finds the types of arrays and plain tuples in C, of each NamedTuple in Python: functions that are called at every environment
+step take plain tuples, and make NamedTuples of them.
 
 Sums are taken in a fixed order, but for those of :data:`inner_fast`: there results are the same to the last bit on one
 machine only.
@@ -11,7 +11,7 @@ machine only.
 import gc
 import hashlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,25 +19,28 @@ from typing import Any
 from numba import config, njit
 from numba.core import event
 
-# The packages with compiled functions.
-ROOMS = ("common", "planning", "models", "transfer")
+PACKAGE = Path(__file__).absolute().parent.parent
 
 
-def remove_outdated(folders: Sequence[Path], cache: str = "") -> None:
+def remove_outdated(package: Path = PACKAGE, cache: str = str(getattr(config, "CACHE_DIR", ""))) -> None:
     """
-    Remove compiled code that is older than any source file in some folders.
+    Remove compiled code that is older than any source file in the folders that have some: for developers.
 
     Numba compiles a function again when its own file has changed, not when a file has changed whose functions it calls.
 
-    :param folders: absolute; they and those within them, with the cache beside each source file
-    :param cache: where Numba keeps the compiled code of each folder in place of that, as ``NUMBA_CACHE_DIR`` says; "" for none
+    :param package: absolute; it and the folders within it, with the cache beside each source file
+    :param cache: where Numba keeps the compiled code of each folder instead, as ``NUMBA_CACHE_DIR`` says; "" for none
     """
-    newest = max((file.stat().st_mtime for folder in folders for file in folder.rglob("*.py")), default=0.0)
-    indices = [file for folder in folders for file in folder.rglob("__pycache__/*.nbi")]
-    if cache:
-        # The names that Numba gives there.
-        names = [f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}" for folder in folders]
-        indices += [file for name in names for file in (Path(cache) / name).glob("*.nbi")]
+    newest = 0.0
+    indices: list[Path] = []
+    for folder in {file.parent for file in package.rglob("*.py")}:
+        found = list(folder.glob("__pycache__/*.nbi"))
+        if cache:
+            # The name that Numba gives there.
+            found += Path(cache).glob(f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}/*.nbi")
+        if found:
+            newest = max(newest, *(file.stat().st_mtime for file in folder.glob("*.py")))
+            indices += found
     for index in indices:
         try:
             if index.stat().st_mtime < newest:
@@ -47,13 +50,10 @@ def remove_outdated(folders: Sequence[Path], cache: str = "") -> None:
             continue
 
 
-remove_outdated([Path(__file__).absolute().parent.parent / room for room in ROOMS], str(getattr(config, "CACHE_DIR", "")))
-
 _njit: Any = njit
-# Three options that are not in Numba's documentation, here alone and worth it; what they give up is noted with each.
-# _nrt: the functions allocate nothing, so they need no reference counts: those took half of the time of a step (Mountain Car
-# 2D 0.14 ms a step with, 0.08 without; 4D 1.3 and 0.7). A function that allocates does not compile. Arrays are kept alive
-# by the caller's arguments.
+# Three options that are not in Numba's documentation, here alone; what they give up is noted with each.
+# _nrt: the functions allocate nothing, so they need no reference counts, which take half of the time of a step. A function
+# that allocates does not compile. Arrays are kept alive by the caller's arguments.
 _options: dict[str, Any] = dict(cache=True, error_model="numpy", _nrt=False)
 compiled = _njit(**_options)
 
@@ -78,9 +78,8 @@ class EntryPoint:
     """
     A compiled function for callers from Python: ``EntryPoint(function)(...)``, or ``.call(...)``, a little quicker.
 
-    Its first call may have to compile; it then prints a message, and garbage collection waits. A compiler makes millions of
-    objects that stay for a while: to look through them, and through all that PyTorch has loaded, again and again takes a
-    tenth of the time or more.
+    Its first call may have to compile; it then prints a message, and garbage collection waits: a compiler makes millions of
+    objects that stay for a while.
 
     :param function: made by :data:`compiled`
     """
@@ -103,19 +102,15 @@ class EntryPoint:
 class _Announcement(event.Listener):
     """Prints once, to stderr, that functions of this package are being compiled."""
 
-    def __init__(self) -> None:
-        self.printed = False
+    printed = False
 
     def on_start(self, event: Any) -> None:
         # Other threads may be compiling functions of their own, which need not have a module.
         module = getattr(event.data["dispatcher"].py_func, "__module__", None) or ""
         if not self.printed and module.startswith("sb3_combrel."):
             self.printed = True
-            print(
-                "sb3_combrel: compiling inner loops for this machine, once (up to half a minute) ...",
-                file=sys.stderr,
-                flush=True,
-            )
+            message = "sb3_combrel: compiling inner loops for this machine, once (up to half a minute) ..."
+            print(message, file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
         pass

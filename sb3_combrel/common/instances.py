@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, part
+from sb3_combrel.common.compiled import EntryPoint, part
 from sb3_combrel.common.periodic import difference, flag_array
 
 BLOCK = 8
@@ -16,31 +16,19 @@ class Instances(NamedTuple):
 
     Experience comes as trajectories, so ``BLOCK`` instances in a row lie close together: the box around each block
     lets a search for near instances skip most blocks.
-
-    :param state: float64, shape (n_actions, capacity, n_variables), unit coordinates
-    :param effect: float64, same shape: next state minus state, unit coordinates; along a periodic variable the shortest way
-    :param reward: float64, shape (n_actions, capacity)
-    :param terminated: bool, same shape: the episode ended in a terminal state (not by a time limit)
-    :param size: int64, shape (n_actions,)
-    :param block_low: float64, shape (n_actions, n_variables, capacity / BLOCK), lower corners of the blocks' boxes
-    :param block_high: the same for the upper corners
-    :param gap: float64 scratch, shape (capacity / BLOCK,): how far a state is from the boxes
-    :param seen: int64 scratch, shape (n_actions, capacity): the last search that began with each instance
-    :param searches: int64 scratch, shape (1,): how many searches there were
-    :param periodic: bool, shape (n_variables,): periodic variables, whose coordinates are stored wrapped to [0, 1]
     """
 
-    state: np.ndarray
-    effect: np.ndarray
-    reward: np.ndarray
-    terminated: np.ndarray
-    size: np.ndarray
-    block_low: np.ndarray
-    block_high: np.ndarray
-    gap: np.ndarray
-    seen: np.ndarray
-    searches: np.ndarray
-    periodic: np.ndarray
+    state: np.ndarray  # float64, (n_actions, capacity, n_variables)
+    effect: np.ndarray  # the same: next state minus state; along a periodic variable the shortest way
+    reward: np.ndarray  # float64, (n_actions, capacity)
+    terminated: np.ndarray  # bool, (n_actions, capacity): the episode ended in a terminal state, not by a time limit
+    size: np.ndarray  # int64, (n_actions,)
+    block_low: np.ndarray  # float64, (n_actions, n_variables, capacity / BLOCK): lower corners of the blocks' boxes
+    block_high: np.ndarray  # the same: upper corners
+    gap: np.ndarray  # float64 scratch, (capacity / BLOCK,): how far a state is from the boxes
+    seen: np.ndarray  # int64 scratch, (n_actions, capacity): the last search that began with each instance
+    searches: np.ndarray  # int64 scratch, (1,): how many searches there were
+    periodic: np.ndarray  # bool, (n_variables,): coordinates of periodic variables are stored wrapped to [0, 1]
 
     @classmethod
     def empty(
@@ -106,12 +94,7 @@ class Instances(NamedTuple):
 
     @classmethod
     def from_rows(cls, n_actions: int, rows: np.ndarray, periodic: Sequence[bool] | np.ndarray | None = None) -> "Instances":
-        """
-        Build them from :meth:`rows`, in the same order for each action.
-
-        :param rows: float64, shape (n, 2 * n_variables + 3)
-        :param periodic: see :meth:`empty`
-        """
+        """Build them from :meth:`rows`, in the same order for each action; ``periodic``: see :meth:`empty`."""
         d = (rows.shape[1] - 3) // 2
         actions = np.clip(rows[:, 0], 0, n_actions - 1).astype(np.int64)
         states, effects = rows[:, 1 : 1 + d], rows[:, 1 + d : 1 + 2 * d]
@@ -130,17 +113,15 @@ class Instances(NamedTuple):
         """Instances of one action for which there is room."""
         return self.state.shape[1]
 
-    def grown(self) -> "Instances":
-        """The same instances with twice the room."""
+    def with_room(self, action: int) -> "Instances":
+        """Itself, or the same with twice the room if one more instance of ``action`` would not fit."""
         n_actions, capacity, n_variables = self.state.shape
+        if self.size[action] < capacity:
+            return self
         larger = Instances.empty(n_actions, n_variables, 2 * capacity)
         for old, new in zip(self, larger, strict=True):
             new[tuple(slice(n) for n in old.shape)] = old
         return larger
-
-    def with_room(self, action: int) -> "Instances":
-        """Itself, or grown if one more instance of ``action`` would not fit."""
-        return self if self.size[action] < self.capacity else self.grown()
 
 
 @part
@@ -165,13 +146,7 @@ def put_instance(instances, transition):
         instances.size[action] += 1
 
 
-@compiled
-def put_one(instances, transition):
-    """:func:`put_instance` for callers from Python."""
-    put_instance(instances, transition)
-
-
-put_instance_at = EntryPoint(put_one)
+put_instance_at = EntryPoint(put_instance)
 
 
 def along_curve(states: np.ndarray) -> np.ndarray:

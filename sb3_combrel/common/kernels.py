@@ -4,7 +4,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import inlined, inner, part
 from sb3_combrel.common.instances import BLOCK
-from sb3_combrel.common.periodic import difference as difference
+from sb3_combrel.common.periodic import difference
 
 
 @inlined
@@ -56,10 +56,7 @@ def any_periodic(periodic):
 
 @inlined
 def squared_distance(state, other, periodic, wraps):
-    """Of two states.
-
-    :param periodic: bool, shape (n_variables,); ``wraps``: whether any is
-    """
+    """Of two states; ``wraps``: whether any variable is periodic."""
     distance = 0.0
     for k in range(len(state)):
         along = state[k] - other[k]
@@ -71,11 +68,7 @@ def squared_distance(state, other, periodic, wraps):
 
 @part
 def measure_gaps(state, low, high, periodic, n_blocks, gap):
-    """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers.
-
-    :param low: float64, shape (n_variables, at least n_blocks); ``high``: the same; of a periodic variable within [0, 1]
-    :param periodic: bool, shape (n_variables,)
-    """
+    """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers."""
     gap[:n_blocks] = 0.0
     for k in range(len(state)):
         at = state[k]
@@ -103,6 +96,14 @@ def measure_gaps_around(at, low, high, n_blocks, gap):
         outside = outside if outside < around else around
         outside = outside if outside > 0.0 else 0.0
         gap[block] += outside * outside
+
+
+@inlined
+def measure_blocks(instances, action, at):
+    """Measure how far the blocks of an action's instances are; how many blocks there are."""
+    n_blocks = (instances.size[action] + BLOCK - 1) // BLOCK
+    measure_gaps(at, instances.block_low[action], instances.block_high[action], instances.periodic, n_blocks, instances.gap)
+    return n_blocks
 
 
 @part
@@ -137,10 +138,7 @@ def near_instances(instances, action, state, kernel, indices, weights, n_before)
                 length, total = insert_by_weight(indices, weights, start, length, total, before, w, min_fraction)
     if length > 0:
         farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
-    n_blocks = (count + BLOCK - 1) // BLOCK
-    low, high = instances.block_low[action], instances.block_high[action]
-    measure_gaps(state, low, high, instances.periodic, n_blocks, instances.gap)
-    for block in range(n_blocks):
+    for block in range(measure_blocks(instances, action, state)):
         if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
@@ -167,3 +165,62 @@ def farthest_to_enter(last, total, min_weight, min_fraction, scale):
 def list_room(min_fraction: float) -> int:
     """Entries that a list needs while one is inserted: 1 + 1/min_fraction equal ones are kept, and one is cut."""
     return int(np.floor(1.0 / min_fraction)) + 3
+
+
+@inlined
+def insert_by_distance(items, distances, length, item, distance):
+    """Put an instance into a full or growing list sorted by distance; its length. Of equal ones the lower number is first."""
+    room = len(items)
+    if length == room:
+        last = distances[room - 1]
+        if distance > last or (distance == last and item > items[room - 1]):
+            return length
+        length -= 1
+    k = length
+    while k > 0 and (distances[k - 1] > distance or (distances[k - 1] == distance and items[k - 1] > item)):
+        distances[k] = distances[k - 1]
+        items[k] = items[k - 1]
+        k -= 1
+    items[k] = item
+    distances[k] = distance
+    return length + 1
+
+
+@inner
+def nearest_instances(instances, action, state, farthest, items, distances, n_before, left_out=-1):
+    """The nearest instances of ``action``, nearest first, as many as ``items`` has room for.
+
+    What was near at the last query is looked at first; the result does not depend on it.
+
+    :param farthest: squared distance beyond which none counts
+    :param items: int32; receives them. ``distances``: float64; receives their squared distances
+    :param n_before: how many of the last query are in ``items``
+    :param left_out: an instance that does not count
+    :return: how many
+    """
+    count = instances.size[action]
+    room = len(items)
+    wraps = any_periodic(instances.periodic)
+    instances.searches[0] += 1
+    search = instances.searches[0]
+    length = np.int64(0)
+    for b in range(n_before):
+        before = np.int64(items[b])
+        if before < count:
+            instances.seen[action, before] = search
+            distance = squared_distance(state, instances.state[action, before], instances.periodic, wraps)
+            if distance <= farthest:
+                length = insert_by_distance(items, distances, length, before, distance)
+    if length == room:
+        farthest = distances[room - 1]
+    for block in range(measure_blocks(instances, action, state)):
+        if instances.gap[block] > farthest * (1 + 1e-12):
+            continue
+        for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
+            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
+            if distance > farthest or i == left_out or instances.seen[action, i] == search:
+                continue
+            length = insert_by_distance(items, distances, length, i, distance)
+            if length == room:
+                farthest = distances[room - 1]
+    return length

@@ -9,7 +9,7 @@ products of its numbers, and of the instances the weighted sums of these: with d
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import inlined, inner
 
 
 def n_products(n_variables: int) -> int:
@@ -20,11 +20,7 @@ def n_products(n_variables: int) -> int:
 
 @inlined
 def products_of(state, effect, products):
-    """Write the products of an instance.
-
-    :param state: float64, shape (n_variables,); ``effect``: the same
-    :param products: receives them, float64, shape (n_products,)
-    """
+    """Write the products of an instance to ``products``, shape (n_products,)."""
     d = len(state)
     products[0] = 1.0
     at = 1 + d
@@ -101,33 +97,3 @@ def fitted_effect(fit, state, k):
     for j in range(d):
         effect += fit[d + j * d + k] * state[j]
     return effect
-
-
-@compiled
-def fit_once(weights, states, effects, ridge, products, factor, fit):
-    """Fit to some instances, for callers from Python; ``products``: float64 scratch, shape (2, n_products)."""
-    products[0, :] = 0.0
-    for i in range(len(weights)):
-        products_of(states[i], effects[i], products[1])
-        add_products(products[0], weights[i], products[1])
-    solve_regression(products[0], ridge, factor, fit)
-
-
-_fit_once = EntryPoint(fit_once)
-
-
-def linear_fit(weights: np.ndarray, states: np.ndarray, effects: np.ndarray, ridge: float) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Fit effects as a linear function of the state.
-
-    :param weights: of the instances, shape (n,)
-    :param states: shape (n, n_variables)
-    :param effects: the same
-    :param ridge: on the slopes, above 0
-    :return: intercept, shape (n_variables,), and slopes, shape (n_variables, n_variables): ``effect = intercept + state @
-        slopes``
-    """
-    d = states.shape[1]
-    fit = np.empty(d + d * d)
-    _fit_once.call(weights, states, effects, float(ridge), np.empty((2, n_products(d))), np.empty((d, d)), fit)
-    return fit[:d].copy(), fit[d:].reshape(d, d).copy()

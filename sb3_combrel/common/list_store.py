@@ -1,8 +1,4 @@
-"""A compiled store of many short, growing lists of (item, weight) entries in two flat arrays.
-
-Such a list is kept for every state-action pair of the grid: hundreds of thousands of lists, most of them empty, few of them
-long. Slots of doubling size in one array keep them compact, and compiled code walks them without pointers.
-"""
+"""A compiled store of many short, growing lists of (item, weight) entries in two flat arrays: slots of doubling size."""
 
 from typing import NamedTuple
 
@@ -17,32 +13,20 @@ USED, FULL = N_SIZE_CLASSES, N_SIZE_CLASSES + 1
 
 
 class ListStore(NamedTuple):
-    """Lists of (item, weight); list ``p`` is ``item[start[p] : start[p] + length[p]]`` and the same of ``weight``.
+    """Lists of (item, weight); list ``p`` is ``item[start[p] : start[p] + length[p]]`` and the same of ``weight``."""
 
-    :param item: int32, shape (capacity,)
-    :param weight: float64, shape (capacity,)
-    :param start: int64, shape (n_lists,): first entry of each list's slot, -1 while it has none
-    :param length: int32, shape (n_lists,)
-    :param size_class: int8, shape (n_lists,): the slot has room for ``MIN_SLOT << size_class`` entries
-    :param allocator: int64, shape (N_SIZE_CLASSES + 2,): head of the chain of free slots of each class, -1 if none; how many
-        entries are in slots (USED); 1 if there was no room for the last slot asked for (FULL)
-    """
-
-    item: np.ndarray
-    weight: np.ndarray
-    start: np.ndarray
-    length: np.ndarray
-    size_class: np.ndarray
-    allocator: np.ndarray
+    item: np.ndarray  # int32, (capacity,)
+    weight: np.ndarray  # float64, (capacity,)
+    start: np.ndarray  # int64, (n_lists,): first entry of each list's slot, -1 while it has none
+    length: np.ndarray  # int32, (n_lists,)
+    size_class: np.ndarray  # int8, (n_lists,): the slot has room for MIN_SLOT << size_class entries
+    # Head of the chain of free slots of each class, -1 if none; how many entries are in slots (USED); 1 if there was no room
+    # for the last slot asked for (FULL).
+    allocator: np.ndarray  # int64, (N_SIZE_CLASSES + 2,)
 
     @classmethod
     def empty(cls, n_lists: int, capacity: int) -> "ListStore":
-        """
-        Make empty lists.
-
-        :param n_lists: how many
-        :param capacity: entries that there is room for before the store has to grow
-        """
+        """Make empty lists with room for ``capacity`` entries before the store has to grow."""
         return cls(
             item=np.empty(capacity, dtype=np.int32),
             weight=np.empty(capacity, dtype=np.float64),
@@ -53,11 +37,7 @@ class ListStore(NamedTuple):
         )
 
     def with_room(self) -> "ListStore":
-        """
-        Double the room if the store is full.
-
-        :return: itself, or a store with the same lists
-        """
+        """Itself, or, if it is full, a store with the same lists and twice the room."""
         if not self.allocator[FULL]:
             return self
         self.allocator[FULL] = 0
@@ -68,11 +48,7 @@ class ListStore(NamedTuple):
         )
 
     def entries(self, p: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Read list ``p``.
-
-        :return: its items and weights, as views
-        """
+        """Items and weights of list ``p``, as views."""
         first = int(self.start[p])
         last = first + int(self.length[p])
         return self.item[first:last], self.weight[first:last]

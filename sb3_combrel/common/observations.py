@@ -7,13 +7,35 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.compiled import EntryPoint, compiled
 from sb3_combrel.common.periodic import flag_array
-from sb3_combrel.common.scaling import StateScaling, scale_into_box
+from sb3_combrel.common.scaling import StateScaling
 
-_scale_into_box = EntryPoint(scale_into_box)
 # Excess over the bounds, in unit coordinates, that rounding can explain.
 ROUNDING = 1e-6
+
+
+@compiled
+def scale_into_box(states, low, ranges, periodic, units):
+    """``StateScaling.to_unit``, and what is outside the unit cube is moved to its boundary, or wrapped into it.
+
+    :param states: float64, raw units, shape (n, n_variables); ``units`` receives the unit coordinates
+    :return: whether anything was moved, or is no number
+    """
+    outside = False
+    for i in range(len(states)):
+        for k in range(len(low)):
+            unit = (states[i, k] - low[k]) / ranges[k]
+            if periodic[k]:
+                # Not a number if the observation is infinite.
+                unit -= np.floor(unit)
+            units[i, k] = min(max(unit, 0.0), 1.0)
+            if units[i, k] != unit:
+                outside = True
+    return outside
+
+
+_scale_into_box = EntryPoint(scale_into_box)
 
 
 class ObservationScaler:

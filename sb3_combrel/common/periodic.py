@@ -27,12 +27,7 @@ def bring_near(state, at, periodic, near):
 
 
 def differences(a: NDArray[np.float64], b: NDArray[np.float64], periodic: NDArray[np.bool_] | None) -> NDArray[np.float64]:
-    """
-    Return :func:`difference` of arrays of states.
-
-    :param a: unit coordinates, shape (..., n_variables); ``b``: the same
-    :param periodic: bool, shape (n_variables,); None: none is periodic
-    """
+    """:func:`difference` of arrays of states, shape (..., n_variables); ``periodic`` None: no variable is."""
     apart: NDArray[np.float64] = np.asarray(a - b)
     if periodic is None or not periodic.any():
         return apart

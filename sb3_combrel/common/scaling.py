@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_combrel.common.compiled import compiled
-
 if TYPE_CHECKING:
     from gymnasium import spaces
 
 Bounds = tuple[ArrayLike, ArrayLike]
-
 
 # A limit of the order of the largest float stands for "unbounded" (3.4e38 in older Gymnasium spaces): a range that
 # dwarfs every state would put all states at one unit coordinate.
@@ -135,60 +132,34 @@ def _count_variables(space: spaces.Space[Any]) -> int:
     """Number of variables of a one-dimensional continuous box; anything else is refused."""
     from gymnasium import spaces as gym_spaces
 
+    wanted = "the observation space must be a one-dimensional Box of floating-point numbers"
     if isinstance(space, gym_spaces.Dict | gym_spaces.Tuple):
-        raise ValueError(
-            f"the observation space must be a one-dimensional Box, got {space}; "
-            "flatten it first, for example with gymnasium.wrappers.FlattenObservation"
-        )
+        raise ValueError(f"{wanted}, got {space}; flatten it first, for example with gymnasium.wrappers.FlattenObservation")
     if not isinstance(space, gym_spaces.Box):
-        raise ValueError(f"the observation space must be a one-dimensional Box, got {space}")
+        raise ValueError(f"{wanted}, got {space}")
     if len(space.shape) != 1 or space.shape[0] == 0:
-        kind = "images are not supported; " if len(space.shape) == 3 else ""
-        raise ValueError(
-            f"the observation space must be a Box of shape (n_variables,), got shape {space.shape}; {kind}"
-            "pass a vector of state variables"
-        )
+        images = "; images are not supported: pass a vector of state variables" if len(space.shape) == 3 else ""
+        raise ValueError(f"{wanted}, got shape {space.shape}{images}")
     if not np.issubdtype(space.dtype, np.floating):
-        raise ValueError(f"the observation space must be a Box of floating-point numbers, got dtype {space.dtype}")
+        raise ValueError(f"{wanted}, got dtype {space.dtype}")
     return int(space.shape[0])
 
 
 def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """``(low, high)`` of the ``bounds`` argument, each broadcast to one number a variable."""
-    right = f"bounds must be (low, high), each a finite number or a sequence of {n_variables} finite numbers"
+    wrong = f"bounds must be (low, high), each a finite number or a sequence of {n_variables} finite numbers, got {{}}"
     try:
         low, high = (np.array(bound, dtype=np.float64) for bound in bounds)
+        is_boolean = any(isinstance(each, bool | np.bool_) for given in bounds for each in np.array(given, dtype=object).flat)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{right}, got bounds={bounds!r}") from error
+        raise ValueError(wrong.format(f"bounds={bounds!r}")) from error
+    if is_boolean:
+        raise ValueError(wrong.format(f"bounds={bounds!r}"))
     for name, bound in (("low", low), ("high", high)):
         if bound.shape not in ((), (n_variables,)):
-            raise ValueError(f"{right}, got a {name} of shape {bound.shape} in bounds={bounds!r}")
-        if any(isinstance(each, bool | np.bool_) for given in bounds for each in np.ravel(np.array(given, dtype=object))):
-            raise ValueError(f"{right}, got bounds={bounds!r}")
+            raise ValueError(wrong.format(f"a {name} of shape {bound.shape} in bounds={bounds!r}"))
         if not np.all(np.isfinite(bound)):
-            raise ValueError(f"{right}, got a {name} of {bound.tolist()} in bounds={bounds!r}")
+            raise ValueError(wrong.format(f"a {name} of {bound.tolist()} in bounds={bounds!r}"))
     low, high = np.broadcast_to(low, n_variables), np.broadcast_to(high, n_variables)
     _check_order(low, high, "bounds")
     return low, high
-
-
-@compiled
-def scale_into_box(states, low, ranges, periodic, units):
-    """:meth:`StateScaling.to_unit`, and what is outside the unit cube is moved to its boundary, or wrapped into it.
-
-    :param states: float64, raw units, shape (n, n_variables)
-    :param low: shape (n_variables,); ``ranges``: high - low; ``periodic``: bool, whether to wrap each variable
-    :param units: receives the unit coordinates, shape (n, n_variables)
-    :return: whether anything was moved, or is no number
-    """
-    outside = False
-    for i in range(len(states)):
-        for k in range(len(low)):
-            unit = (states[i, k] - low[k]) / ranges[k]
-            if periodic[k]:
-                # Not a number if the observation is infinite.
-                unit -= np.floor(unit)
-            units[i, k] = min(max(unit, 0.0), 1.0)
-            if units[i, k] != unit:
-                outside = True
-    return outside

@@ -101,11 +101,7 @@ def _read_object(kind: Any, content: Content) -> Any:
 
 
 def damage_text(error: BaseException) -> str:
-    """
-    What was wrong with damaged content, in one line of at most 300 characters.
-
-    :param error: what reading it raised
-    """
+    """What was wrong with damaged content, given what reading it raised, in one line of at most 300 characters."""
     if isinstance(error, KeyError) and error.args:
         return f"{error.args[0]!r} is missing"
     return " ".join(str(error).split())[:300] or type(error).__name__

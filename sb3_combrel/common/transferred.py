@@ -1,4 +1,4 @@
-"""Transferred instances on their way from a transfer method to the model."""
+"""What transfer methods give to the model: transferred instances, or predictions as a prior."""
 
 from typing import NamedTuple
 
@@ -30,14 +30,7 @@ class TransferredInstances(NamedTuple):
 
     @classmethod
     def empty(cls, n: int, n_variables: int, max_instances: int = 0) -> "TransferredInstances":
-        """
-        Make room for transferred instances.
-
-        :param n: number of pairs
-        :param n_variables: number of state variables of the target
-        :param max_instances: of one pair
-        :return: arrays of that shape, with nothing transferred to any pair
-        """
+        """Make room for ``max_instances`` for each of ``n`` pairs; nothing is transferred to any."""
         return cls(
             length=np.zeros(n, dtype=np.int64),
             weight=np.zeros((n, max_instances)),
@@ -45,6 +38,28 @@ class TransferredInstances(NamedTuple):
             reward=np.zeros((n, max_instances)),
             terminated=np.zeros((n, max_instances), dtype=np.bool_),
         )
+
+
+class PriorPredictions(NamedTuple):
+    """What a source predicts of n state-action pairs of the target (see ``Transfer.prior``). Unit coordinates of the target.
+
+    :param effect: float64, shape (n, n_variables): predicted displacement; 0 for variables of which it says nothing
+    :param reward: float64, shape (n,): expected reward, raw
+    :param end: float64, shape (n,): probability of termination
+    :param weight: float64, shape (n,): how well founded the prediction is, on the scale of the target's
+        ``exploration_threshold``. A pair whose weight reaches the threshold is modelled without instances of its own; 0: it
+        stays optimistic until they suffice, with ``effect`` still the mean to which they are fitted
+    """
+
+    effect: np.ndarray
+    reward: np.ndarray
+    end: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def nothing(cls, n: int, n_variables: int) -> "PriorPredictions":
+        """Predict no change of any of ``n`` pairs, and claim nothing."""
+        return cls(np.zeros((n, n_variables)), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 _TYPES = tuple(map(np.dtype, (np.int64, np.float64, np.float64, np.float64, np.bool_)))
@@ -56,10 +71,8 @@ def check_transferred(
     """
     Check what a transfer method returned before compiled code reads it.
 
-    :param given: what it returned
     :param method: the transfer method, named in the message
     :param own_weight: weight of the target's own instances of each pair that was asked for, shape (n,)
-    :param n_variables: number of state variables of the target
     :param threshold: weight that own and transferred instances of a pair must reach together
     :raises ValueError: if rows are missing, arrays have other types or shapes, a value is not finite, a weight is not above
         0, or the weights of a pair do not reach the threshold
@@ -70,17 +83,15 @@ def check_transferred(
     if problem == _NO_PROBLEM:
         return
     length, weights = int(given.length[row]), given.weight[row, : max(0, given.length[row])]
-    if problem == _LENGTH:
-        raise ValueError(
-            f"{name} returned length={length} for row {row}; it must be from 0 to {given.weight.shape[1]}, the room in weight"
-        )
-    if problem == _WEIGHT:
-        raise ValueError(f"{name} returned the weights {weights} for row {row}; they must be finite and above 0")
-    if problem == _VALUE:
-        raise ValueError(f"{name} returned an effect or a reward that is not finite for row {row}")
     raise ValueError(
-        f"{name} returned weights that add up to {weights.sum():g} for row {row}, with {own_weight[row]:g} of the target's "
-        f"own instances; together they must reach the threshold of {threshold:g}, or length must be 0"
+        {
+            _LENGTH: f"{name} returned length={length} for row {row}; it must be from 0 to {given.weight.shape[1]}, "
+            "the room in weight",
+            _WEIGHT: f"{name} returned the weights {weights} for row {row}; they must be finite and above 0",
+            _VALUE: f"{name} returned an effect or a reward that is not finite for row {row}",
+            _THRESHOLD: f"{name} returned weights that add up to {weights.sum():g} for row {row}, with {own_weight[row]:g} of "
+            f"the target's own instances; together they must reach the threshold of {threshold:g}, or length must be 0",
+        }[problem]
     )
 
 

@@ -9,8 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from sb3_combrel.common.instances import Instances, put_instance_at
-from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.common.transferred import TransferredInstances, check_transferred
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances, check_transferred
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
 
@@ -21,16 +20,7 @@ MAX_PAIRS_AT_ONCE = 4096
 @dataclass(frozen=True)
 class ModelSettings:
     """
-    The arguments of :class:`~sb3_combrel.FittedRMax` that a model needs; see there.
-
-    :param model_breadth: kernel breadth, unit coordinates
-    :param min_weight: instances of less weight do not count
-    :param min_fraction: fraction of the weight of nearer instances that an instance must have
-    :param exploration_threshold: weight of instances that makes a state-action pair known
-    :param max_instances: of one action; None for no limit
-    :param n_neighbors: of a local linear model: nearest instances that a fit is made to
-    :param outcome_breadth: of a local linear model: breadth of the kernel for rewards and ends
-    :param max_model_steps: of a local linear model: most steps that a row of the finite MDP leads ahead
+    The arguments of :class:`~sb3_combrel.FittedRMax` that a model needs; what they mean is said there.
     """
 
     model_breadth: float
@@ -44,7 +34,8 @@ class ModelSettings:
 
 
 class Predictions(NamedTuple):
-    """What the target's own instances predict of n state-action pairs. Unit coordinates.
+    """
+    What the target's own instances predict of n state-action pairs. Unit coordinates.
 
     :param weight: float64, shape (n,): weight of the instances behind each prediction, which decides whether it is known
     :param reward: float64, shape (n,): expected reward
@@ -71,7 +62,7 @@ class InstanceTransfer(Protocol):
         """The same for states of the finite sample, by number."""
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        """What the source predicts of states, unit coordinates, and actions."""
+        """What the source predicts of states, unit coordinates, and actions; of its effects those at grid points are used."""
 
     def prior_version(self) -> int:
         """A number that grows when what ``prior`` returns may have changed."""
@@ -128,8 +119,7 @@ class Model(ABC):
         """
         Add one transition.
 
-        :param state: shape (n_variables,)
-        :param next_state: the same
+        :param state: shape (n_variables,); ``next_state``: the same
         :param terminated: the episode ended in a terminal state; a time limit is none
         :return: pairs whose rows are to be updated, int64; by default all of the action
         """
@@ -143,11 +133,7 @@ class Model(ABC):
         return np.arange(action * self.grid.n_points, (action + 1) * self.grid.n_points)
 
     def update_rows(self, pairs: np.ndarray) -> None:
-        """
-        Bring the rows of the finite MDP up to date with the instances and with what is transferred.
-
-        :param pairs: int64, at most ``MAX_PAIRS_AT_ONCE``
-        """
+        """Bring the rows of at most ``MAX_PAIRS_AT_ONCE`` pairs up to date with the instances and with what is transferred."""
         actions, points = np.divmod(pairs, self.grid.n_points)
         predictions = self.predict(self.grid.states_of(points), actions)
         self.own_weight[pairs] = predictions.weight
@@ -180,40 +166,24 @@ class Model(ABC):
         return Prediction(modelled, weight, predictions.reward, length, *arrays), given
 
     def lower_threshold(self, threshold: float) -> np.ndarray:
-        """
-        Be content with less weight.
-
-        :return: the pairs that become known by that, whose rows are to be updated
-        """
+        """Be content with less weight; the pairs that become known by that, whose rows are to be updated."""
         self.exploration_threshold = threshold
         newly_known = np.flatnonzero(~self.known & (self.own_weight >= threshold))
         self.known[newly_known] = True
         return newly_known
 
     def accept(self, pairs: np.ndarray) -> np.ndarray:
-        """
-        Let pairs count as known from what instances they have.
-
-        :return: those that become known by that, whose rows are to be updated
-        """
+        """Let pairs count as known from what instances they have; those that become so, whose rows are to be updated."""
         newly_known = pairs[~self.known[pairs] & (self.own_weight[pairs] > 0.0)]
         self.known[newly_known] = True
         return newly_known
 
     def renew_prior(self) -> np.ndarray:
-        """
-        Ask the transfer method for its prior again if that may have changed.
-
-        :return: the pairs whose rows are to be updated; none unless ``takes_prior``
-        """
+        """Ask the transfer method for its prior again if that may have changed; the pairs whose rows are to be updated."""
         return NO_PAIRS
 
     def end_episode(self) -> np.ndarray:
-        """
-        Do what may wait until the end of an episode.
-
-        :return: the pairs whose rows are to be updated; by default none
-        """
+        """Do what may wait until the end of an episode; the pairs whose rows are to be updated."""
         return NO_PAIRS
 
     def outdated(self) -> np.ndarray:
@@ -251,12 +221,8 @@ class Model(ABC):
 
 
 def join(own: Predictions, given: TransferredInstances, known: np.ndarray) -> tuple[Predictions, np.ndarray]:
-    """
-    Let transferred instances join the own ones of pairs that are not known, all in proportion to their weight.
+    """Let transferred instances, one row a pair, join the own ones of pairs that are not known, in proportion to their weight.
 
-    :param own: what the own instances predict
-    :param given: transferred instances, one row a pair
-    :param known: bool, shape (n,): pairs that need none
     :return: the predictions, and which of the pairs have a model, bool, shape (n,)
     """
     n = len(known)

@@ -8,9 +8,8 @@ from sb3_combrel.common.kernels import any_periodic
 from sb3_combrel.common.linear_regression import fitted_effect, products_of
 from sb3_combrel.common.periodic import bring_near, difference
 from sb3_combrel.models.fit_arrays import FitScratch, Kernel, LinearFits
-from sb3_combrel.models.kernel_refill import unit_coordinates_of
 from sb3_combrel.models.linear_fits import count_instance, narrow, narrow_and_refit, prediction_moved, recount, refit
-from sb3_combrel.planning.grid import GridArrays
+from sb3_combrel.planning.grid import GridArrays, unit_coordinates_of
 
 # Within an episode a pair is fitted again once what new instances leave unexplained may move its prediction by this, in parts
 # of the size of the action's effects.
@@ -24,10 +23,9 @@ LEAST_SCALE = 0.02
 
 @part
 def points_within(state, reach, widest, grid, scratch):
-    """Grid points to which ``state`` is at most as near as ``reach`` says, and their squared distances.
+    """Grid points to which ``state`` is at most as near as ``reach`` says, shape (n_points,), no more than ``widest``.
 
-    :param reach: float64, shape (n_points,): squared distances; none is above ``widest``
-    :return: how many; they are in ``scratch.point`` and ``scratch.distance``
+    They are written to ``scratch.point``, their squared distances to ``scratch.distance``; how many they are.
     """
     first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]
     d = len(state)
@@ -74,11 +72,7 @@ def points_within(state, reach, widest, grid, scratch):
 
 @inlined
 def contradiction(fits, pair, instances, action, slot, state, shares):
-    """By how much an instance may change what its pair predicts.
-
-    :param state: where it is, near the pair's point (see ``bring_near``)
-    :param shares: the fraction of the pair's weight that it has, and of the pair's narrower weight
-    """
+    """By how much an instance, at ``state``, may change what its pair predicts; ``shares``: see :func:`count_instance`."""
     d = len(state)
     most = 0.0
     for k in range(d):
@@ -92,22 +86,24 @@ def contradiction(fits, pair, instances, action, slot, state, shares):
     return max(1e-12, shares[0] * most + shares[1] * max(of_reward, of_end))
 
 
-@part
+@compiled
 def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
-    """Write an instance to its slot, and count it for all pairs that it reaches.
+    """Write an instance to its slot, and count it for all pairs that it reaches; plain tuples.
 
-    :param prior: float64, shape (n_variables,): effect that the prior predicts of it
     :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
         row is to be updated, 0: never)
     :param transition: (action, slot, state, next_state, reward, terminated)
+    :param prior: effect that the prior predicts of it
     :return: of how many pairs the rows are to be updated; their points are moved to the front of ``scratch.point``
     """
+    instances, fits, grid = Instances(*instances), LinearFits(*fits), GridArrays(*grid)
+    kernel, scratch = Kernel(*kernel), FitScratch(*scratch)
     threshold, min_change = thresholds
     action, slot, _, _, reward, terminated = transition
     n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
     put_instance(instances, transition)
-    state = scratch.entering
+    state = scratch.state
     wraps = any_periodic(grid.periodic)
     for k in range(len(state)):
         state[k] = instances.state[action, slot, k]
@@ -153,20 +149,11 @@ def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch)
     return changed
 
 
-@compiled
-def enter_plain(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
-    """:func:`enter` for callers from Python, with plain tuples."""
-    instances, fits, grid = Instances(*instances), LinearFits(*fits), GridArrays(*grid)
-    return enter(instances, fits, grid, Kernel(*kernel), thresholds, transition, prior, FitScratch(*scratch))
-
-
 @part
 def count_without(instances, fits, pair, action, slot, kernel, scratch):
     """Bring a pair that has lost an instance in order; whether its row is to be updated.
 
     A narrow kernel with less than half of ``n_neighbors`` left is as broad again as these allow.
-
-    :param slot: the instance that is gone; ``scratch.at`` is where the pair's point is
     """
     if fits.n_counted[pair] > 0 and (2 * fits.n_counted[pair] >= kernel.n_neighbors or fits.reach[pair] >= kernel.reach):
         return False
@@ -186,12 +173,11 @@ def count_without(instances, fits, pair, action, slot, kernel, scratch):
 def leave(instances, fits, grid, kernel, action, slot, scratch):
     """Take an instance out of the sums of the pairs for which it counts; another is about to be entered in its place.
 
-    :return: of how many pairs the rows are to be updated at once, as they have no instances left, or others than before;
-        their points are moved to the front of ``scratch.point``
+    Of how many pairs the rows are to be updated at once; their points are moved to the front of ``scratch.point``.
     """
     n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
-    state = scratch.entering
+    state = scratch.state
     reward, terminated = instances.reward[action, slot], instances.terminated[action, slot]
     for k in range(len(state)):
         fits.effect_range[2, action, k] -= abs(instances.effect[action, slot, k])
@@ -221,12 +207,9 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
 
 @compiled
 def refit_changed(fits, grid, scratch, range_has_changed, changed):
-    """Fit all pairs again that have had instances since the last time; how many rows are to be updated.
+    """Fit all pairs again that have had instances since the last time; how many rows are to be updated, in ``changed``.
 
     All rows are looked at: the range that effects are kept within may have changed.
-
-    :param range_has_changed: bool, shape (n_actions,)
-    :param changed: int64, shape (n_pairs,): receives these pairs
     """
     n_points = grid.shape[0] * grid.strides[0]
     n = 0
@@ -250,10 +233,7 @@ def refit_changed(fits, grid, scratch, range_has_changed, changed):
 
 @compiled
 def recount_pairs(instances, fits, grid, kernel, threshold, scratch):
-    """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known.
-
-    :param threshold: weight that makes a pair known
-    """
+    """Compute sums and fits of all pairs from the instances and from ``reach``; what was known stays known."""
     n_points = grid.shape[0] * grid.strides[0]
     for pair in range(len(fits.total)):
         action = pair // n_points

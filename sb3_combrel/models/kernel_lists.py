@@ -6,37 +6,29 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.instances import Instances, put_instance
-from sb3_combrel.common.kernels import cut_by_fraction, difference, insert_by_weight
+from sb3_combrel.common.kernels import cut_by_fraction, insert_by_weight
 from sb3_combrel.common.list_store import ListStore, reserve
+from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.compiled_model import add_to_row, total_weight
 from sb3_combrel.planning.grid import GridArrays
 from sb3_combrel.planning.mdp import RowScratch, add_successor, as_mdp, coordinates_of, finish_row, set_modelled
 
 
 class KernelLists(NamedTuple):
-    """The kept instances of each pair of the grid (pair ``action * n_points + point``).
+    """The kept instances of each pair of the grid (pair ``action * n_points + point``)."""
 
-    :param lists: kept instances of each pair, heaviest first, with their kernel weights
-    :param entry: float64, shape (n_pairs,): the weight that a further instance needs to enter the pair's list
-    :param total: float64, shape (n_pairs,): sum of the kept weights
-    :param last_total: float64, shape (n_pairs,): what ``total`` was when the pair's row was updated
-    :param known: bool, shape (n_pairs,): the target's own instances suffice
-    :param n_lists: int32, shape (n_actions, capacity): how many lists each instance is in
-    :param corner_low: int32, shape (n_actions, capacity, n_variables): the effect of each instance in cells, rounded down
-    :param corner_offset: int32, shape (n_actions, capacity, 2 ** n_variables): counted from a grid point that the effect
-        is applied to, the grid points around the state that it leads to; ``corner_weight``: float64, same shape, their
-        multilinear weights
-    """
-
-    lists: ListStore
-    entry: np.ndarray
-    total: np.ndarray
-    last_total: np.ndarray
-    known: np.ndarray
-    n_lists: np.ndarray
-    corner_low: np.ndarray
-    corner_offset: np.ndarray
-    corner_weight: np.ndarray
+    lists: ListStore  # kept instances of each pair, heaviest first, with their kernel weights
+    entry: np.ndarray  # float64, (n_pairs,): the weight that a further instance needs to enter the pair's list
+    total: np.ndarray  # float64, (n_pairs,): sum of the kept weights
+    last_total: np.ndarray  # float64, (n_pairs,): what ``total`` was when the pair's row was updated
+    known: np.ndarray  # bool, (n_pairs,): the target's own instances suffice
+    n_lists: np.ndarray  # int32, (n_actions, capacity): how many lists each instance is in
+    # The effect of each instance in cells, rounded down; counted from a grid point that the effect is applied to, the grid
+    # points around the state that it leads to, and their multilinear weights.
+    corner_low: np.ndarray  # int32, (n_actions, capacity, n_variables)
+    corner_offset: np.ndarray  # int32, (n_actions, capacity, 2 ** n_variables)
+    corner_weight: np.ndarray  # float64, the same
 
     def plain(self) -> tuple[Any, ...]:
         """The same as plain tuples (see ``common.compiled``)."""
@@ -51,34 +43,19 @@ def as_lists(plain):
 
 
 class ReachScratch(NamedTuple):
-    """Work space for the grid points that an instance reaches.
+    """Work space for the grid points that an instance reaches."""
 
-    :param kernel: float64, shape (n_variables, largest axis of the grid): one-dimensional kernel factors
-    :param at: int64, shape (3, n_variables): first grid coordinate within reach, one past the last, the present one; along a
-        periodic variable the last may come before the first
-    :param point: int64, shape (n_points,): points within reach; ``weight``: float64, same shape: the instance's weight there
-    """
-
-    kernel: np.ndarray
-    at: np.ndarray
-    point: np.ndarray
-    weight: np.ndarray
-
-
-class Outcomes(NamedTuple):
-    """What the instances of a model lead to; three of the arrays of ``Instances``."""
-
-    effect: np.ndarray
-    reward: np.ndarray
-    terminated: np.ndarray
+    kernel: np.ndarray  # float64, (n_variables, largest axis of the grid): one-dimensional kernel factors
+    # First grid coordinate within reach, one past the last, the present one; along a periodic variable the last may come
+    # before the first.
+    at: np.ndarray  # int64, (3, n_variables)
+    point: np.ndarray  # int64, (n_points,): points within reach
+    weight: np.ndarray  # float64, the same: the instance's weight there
 
 
 @part
 def factors_in_reach(state, kernel, grid, scratch):
-    """Write the first and the last grid coordinate within reach to ``scratch.at``, and the kernel's factors between them.
-
-    :return: whether there are any along every variable
-    """
+    """Write the kernel's factors and what grid coordinates are within reach; whether there are any along every variable."""
     breadth, min_weight, _ = kernel
     first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
     reach = breadth * np.sqrt(-np.log(min_weight)) * (1 + 1e-12)
@@ -110,13 +87,10 @@ def factors_in_reach(state, kernel, grid, scratch):
 
 @part
 def points_in_reach(state, kernel, grid, entry, scratch):
-    """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``.
+    """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``, shape (n_points,).
 
     The kernel is a product of one factor a variable, so the exponentials are few: one for each grid coordinate.
-
-    :param kernel: (breadth, min_weight, min_fraction)
-    :param entry: float64, shape (n_points,)
-    :return: how many; they and the weights are in ``scratch.point`` and ``scratch.weight``
+    They and the weights are in ``scratch.point`` and ``scratch.weight``; how many they are.
     """
     _, min_weight, _ = kernel
     first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
@@ -154,25 +128,31 @@ def points_in_reach(state, kernel, grid, entry, scratch):
             return found
 
 
-@part
+# What ``progress`` of :func:`enter` begins with: the instance is to be written to its slot first, or stands there.
+TO_BE_PUT, IN_ITS_SLOT = -1, -2
+
+
+@compiled
 def enter(instances, arrays, grid, kernel, thresholds, transition, scratch, progress):
-    """Write an instance to its slot, and put it into the lists of all pairs that it reaches.
+    """Write an instance to its slot, and put it into the lists of all pairs that it reaches; plain tuples.
 
     :param kernel: (breadth, min_weight, min_fraction)
     :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
         row is to be updated)
     :param transition: (action, slot, state, next_state, reward, terminated)
     :param progress: int64, shape (3,): pairs in reach, how many of them are done, and how many of these are to be updated,
-        whose points are moved to the front of ``scratch.point``; {-1, 0, 0} at first
+        whose points are moved to the front of ``scratch.point``; TO_BE_PUT or IN_ITS_SLOT, 0, 0 at first
     :return: False if there is no room for the lists: they must grow before another call goes on
     """
+    instances, arrays, grid, scratch = Instances(*instances), as_lists(arrays), GridArrays(*grid), ReachScratch(*scratch)
     _, _, min_fraction = kernel
     threshold, min_change = thresholds
     action, slot, _, _, _, _ = transition
     n_points = grid.shape[0] * grid.strides[0]
     first_pair = action * n_points
-    if progress[0] < 0:
+    if progress[0] == TO_BE_PUT:
         put_instance(instances, transition)
+    if progress[0] < 0:
         note_corners(arrays, instances.effect[action, slot], grid, action, slot)
         entry = arrays.entry[first_pair : first_pair + n_points]
         progress[0] = points_in_reach(instances.state[action, slot], kernel, grid, entry, scratch)
@@ -202,20 +182,8 @@ def enter(instances, arrays, grid, kernel, thresholds, transition, scratch, prog
 
 
 @compiled
-def enter_plain(instances, arrays, grid, kernel, thresholds, transition, scratch, progress):
-    """:func:`enter` for callers from Python, with plain tuples."""
-    instances, arrays, grid, scratch = Instances(*instances), as_lists(arrays), GridArrays(*grid), ReachScratch(*scratch)
-    return enter(instances, arrays, grid, kernel, thresholds, transition, scratch, progress)
-
-
-@compiled
 def leave_lists(instances, arrays, grid, kernel, action, slot, anywhere, scratch):
-    """Take an instance out of the lists that it is in.
-
-    :param kernel: (breadth, min_weight, min_fraction)
-    :param anywhere: zeros, shape (n_points,)
-    :return: how many lists changed; their points are moved to the front of ``scratch.point``
-    """
+    """Take an instance out of the lists that it is in; how many changed, whose points are moved to ``scratch.point``."""
     _, _, min_fraction = kernel
     n_found = points_in_reach(instances.state[action, slot], kernel, grid, anywhere, scratch)
     first_pair = action * grid.shape[0] * grid.strides[0]
@@ -270,12 +238,7 @@ def note_corners(arrays, effect, grid, action, slot):
 
 @part
 def add_instance(p, arrays, instance, effect, point, scratch, grid, n_touched):
-    """Add the successors of an instance, of probability ``p``, at a grid point with coordinates ``scratch.at``.
-
-    :param instance: (action, number)
-    :param effect: of the instance
-    :return: see ``add_successor``
-    """
+    """Add the successors of an instance (action, number) at the grid point at ``scratch.at``, as ``add_successor``."""
     action, i = instance
     for k in range(len(grid.shape)):
         low = scratch.at[k] + arrays.corner_low[action, i, k]
@@ -293,11 +256,8 @@ def add_instance(p, arrays, instance, effect, point, scratch, grid, n_touched):
 
 
 @part
-def add_own(arrays, outcomes, pair, total, grid, scratch):
-    """Add what a pair's own instances predict; the expected reward, and see ``add_successor``.
-
-    :param total: weight of all instances of the pair, transferred ones included
-    """
+def add_own(arrays, instances, pair, total, grid, scratch):
+    """Add what a pair's own instances predict, all weighing ``total``; the expected reward, and see ``add_successor``."""
     n_points = grid.shape[0] * grid.strides[0]
     action = pair // n_points
     point = pair - action * n_points
@@ -307,49 +267,40 @@ def add_own(arrays, outcomes, pair, total, grid, scratch):
     for k in range(start, start + arrays.lists.length[pair]):
         i = arrays.lists.item[k]
         p = arrays.lists.weight[k] / total
-        reward += p * outcomes.reward[action, i]
-        if not outcomes.terminated[action, i]:
-            effect = outcomes.effect[action, i]
+        reward += p * instances.reward[action, i]
+        if not instances.terminated[action, i]:
+            effect = instances.effect[action, i]
             n_touched = add_instance(p, arrays, (action, i), effect, point, scratch, grid, n_touched)
     return reward, n_touched
 
 
-@part
-def update_rows(arrays, outcomes, mdp, grid, gamma, pairs, transferred, scratch):
-    """Bring the rows of ``pairs`` up to date with their lists and with transferred instances.
+@compiled
+def update_rows(arrays, instances, mdp, grid, gamma, pairs, transferred, scratch):
+    """Bring the rows of pairs up to date with their lists and with transferred instances; how many are done.
 
-    :param pairs: (pairs, how many of them are done)
+    :param pairs: (pairs, how many of them are done); plain tuples for the rest
     :param transferred: a row for each of them, which counts only while the pair is not known
-    :return: how many of them are done; fewer than all if there is no room in the MDP
     """
+    arrays, instances, mdp, grid = as_lists(arrays), Instances(*instances), as_mdp(mdp), GridArrays(*grid)
+    transferred, scratch = TransferredInstances(*transferred), RowScratch(*scratch)
     pairs, done = pairs
     n_points = len(mdp.n_optimistic)
     while done < len(pairs):
         pair = pairs[done]
-        n_transferred = 0 if arrays.known[pair] else transferred.length[done]
-        modelled = arrays.known[pair] or n_transferred > 0
+        joined = not arrays.known[pair] and transferred.length[done] > 0
+        modelled = arrays.known[pair] or joined
         if modelled:
             point = pair % n_points
             coordinates_of(point, grid, scratch.at)
             total = arrays.total[pair] if arrays.lists.length[pair] > 0 else 0.0
-            for j in range(n_transferred):
-                total += transferred.weight[done, j]
-            reward, n_touched = add_own(arrays, outcomes, pair, total, grid, scratch)
-            for j in range(n_transferred):
-                p = transferred.weight[done, j] / total
-                reward += p * transferred.reward[done, j]
-                if not transferred.terminated[done, j]:
-                    n_touched = add_successor(p, transferred.effect[done, j], scratch, grid, n_touched)
+            if joined:
+                total = total_weight(total, transferred, done)
+            reward, n_touched = add_own(arrays, instances, pair, total, grid, scratch)
+            if joined:
+                reward, n_touched = add_to_row(reward, n_touched, transferred, done, total, scratch, grid)
             if not finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
                 return done
         arrays.last_total[pair] = arrays.total[pair]
         set_modelled(mdp, pair, modelled)
         done += 1
     return done
-
-
-@compiled
-def update_rows_plain(arrays, outcomes, mdp, grid, gamma, pairs, transferred, scratch):
-    """:func:`update_rows` for callers from Python, with plain tuples."""
-    arrays, outcomes, grid, scratch = as_lists(arrays), Outcomes(*outcomes), GridArrays(*grid), RowScratch(*scratch)
-    return update_rows(arrays, outcomes, as_mdp(mdp), grid, gamma, pairs, TransferredInstances(*transferred), scratch)

@@ -4,35 +4,32 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, part
+from sb3_combrel.common.compiled import compiled, part
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.compiled_model import add_to_prediction, total_weight
 from sb3_combrel.planning.q_values import Prediction
 
 
 class NearLists(NamedTuple):
-    """The kept instances at an exact state, one row an action.
+    """The kept instances at an exact state, one row an action."""
 
-    :param item: int32, shape (n_actions, list room): instances, nearest first; ``weight``: float64, same shape
-    :param length: int64, shape (n_actions,)
-    """
-
-    item: np.ndarray
-    weight: np.ndarray
-    length: np.ndarray
+    item: np.ndarray  # int32, (n_actions, list room): instances, nearest first
+    weight: np.ndarray  # float64, the same
+    length: np.ndarray  # int64, (n_actions,)
 
 
-@part
+@compiled
 def predict_own(instances, state, kernel, threshold, near, prediction):
-    """Predict every action at ``state`` from the instances that the kernel keeps there.
+    """Predict every action at ``state`` from the instances that the kernel keeps there; the least weight that one has.
 
-    :param kernel: (breadth, min_weight, min_fraction)
+    :param kernel: (breadth, min_weight, min_fraction); plain tuples for the rest
     :param near: receives these instances; those of the last query make the search shorter
-    :param prediction: receives the prediction; an action of less weight than ``threshold`` has none. An action that was
-        known stays known: one whose list a nearer instance has shortened counts as weighing ``threshold``.
-    :return: the least weight that an action has
+    :param prediction: receives the prediction. An action that was known stays known: one whose list a nearer instance has
+        shortened counts as weighing ``threshold``.
     """
+    instances, near, prediction = Instances(*instances), NearLists(*near), Prediction(*prediction)
     least = np.inf
     for action in range(len(near.length)):
         item = near.item[action]
@@ -75,20 +72,6 @@ def known_before(instances, action, state, kernel, threshold, total):
     return everything >= threshold
 
 
-@compiled
-def predict_own_plain(instances, state, kernel, threshold, near, prediction):
-    """:func:`predict_own` for callers from Python, with plain tuples."""
-    return predict_own(Instances(*instances), state, kernel, threshold, NearLists(*near), Prediction(*prediction))
-
-
-@inlined
-def enter_successor(prediction, action, n, p, effect):
-    """Write the ``n``-th successor of an action, of probability ``p``."""
-    prediction.probability[action, n] = p
-    for v in range(len(effect)):
-        prediction.effect[action, n, v] = effect[v]
-
-
 @part
 def predict_from_lists(instances, action, near, total, prediction):
     """Enter what the instances in ``near`` predict of an action, all instances weighing ``total``."""
@@ -99,41 +82,21 @@ def predict_from_lists(instances, action, near, total, prediction):
         p = near.weight[action, k] / total
         reward += p * instances.reward[action, i]
         if not instances.terminated[action, i]:
-            enter_successor(prediction, action, n, p, instances.effect[action, i])
+            prediction.probability[action, n] = p
+            for v in range(instances.effect.shape[2]):
+                prediction.effect[action, n, v] = instances.effect[action, i, v]
             n += 1
     prediction.reward[action] = reward
     prediction.length[action] = n
 
 
-@part
-def join_transferred(instances, near, transferred, threshold, prediction):
-    """Let transferred instances join the prediction of the actions whose own instances weigh less than ``threshold``.
-
-    :param transferred: one row an action
-    """
-    for action in range(len(near.length)):
-        n_transferred = transferred.length[action]
-        if prediction.weight[action] >= threshold or n_transferred == 0:
-            continue
-        total = prediction.weight[action]
-        for j in range(n_transferred):
-            total += transferred.weight[action, j]
-        predict_from_lists(instances, action, near, total, prediction)
-        n = prediction.length[action]
-        reward = prediction.reward[action]
-        for j in range(n_transferred):
-            p = transferred.weight[action, j] / total
-            reward += p * transferred.reward[action, j]
-            if not transferred.terminated[action, j]:
-                enter_successor(prediction, action, n, p, transferred.effect[action, j])
-                n += 1
-        prediction.reward[action] = reward
-        prediction.length[action] = n
-        prediction.modelled[action] = True
-
-
 @compiled
-def join_transferred_plain(instances, near, transferred, threshold, prediction):
-    """:func:`join_transferred` for callers from Python, with plain tuples."""
+def join_transferred(instances, near, transferred, threshold, prediction):
+    """Let transferred instances join the prediction of actions of less weight than ``threshold``; plain tuples."""
+    instances, near, prediction = Instances(*instances), NearLists(*near), Prediction(*prediction)
     transferred = TransferredInstances(*transferred)
-    join_transferred(Instances(*instances), NearLists(*near), transferred, threshold, Prediction(*prediction))
+    for action in range(len(near.length)):
+        if prediction.weight[action] < threshold and transferred.length[action] > 0:
+            total = total_weight(prediction.weight[action], transferred, action)
+            predict_from_lists(instances, action, near, total, prediction)
+            add_to_prediction(prediction, action, transferred, total)

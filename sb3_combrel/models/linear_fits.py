@@ -4,18 +4,17 @@ import numpy as np
 
 from sb3_combrel.common.compiled import inlined, inner
 from sb3_combrel.common.instances import BLOCK
-from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
+from sb3_combrel.common.kernels import any_periodic, measure_blocks, nearest_instances, squared_distance
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
-from sb3_combrel.models.kernel_refill import unit_coordinates_of
+from sb3_combrel.planning.grid import unit_coordinates_of
 
 # The kernel of a pair is so broad that the farthest of its instances weighs this, and no broader than ``model_breadth``.
 LAST_WEIGHT = 0.05
 PER_BREADTH = -np.log(LAST_WEIGHT)
 # No narrower than this fraction of ``model_breadth``: all instances may be at the very same state.
 NARROWEST = 0.02
-# On the slopes, in squares of the kernel's breadth. Ten times as much flattens slopes across a trajectory once the kernel has
-# narrowed: Mountain Car 4D then gets slower with more data. With a tenth as much the first episodes take longer.
+# On the slopes, in squares of the kernel's breadth: more flattens slopes across a trajectory once the kernel has narrowed.
 RIDGE = 0.001
 # What the linear fit leaves unexplained of the instances nearest to a state, as at a wall, is added to its prediction, as if
 # there were so much weight of instances besides that it explains.
@@ -40,12 +39,7 @@ def narrowed(reach, kernel):
 
 @inlined
 def count_instance(fits, pair, distance, products, reward, terminated, kernel, sign):
-    """Add an instance to a pair's sums, or take it out of them (``sign`` -1).
-
-    :param distance: from the pair's point, squared
-    :param products: of the instance
-    :return: by how much the two sums of weights have grown, in parts of them
-    """
+    """Add an instance at a squared distance to a pair's sums (``sign`` -1: take it out); by which parts these have grown."""
     weight = sign * np.exp(distance * fits.scale[pair])
     sums = fits.sums[pair]
     add_products(sums, weight, products)
@@ -66,10 +60,7 @@ def count_instance(fits, pair, distance, products, reward, terminated, kernel, s
 
 @inlined
 def unexplained_effect(fit, outcome, k):
-    """The part of effect ``k`` that a linear fit leaves unexplained of the instances nearest to a state.
-
-    :param outcome: as in :class:`LinearFits`
-    """
+    """The part of effect ``k`` that a linear fit leaves unexplained of the instances nearest to a state."""
     d = (len(outcome) - 3) // 2
     effect = outcome[3 + d + k] - fit[k] * outcome[0]
     for j in range(d):
@@ -77,41 +68,27 @@ def unexplained_effect(fit, outcome, k):
     return effect / (outcome[0] + EXPLAINED_WEIGHT)
 
 
-@inlined
-def measure_blocks(instances, action, at):
-    """Measure how far the blocks of an action's instances are; how many blocks there are."""
-    n_blocks = (instances.size[action] + BLOCK - 1) // BLOCK
-    measure_gaps(at, instances.block_low[action], instances.block_high[action], instances.periodic, n_blocks, instances.gap)
-    return n_blocks
-
-
 @inner
 def recount(instances, fits, pair, action, kernel, left_out, scratch):
-    """Compute a pair's sums anew from the instances that count, in their order.
-
-    :param left_out: number of an instance that does not count; -1 for none
-    :param scratch: ``at`` is where the pair's point is
-    :return: the sum of their weights (of the kernel that decides what is known)
-    """
+    """Compute a pair's sums anew from all instances that count but ``left_out``; the weight that decides what is known."""
     fits.sums[pair, :] = 0.0
     fits.outcome[pair, :] = 0.0
     fits.n_ended[pair] = 0
     fits.scale[pair] = narrowed(fits.reach[pair], kernel)
     reach = fits.reach[pair]
-    n_blocks = measure_blocks(instances, action, scratch.at)
     products = scratch.products[1]
     wraps = any_periodic(instances.periodic)
     count = np.int64(0)
     total = 0.0
-    for block in range(n_blocks):
+    for block in range(measure_blocks(instances, action, scratch.at)):
         if instances.gap[block] > reach * (1 + 1e-12):
             continue
         for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
             distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
             if distance > reach or i == left_out:
                 continue
-            bring_near(instances.state[action, i], scratch.at, instances.periodic, scratch.state)
-            products_of(scratch.state, fits.target[action, i], products)
+            bring_near(instances.state[action, i], scratch.at, instances.periodic, scratch.counted)
+            products_of(scratch.counted, fits.target[action, i], products)
             reward, terminated = instances.reward[action, i], instances.terminated[action, i]
             count_instance(fits, pair, distance, products, reward, terminated, kernel, 1.0)
             total += np.exp(distance * kernel.counting_scale)
@@ -122,38 +99,14 @@ def recount(instances, fits, pair, action, kernel, left_out, scratch):
 
 @inner
 def narrow(instances, fits, pair, action, kernel, left_out, scratch):
-    """Let only the ``n_neighbors`` nearest instances of a pair count, and those as near as the last of them.
-
-    :param left_out: as in :func:`recount`
-    """
-    reach = fits.reach[pair]
-    n_blocks = measure_blocks(instances, action, scratch.at)
-    nearest = scratch.nearest
-    wraps = any_periodic(instances.periodic)
-    length = 0
-    for block in range(n_blocks):
-        if instances.gap[block] > reach * (1 + 1e-12):
-            continue
-        for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
-            distance = squared_distance(scratch.at, instances.state[action, i], instances.periodic, wraps)
-            if distance > reach or i == left_out:
-                continue
-            k = length if length < kernel.n_neighbors else length - 1
-            if length == kernel.n_neighbors:
-                if distance >= nearest[k]:
-                    continue
-            else:
-                length += 1
-            while k > 0 and nearest[k - 1] > distance:
-                nearest[k] = nearest[k - 1]
-                k -= 1
-            nearest[k] = distance
-            if length == kernel.n_neighbors:
-                reach = nearest[length - 1]
-    fits.reach[pair] = reach
+    """Let only the ``n_neighbors`` nearest instances of a pair count, and those as near as the last of them."""
+    nearest, n = scratch.nearest, kernel.n_neighbors
+    length = nearest_instances(instances, action, scratch.at, fits.reach[pair], scratch.item, nearest, 0, left_out)
+    if length == n:
+        fits.reach[pair] = nearest[length - 1]
     recount(instances, fits, pair, action, kernel, left_out, scratch)
     # Many instances at one state: to look for narrower kernels again and again would be in vain.
-    n, n_counted = kernel.n_neighbors, fits.n_counted[pair]
+    n_counted = fits.n_counted[pair]
     fits.limit[pair] = max(n + n // 2, 2 * n_counted if n_counted > n + n // 4 else 0)
 
 
@@ -177,10 +130,7 @@ def prediction_moved(fits, pair, action, at, tolerance):
 
 @inlined
 def mean_outcome(outcome, prior, with_prior):
-    """Reward and probability of termination from the narrower sums, and from the prior where these do not suffice.
-
-    :param with_prior: the prior claims to know them, and the target's own instances make nothing known
-    """
+    """Reward and probability of termination from the narrower sums, and from the prior where these do not suffice."""
     d = len(prior) - 2
     weight = PRIOR_OUTCOME_WEIGHT if with_prior else 0.0
     total = outcome[0] + weight

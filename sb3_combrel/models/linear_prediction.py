@@ -5,104 +5,49 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
-from sb3_combrel.common.instances import BLOCK, Instances
-from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
-from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.kernels import nearest_instances
+from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.compiled_model import add_to_prediction, total_weight
 from sb3_combrel.models.fit_arrays import Kernel
 from sb3_combrel.models.linear_fits import PRIOR_WEIGHT, RIDGE, mean_outcome, narrowed, unexplained_effect
+from sb3_combrel.planning.grid import GridArrays, corners_of
 from sb3_combrel.planning.q_values import Prediction
 
 
 class NearestLists(NamedTuple):
-    """The nearest instances at an exact state, one row an action, and work space for fits.
+    """The nearest instances at an exact state, one row an action, and work space for fits."""
 
-    :param item: int32, shape (n_actions, n_neighbors): instances, nearest first
-    :param distance: float64, same shape: their squared distances
-    :param length: int64, shape (n_actions,)
-    :param state: float64, shape (n_variables,)
-    :param products: float64, shape (2, n_products): sums, and of one instance
-    :param factor: float64, shape (n_variables, n_variables); ``fit`` and ``outcome``: as in ``LinearFits``, of one pair
-    """
+    item: np.ndarray  # int32, (n_actions, n_neighbors): instances, nearest first
+    distance: np.ndarray  # float64, the same: their squared distances
+    length: np.ndarray  # int64, (n_actions,)
+    state: np.ndarray  # float64, (n_variables,)
+    products: np.ndarray  # float64, (2, n_products): sums, and of one instance
+    factor: np.ndarray  # float64, (n_variables, n_variables)
+    fit: np.ndarray  # as in LinearFits, of one pair
+    outcome: np.ndarray  # as in LinearFits, of one pair
 
-    item: np.ndarray
-    distance: np.ndarray
-    length: np.ndarray
-    state: np.ndarray
-    products: np.ndarray
-    factor: np.ndarray
-    fit: np.ndarray
-    outcome: np.ndarray
-
-
-@inlined
-def insert_by_distance(items, distances, length, item, distance):
-    """Put an instance into a full or growing list sorted by distance; its length. Of equal ones the lower number is first."""
-    room = len(items)
-    if length == room:
-        last = distances[room - 1]
-        if distance > last or (distance == last and item > items[room - 1]):
-            return length
-        length -= 1
-    k = length
-    while k > 0 and (distances[k - 1] > distance or (distances[k - 1] == distance and items[k - 1] > item)):
-        distances[k] = distances[k - 1]
-        items[k] = items[k - 1]
-        k -= 1
-    items[k] = item
-    distances[k] = distance
-    return length + 1
-
-
-@part
-def nearest_instances(instances, action, state, farthest, items, distances, n_before):
-    """The nearest instances of ``action``, nearest first, as many as ``items`` has room for.
-
-    What was near at the last query is looked at first; the result does not depend on it.
-
-    :param farthest: squared distance beyond which none counts
-    :param items: int32; receives them. ``distances``: float64; receives their squared distances
-    :param n_before: how many of the last query are in ``items``
-    :return: how many
-    """
-    count = instances.size[action]
-    room = len(items)
-    wraps = any_periodic(instances.periodic)
-    instances.searches[0] += 1
-    search = instances.searches[0]
-    length = np.int64(0)
-    for b in range(n_before):
-        before = np.int64(items[b])
-        if before < count:
-            instances.seen[action, before] = search
-            distance = squared_distance(state, instances.state[action, before], instances.periodic, wraps)
-            if distance <= farthest:
-                length = insert_by_distance(items, distances, length, before, distance)
-    if length == room:
-        farthest = distances[room - 1]
-    n_blocks = (count + BLOCK - 1) // BLOCK
-    measure_gaps(state, instances.block_low[action], instances.block_high[action], instances.periodic, n_blocks, instances.gap)
-    for block in range(n_blocks):
-        if instances.gap[block] > farthest:
-            continue
-        for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
-            if distance > farthest or instances.seen[action, i] == search:
-                continue
-            length = insert_by_distance(items, distances, length, i, distance)
-            if length == room:
-                farthest = distances[room - 1]
-    return length
+    @classmethod
+    def empty(cls, n_actions: int, n_neighbors: int, n_variables: int) -> "NearestLists":
+        """Make room for so many."""
+        d = n_variables
+        return cls(
+            item=np.zeros((n_actions, n_neighbors), dtype=np.int32),
+            distance=np.empty((n_actions, n_neighbors)),
+            length=np.zeros(n_actions, dtype=np.int64),
+            state=np.empty(d),
+            products=np.empty((2, n_products(d))),
+            factor=np.empty((d, d)),
+            fit=np.empty(d + d * d),
+            outcome=np.empty(3 + 2 * d),
+        )
 
 
 @part
 def fit_nearest(instances, target, action, state, kernel, near):
-    """Fit the effect around ``state`` to the instances in ``near``; into ``near.fit``.
-
-    :param target: as in ``LinearFits``
-    :return: sum of their weights (of the kernel that decides what is known)
-    """
+    """Fit the effect around ``state`` to the instances in ``near``, into ``near.fit``; the weight that decides on known."""
     length = near.length[action]
     nearest, last = near.distance[action, 0], near.distance[action, length - 1]
     scale = narrowed(last, kernel) if length == kernel.n_neighbors else kernel.scale
@@ -136,10 +81,9 @@ def fit_nearest(instances, target, action, state, kernel, near):
 
 @inlined
 def enter_mean(prediction, action, near, state, prior, claimed, known, effect_range):
-    """Enter what is predicted of an action: reward, end, and the mean of its successors, within the range of effects.
+    """Enter reward, end, and mean effect of an action, within the range of effects.
 
-    :param prior: float64, shape (n_variables + 2,): effect, reward and end that the prior predicts
-    :param claimed: whether the prior suffices for a model; ``known``: whether the instances do
+    ``claimed``: whether the prior suffices for a model; ``known``: whether the instances do.
     """
     d = len(state)
     if near.length[action] > 0:
@@ -157,16 +101,18 @@ def enter_mean(prediction, action, near, state, prior, claimed, known, effect_ra
         prediction.effect[action, 0, v] = min(max(effect, effect_range[0, action, v]), effect_range[1, action, v])
 
 
-@part
+@compiled
 def predict_own(instances, of_model, state, kernel, threshold, near, prediction):
-    """Predict every action at ``state`` from the instances nearest to it, and from the prior.
+    """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
 
+    :param instances: plain tuple, as ``kernel``, ``near`` and ``prediction``
     :param of_model: (target, effect_range) as in ``LinearFits``; what the prior predicts at ``state``, float64, shape
         (n_actions, n_variables + 2); and whether that suffices for a model, bool, shape (n_actions,)
     :param near: receives these instances; those of the last query make the search shorter
     :param prediction: receives the prediction; an action of less weight than ``threshold`` has no model without the prior
-    :return: the least weight that an action has
     """
+    instances, kernel = Instances(*instances), Kernel(*kernel)
+    near, prediction = NearestLists(*near), Prediction(*prediction)
     target, effect_range, prior, claimed = of_model
     least = np.inf
     for action in range(len(near.length)):
@@ -189,39 +135,36 @@ def predict_own(instances, of_model, state, kernel, threshold, near, prediction)
 
 
 @compiled
-def predict_own_plain(instances, of_model, state, kernel, threshold, near, prediction):
-    """:func:`predict_own` for callers from Python, with plain tuples."""
-    instances, near, prediction = Instances(*instances), NearestLists(*near), Prediction(*prediction)
-    return predict_own(instances, of_model, state, Kernel(*kernel), threshold, near, prediction)
+def join_transferred(transferred, threshold, prediction):
+    """Let transferred instances join the prediction of actions of less weight than ``threshold``; plain tuples."""
+    transferred, prediction = TransferredInstances(*transferred), Prediction(*prediction)
+    for action in range(len(prediction.weight)):
+        own = prediction.weight[action]
+        if own < threshold and transferred.length[action] > 0:
+            total = total_weight(own, transferred, action)
+            for k in range(prediction.length[action]):
+                prediction.probability[action, k] *= own / total
+            prediction.reward[action] *= own / total
+            add_to_prediction(prediction, action, transferred, total)
 
 
 @compiled
-def join_transferred_plain(transferred, threshold, prediction):
-    """Let transferred instances join the prediction of the actions whose own instances weigh less than ``threshold``.
+def interpolate_prior(prior, grid, states, actions, corners, found):
+    """Write the effects that a prior predicts of states and actions, multilinear between the grid points, to ``found``.
 
-    :param transferred: one row an action; plain tuples, as ``prediction``
+    :param prior: as in ``LinearFits``; ``grid``: a plain tuple
+    :param states: unit coordinates, float64, shape (n, n_variables); beyond the grid the nearest point of it counts
+    :param corners: work space: position, corner_index, corner_weight (see ``corners_of``)
     """
-    transferred, prediction = TransferredInstances(*transferred), Prediction(*prediction)
-    for action in range(len(prediction.weight)):
-        n_transferred = transferred.length[action]
-        own = prediction.weight[action]
-        if own >= threshold or n_transferred == 0:
-            continue
-        total = own
-        for j in range(n_transferred):
-            total += transferred.weight[action, j]
-        n = prediction.length[action]
-        for k in range(n):
-            prediction.probability[action, k] *= own / total
-        reward = own / total * prediction.reward[action]
-        for j in range(n_transferred):
-            p = transferred.weight[action, j] / total
-            reward += p * transferred.reward[action, j]
-            if not transferred.terminated[action, j]:
-                prediction.probability[action, n] = p
-                for v in range(prediction.effect.shape[2]):
-                    prediction.effect[action, n, v] = transferred.effect[action, j, v]
-                n += 1
-        prediction.reward[action] = reward
-        prediction.length[action] = n
-        prediction.modelled[action] = True
+    grid = GridArrays(*grid)
+    position, corner, weight = corners
+    d = len(position)
+    n_points = grid.shape[0] * grid.strides[0]
+    for i in range(len(actions)):
+        for k in range(d):
+            position[k] = states[i, k] * grid.cells[k] + grid.margin[k]
+            found[i, k] = 0.0
+        first_pair = actions[i] * n_points
+        for c in range(corners_of(position, grid, corner, weight)):
+            for k in range(d):
+                found[i, k] += weight[c] * prior[first_pair + corner[c], k]

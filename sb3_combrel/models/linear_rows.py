@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, inner, part
+from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.compiled_model import add_to_row, total_weight
 from sb3_combrel.models.fit_arrays import FitScratch, LinearFits
 from sb3_combrel.models.linear_fits import PRIOR_WEIGHT, refit
 from sb3_combrel.planning.grid import GridArrays
@@ -14,18 +15,8 @@ STAYS = 1e-6
 
 
 @inlined
-def predict_from_prior(fits, pair):
-    """Put what the prior predicts into ``fits.row``: no instance counts for the pair."""
-    for k in range(fits.row.shape[1]):
-        fits.row[pair, k] = fits.prior[pair, k]
-
-
-@inlined
 def prior_change(fits, pair, k, grid, at, away):
-    """By how much the prior's effect ``k`` changes from a pair's point to a state, linear between grid points.
-
-    :param at: grid coordinates of the point; ``away``: from there to the state, float64, unit coordinates
-    """
+    """By how much the prior's effect ``k`` changes from a pair's point to ``away`` from there, linear between grid points."""
     change = 0.0
     for j in range(len(at)):
         if away[j] == 0.0:
@@ -43,18 +34,18 @@ def prior_change(fits, pair, k, grid, at, away):
 
 @inner
 def follow(fits, pair, action, grid, at, limits, scratch):
-    """Follow a pair's model from its point, the action held, until a variable has changed by a cell of the grid.
+    """Follow a pair's model, the action held, until a variable has changed by a cell of the grid; the number of steps.
 
     The effect of a step is that of the pair's fit where the step begins, within the range of effects, as at the point itself.
+    The last step is cut short where the cell is left.
 
     :param at: grid coordinates of the point
     :param limits: (max_model_steps, whether there is a prior)
-    :param scratch: ``entering`` receives the displacement
-    :return: number of steps, the last of them cut short where the cell is left
+    :param scratch: ``away`` receives the displacement
     """
     max_steps, has_prior = limits
     d = len(at)
-    away, step, fit = scratch.entering, scratch.step, fits.fit[pair]
+    away, step, fit = scratch.away, scratch.step, fits.fit[pair]
     fitted = fits.n_counted[pair] > 0
     share = fits.sums[pair, 0] / (fits.sums[pair, 0] + PRIOR_WEIGHT) if fits.claimed[pair] else 1.0
     low, high = fits.effect_range[0, action], fits.effect_range[1, action]
@@ -107,7 +98,7 @@ def write_row(fits, mdp, grid, gamma, pair, limits, scratch, fit_scratch):
         steps = follow(fits, pair, action, grid, scratch.at, limits, fit_scratch)
         discount = gamma**steps
         reward *= steps if gamma == 1.0 else (1.0 - discount) / (1.0 - gamma)
-        n_touched = add_successor(1.0, fit_scratch.entering, scratch, grid, n_touched)
+        n_touched = add_successor(1.0, fit_scratch.away, scratch, grid, n_touched)
     elif end < 1.0:
         n_touched = add_successor(1.0 - end, row[:d], scratch, grid, n_touched)
     return finish_row(mdp, discount, pair, point, reward, n_touched, scratch)
@@ -115,39 +106,30 @@ def write_row(fits, mdp, grid, gamma, pair, limits, scratch, fit_scratch):
 
 @inner
 def write_row_with_transferred(fits, mdp, grid, gamma, pair, transferred, asked, scratch):
-    """Write the row of a pair that is not known from its own instances and transferred ones; False if there is no room.
-
-    :param asked: row of the pair in ``transferred``
-    """
-    d = len(grid.shape)
+    """Write the row of a pair that is not known from its own and transferred instances; False if there is no room."""
     own = fits.total[pair] if fits.n_counted[pair] > 0 else 0.0
-    total = own
-    for j in range(transferred.length[asked]):
-        total += transferred.weight[asked, j]
+    total = total_weight(own, transferred, asked)
     reward = 0.0
     n_touched = np.int64(0)
     if own > 0.0:
-        row = fits.row[pair]
+        row, d = fits.row[pair], len(grid.shape)
         reward = own / total * row[d]
         if row[d + 1] < 1.0:
             n_touched = add_successor(own / total * (1.0 - row[d + 1]), row[:d], scratch, grid, n_touched)
-    for j in range(transferred.length[asked]):
-        p = transferred.weight[asked, j] / total
-        reward += p * transferred.reward[asked, j]
-        if not transferred.terminated[asked, j]:
-            n_touched = add_successor(p, transferred.effect[asked, j], scratch, grid, n_touched)
+    reward, n_touched = add_to_row(reward, n_touched, transferred, asked, total, scratch, grid)
     return finish_row(mdp, gamma, pair, pair % len(mdp.n_optimistic), reward, n_touched, scratch)
 
 
-@part
+@compiled
 def update_rows(fits, mdp, grid, planned, pairs, transferred, scratch, fit_scratch):
-    """Bring the rows of ``pairs`` up to date with their fits and with transferred instances.
+    """Bring rows up to date with the pairs' fits and with transferred instances; how many are done.
 
-    :param planned: (gamma, max_model_steps, whether there is a prior)
+    :param planned: (gamma, max_model_steps, whether there is a prior); plain tuples for the rest
     :param pairs: (pairs, how many of them are done)
     :param transferred: a row for each of them, which counts only while the pair is not known
-    :return: how many of them are done; fewer than all if there is no room in the MDP
     """
+    fits, mdp, grid, transferred = LinearFits(*fits), as_mdp(mdp), GridArrays(*grid), TransferredInstances(*transferred)
+    scratch, fit_scratch = RowScratch(*scratch), FitScratch(*fit_scratch)
     pairs, done = pairs
     gamma, max_steps, has_prior = planned
     n_points = len(mdp.n_optimistic)
@@ -158,7 +140,8 @@ def update_rows(fits, mdp, grid, planned, pairs, transferred, scratch, fit_scrat
         if modelled:
             coordinates_of(pair % n_points, grid, scratch.at)
             if fits.n_counted[pair] == 0:
-                predict_from_prior(fits, pair)
+                for k in range(fits.row.shape[1]):
+                    fits.row[pair, k] = fits.prior[pair, k]
             elif fits.unexplained[pair] == np.inf:
                 refit(fits, pair, pair // n_points, grid, fit_scratch, 0.0)
             if with_transferred:
@@ -172,10 +155,3 @@ def update_rows(fits, mdp, grid, planned, pairs, transferred, scratch, fit_scrat
         set_modelled(mdp, pair, modelled)
         done += 1
     return done
-
-
-@compiled
-def update_rows_plain(fits, mdp, grid, planned, pairs, transferred, scratch, fit_scratch):
-    """:func:`update_rows` for callers from Python, with plain tuples."""
-    fits, grid, scratch, fit_scratch = LinearFits(*fits), GridArrays(*grid), RowScratch(*scratch), FitScratch(*fit_scratch)
-    return update_rows(fits, as_mdp(mdp), grid, planned, pairs, TransferredInstances(*transferred), scratch, fit_scratch)

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import n_products
 from sb3_combrel.common.periodic import differences
-from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
 from sb3_combrel.models.fit_arrays import FitScratch, Kernel, LinearFits
-from sb3_combrel.models.fit_updates import LEAST_SCALE, enter_plain, leave, recount_pairs, recount_totals, refit_changed
-from sb3_combrel.models.linear_prediction import NearestLists, join_transferred_plain, predict_own_plain
-from sb3_combrel.models.linear_rows import update_rows_plain
-from sb3_combrel.models.prior_effects import interpolate_prior_plain
+from sb3_combrel.models.fit_updates import LEAST_SCALE, enter, leave, recount_pairs, recount_totals, refit_changed
+from sb3_combrel.models.linear_prediction import NearestLists, interpolate_prior, join_transferred, predict_own
+from sb3_combrel.models.linear_rows import update_rows
 from sb3_combrel.planning.mdp import FiniteMDP
-from sb3_combrel.planning.q_values import Prediction
 
 # Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
 # values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
@@ -26,18 +26,16 @@ from sb3_combrel.planning.q_values import Prediction
 ON_GRID = 0.5
 # As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, known is decided
 # by a kernel of half the squared breadth: a broad kernel knows soon how states change, and would never find a small goal. To
-# demand more weight instead would send the agent to where it has been first (point robot: in half of the runs no goal).
-# The second and later times nearly all must be known: the agent goes to the nearest of what is not, and each time begins anew
-# near where episodes start. With 0.9 as well it had not been to the last tenth, where the goal is, after 8,000 steps in five
-# of 28 runs of the point robot; now all find it, the last after 3,395.
+# demand more weight instead would send the agent to where it has been first. The second and later times nearly all must be
+# known: the agent goes to the nearest of what is not, and each time begins anew near where episodes start.
 EXPLORED, EXPLORED_AGAIN, CHECKED_EVERY = 0.9, 0.99, 50
-# In a damaged file there may be anything.
+# Whatever a file says.
 MAX_NARROWING = 2.0**20
 
-_enter, _leave, _recount = EntryPoint(enter_plain), EntryPoint(leave), EntryPoint(recount_pairs)
-_update_rows, _predict_own = EntryPoint(update_rows_plain), EntryPoint(predict_own_plain)
+_enter, _leave, _recount = EntryPoint(enter), EntryPoint(leave), EntryPoint(recount_pairs)
+_update_rows, _predict_own = EntryPoint(update_rows), EntryPoint(predict_own)
 _refit_changed, _recount_totals = EntryPoint(refit_changed), EntryPoint(recount_totals)
-_join_transferred, _interpolate_prior = EntryPoint(join_transferred_plain), EntryPoint(interpolate_prior_plain)
+_join_transferred, _interpolate_prior = EntryPoint(join_transferred), EntryPoint(interpolate_prior)
 
 
 class LocalLinear(CompiledModel):
@@ -56,10 +54,10 @@ class LocalLinear(CompiledModel):
     than those that are interpolated once a step (Munos & Moore 2002). Where an instance near the point has ended an episode
     it is one step.
 
-    On the grid, the sums of each pair's regression are kept: an instance is added to those of all pairs that it reaches, and
-    the regression is solved again only where the instances since the last time contradict it. When a pair has half as many
-    again as ``n_neighbors`` its kernel narrows, and the sums are computed anew. With ``max_instances``, the nearest instance
-    of the same action is replaced; a pair that has less than half of ``n_neighbors`` left by that gets a broader kernel again.
+    On the grid, the sums of each pair's regression are kept, and it is solved again where new instances contradict it. When a
+    pair has half as many again as ``n_neighbors`` its kernel narrows, and the sums are computed anew. With ``max_instances``,
+    the nearest instance of the same action is replaced; a pair with less than half of ``n_neighbors`` left gets a broader
+    kernel again.
 
     With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and pairs
     that it claims to know are modelled before their own instances suffice. The prior's effects are those at the grid points,
@@ -98,7 +96,7 @@ class LocalLinear(CompiledModel):
                 n_ended=np.zeros(n_pairs, dtype=np.int32),
                 limit=np.full(n_pairs, n_near + n_near // 2, dtype=np.int32),
                 total=self.own_weight,
-                last_total=np.zeros(n_pairs),
+                last_total=self.last_weight,
                 refitted=np.zeros(n_pairs, dtype=np.bool_),
                 clipped=np.zeros(n_pairs, dtype=np.bool_),
                 known=self.known,
@@ -111,11 +109,13 @@ class LocalLinear(CompiledModel):
         )
         self._scratch = FitScratch(
             at=np.empty(d),
-            entering=np.empty(d),
             state=np.empty(d),
+            counted=np.empty(d),
+            away=np.empty(d),
             step=np.empty(d),
             products=np.empty((2, n_products(d))),
             factor=np.empty((d, d)),
+            item=np.empty(n_near, dtype=np.int32),
             nearest=np.empty(n_near),
             along=np.empty((d, int(grid.arrays.shape.max()))),
             span=np.empty((3, d), dtype=np.int64),
@@ -129,16 +129,7 @@ class LocalLinear(CompiledModel):
         self._range_before = self.fits.effect_range[:2].copy()
         self._planned = self.mdp.gamma, settings.max_model_steps, self._prior is not None
         self._renew_targets()
-        self._near = NearestLists(
-            item=np.empty((self.n_actions, n_near), dtype=np.int32),
-            distance=np.empty((self.n_actions, n_near)),
-            length=np.zeros(self.n_actions, dtype=np.int64),
-            state=np.empty(d),
-            products=np.empty((2, n_products(d))),
-            factor=np.empty((d, d)),
-            fit=np.empty(d + d * d),
-            outcome=np.empty(3 + 2 * d),
-        )
+        self._near = NearestLists.empty(self.n_actions, n_near, d)
         self._plain_near = tuple(self._near)
         self._prior_version = -1
         # Whether an outcome has told states apart.
@@ -148,9 +139,8 @@ class LocalLinear(CompiledModel):
         self._n_added = 0
         self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
         self._all_actions = np.arange(self.n_actions)
+        self._own_room = 1
         self._make_prediction(1)
-
-    # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
 
     def _set_fits(self, fits: LinearFits) -> None:
         self.fits, self._plain_fits = fits, tuple(fits)
@@ -199,12 +189,20 @@ class LocalLinear(CompiledModel):
             self._set_fits(self.fits._replace(target=target))
         return size, NO_PAIRS
 
-    def _prior_at(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the prior predicts: effects, reward and end, shape (n, n_variables + 2); and whether it claims to know."""
+    def _prior_at(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the prior predicts of all actions at a state, as in ``LinearFits``, and whether it claims to know.
+
+        The effects are those at the grid points, see :meth:`_prior_effects`; the source's own at the state are not used.
+        """
         if self._prior is None:
             return self._no_prior
-        given = self._prior.prior(states, actions)
-        return np.column_stack([given.effect, given.reward, given.end]), given.weight >= self.settings.exploration_threshold
+        states = np.repeat(state[None], self.n_actions, axis=0)
+        given = self._prior.prior(states, self._all_actions)
+        effects = self._prior_effects(states, self._all_actions)
+        return np.column_stack([effects, given.reward, given.end]), self._claims(given)
+
+    def _claims(self, given: PriorPredictions) -> np.ndarray:
+        return given.weight >= self.settings.exploration_threshold
 
     def _prior_effects(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The prior's effects, multilinear between the grid points: shape (n, n_variables); without a prior, rows of zeros.
@@ -226,10 +224,17 @@ class LocalLinear(CompiledModel):
         points = self.grid.points()
         for action in range(self.n_actions):
             pairs = slice(action * n_points, (action + 1) * n_points)
-            fits.prior[pairs], fits.claimed[pairs] = self._prior_at(points, np.full(n_points, action))
-        self._renew_targets()
-        _recount.call(self.instances, fits, self.grid.arrays, self._kernel, self._threshold_on_grid(), self._scratch)
+            given = self._prior.prior(points, np.full(n_points, action))
+            fits.prior[pairs] = np.column_stack([given.effect, given.reward, given.end])
+            fits.claimed[pairs] = self._claims(given)
+        self._recount()
         return np.arange(len(self.known))
+
+    def _recount(self) -> None:
+        """Compute sums and fits of all pairs from the instances."""
+        self._renew_targets()
+        grid, threshold = self.grid.arrays, self._threshold_on_grid()
+        _recount.call(self.instances, self.fits, grid, self._kernel, threshold, self._scratch)
 
     def _renew_targets(self) -> None:
         """Compute what the prior leaves over of each instance's effect, and the range of effects."""
@@ -317,49 +322,20 @@ class LocalLinear(CompiledModel):
         self._range_before = effect_range.copy()
         return changed[:n]
 
-    def outdated(self) -> np.ndarray:
-        return np.flatnonzero(~self.fits.known & (self.fits.total != self.fits.last_total))
-
-    def update_rows(self, pairs: np.ndarray) -> None:
-        mdp = self.mdp
-        transferred = tuple(self._transferred_to(pairs))
-        done = 0
-        while done < len(pairs):
-            query, scratch = (pairs, done), mdp.plain_scratch
-            done = _update_rows.call(
-                self._plain_fits, mdp.plain, self.grid.plain, self._planned, query, transferred, scratch, self._plain_scratch
-            )
-            if done < len(pairs):
-                mdp.make_room()
+    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
+        mdp, planned, scratch = self.mdp, self._planned, self._plain_scratch
+        of_mdp, grid = mdp.plain, self.grid.plain
+        return int(_update_rows.call(self._plain_fits, of_mdp, grid, planned, pairs, transferred, mdp.plain_scratch, scratch))
 
     def _predict_own(self, state: np.ndarray) -> float:
-        """Fill the prediction from the own instances; the least weight that an action has."""
-        if self._prior is None:
-            prior, claimed = self._no_prior
-        else:
-            states = np.repeat(state[None], self.n_actions, axis=0)
-            prior, claimed = self._prior_at(states, self._all_actions)
-            prior[:, : self.grid.n_variables] = self._prior_effects(states, self._all_actions)
-        of_model = self.fits.target, self.fits.effect_range, prior, claimed
-        near, prediction = self._plain_near, self._plain_prediction
-        threshold = self.exploration_threshold
+        of_model = self.fits.target, self.fits.effect_range, *self._prior_at(state)
+        near, prediction, threshold = self._plain_near, self._plain_prediction, self.exploration_threshold
         return float(
             _predict_own.call(self._plain_instances, of_model, state, self._plain_kernel, threshold, near, prediction)
         )
 
-    def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
-        if self._predict_own(state) >= self.exploration_threshold or self._giver is None:
-            return self._prediction, None
-        actions = self._all_actions
-        states = np.repeat(state[None], self.n_actions, axis=0)
-        given = self._giver.transferred(states, actions, self._prediction.weight)
-        self._check(given, self._prediction.weight)
-        room = 1 + given.weight.shape[1]
-        if room > self._prediction.probability.shape[1]:
-            self._make_prediction(room)
-            self._predict_own(state)
+    def _join_transferred(self, given: TransferredInstances) -> None:
         _join_transferred.call(tuple(given), self.exploration_threshold, self._plain_prediction)
-        return self._prediction, given
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {
@@ -387,8 +363,7 @@ class LocalLinear(CompiledModel):
         fits.known[:] = state["known"] > 0.5
         self._set_fits(fits._replace(target=np.empty_like(instances.effect)))
         if len(self.renew_prior()) == 0:
-            self._renew_targets()
-            _recount.call(self.instances, self.fits, self.grid.arrays, self._kernel, self._threshold_on_grid(), self._scratch)
+            self._recount()
         fits.total[:] = state["total"]
         self.update_all_rows()
         self._range_before = fits.effect_range[:2].copy()

@@ -1,13 +1,9 @@
 """Corrections of the interpolated value function where the agent makes no progress, in the manner of LRTA*.
 
-Between grid points the interpolated value can be far too high: at a joint limit or a wall the grid points beyond were fitted
-to instances that moved freely. Acting greedily on it can keep an agent in place for ever. A state to which the agent has
-returned ``MAX_VISITS`` times within an episode is such a place. There, when the interpolated value exceeds the best action
-value, that action value is stored and caps the value of states in the same small cell. Each further visit lowers the cap,
-until another action looks better.
-
-Where the agent does make progress nothing is corrected: values that are right along the path taken and too high beside it
-would make every other path look better than the one that works.
+Between grid points the interpolated value can be far too high, as at a wall, and keep a greedy agent in place for ever. At a
+state to which it has returned ``MAX_VISITS`` times within an episode the best action value is stored, and caps the value of
+states in the same small cell; each further visit lowers the cap, until another action looks better. Elsewhere nothing is
+corrected: values that are right along the path taken and too high beside it would make every other path look better.
 """
 
 from typing import NamedTuple
@@ -26,33 +22,19 @@ VISIT_TABLE_SIZE = 1 << 14
 
 
 class CorrectionArrays(NamedTuple):
-    """Corrected states, found by an open-addressing hash table of the small cells they lie in.
+    """Corrected states, found by an open-addressing hash table of the small cells they lie in."""
 
-    :param table: int32, shape (power of two,): number of a corrected state, -1 for none
-    :param key: int64, shape (capacity,): the cell of each corrected state
-    :param state: float64, shape (capacity, n_variables), unit coordinates: the last state visited in the cell
-    :param value: float64, shape (capacity,): the best action value there
-    :param n_states: int64, shape (1,): how many there are
-    :param visit_key: int64, shape (VISIT_TABLE_SIZE,): cells visited lately, hashed with the number of the episode
-    :param visits: int32, same shape: how often
-    """
-
-    table: np.ndarray
-    key: np.ndarray
-    state: np.ndarray
-    value: np.ndarray
-    n_states: np.ndarray
-    visit_key: np.ndarray
-    visits: np.ndarray
+    table: np.ndarray  # int32, (power of two,): number of a corrected state, -1 for none
+    key: np.ndarray  # int64, (capacity,): the cell of each corrected state
+    state: np.ndarray  # float64, (capacity, n_variables), unit coordinates: the last state visited in the cell
+    value: np.ndarray  # float64, (capacity,): the best action value there
+    n_states: np.ndarray  # int64, (1,): how many there are
+    visit_key: np.ndarray  # int64, (VISIT_TABLE_SIZE,): cells visited lately, hashed with the number of the episode
+    visits: np.ndarray  # int32, (VISIT_TABLE_SIZE,): how often
 
     @classmethod
     def empty(cls, n_variables: int, capacity: int = 256) -> "CorrectionArrays":
-        """
-        Make room for corrections.
-
-        :param n_variables: number of state variables
-        :param capacity: how many there is room for, a power of two
-        """
+        """Make room for ``capacity`` corrections, a power of two."""
         return cls(
             table=np.full(4 * capacity, -1, dtype=np.int32),
             key=np.empty(capacity, dtype=np.int64),
@@ -65,11 +47,7 @@ class CorrectionArrays(NamedTuple):
 
     @classmethod
     def of_rows(cls, rows: np.ndarray) -> "CorrectionArrays":
-        """
-        Build them from :meth:`rows`; of rows with the same key the last one is found.
-
-        :param rows: float64, shape (n, 2 + n_variables)
-        """
+        """Build them from :meth:`rows`; of rows with the same key the last one is found."""
         n = len(rows)
         capacity = 256
         while capacity < n:
@@ -86,13 +64,8 @@ class CorrectionArrays(NamedTuple):
         return np.column_stack([self.key[:n], self.value[:n], self.state[:n]])
 
     def with_room(self) -> "CorrectionArrays":
-        """
-        Double the room if one more state would not fit.
-
-        :return: itself, or a copy with the same corrections
-        """
-        capacity = len(self.key)
-        n = int(self.n_states[0])
+        """Itself, or a copy with twice the room if one more state would not fit."""
+        capacity, n = len(self.key), int(self.n_states[0])
         if n < capacity:
             return self
         larger = CorrectionArrays.empty(self.state.shape[1], 2 * capacity)
@@ -104,16 +77,12 @@ class CorrectionArrays(NamedTuple):
 
 
 class ValueScratch(NamedTuple):
-    """Work space for values between grid points.
+    """Work space for values between grid points."""
 
-    :param position: float64, shape (n_variables,), grid coordinates; ``corrected``: the same
-    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
-    """
-
-    position: np.ndarray
-    corrected: np.ndarray
-    corner_index: np.ndarray
-    corner_weight: np.ndarray
+    position: np.ndarray  # float64, (n_variables,): grid coordinates
+    corrected: np.ndarray  # float64, (n_variables,): those of a corrected state
+    corner_index: np.ndarray  # int64, (2 ** n_variables,)
+    corner_weight: np.ndarray  # float64, (2 ** n_variables,)
 
     @classmethod
     def for_variables(cls, n_variables: int) -> "ValueScratch":
@@ -184,10 +153,7 @@ def cap_value(value, m, values, corrections, grid, scratch):
 
 @part
 def count_visit(corrections, key, episode):
-    """How often the cell was visited in this episode, this visit included.
-
-    A direct-mapped table: where two cells share a place, the count of the later one starts at 1.
-    """
+    """How often the cell was visited in this episode; where two cells share a place, the later one begins at 1."""
     tagged = key * 1000003 + episode
     at = (tagged * 0x9E3779B1 >> 7) & (VISIT_TABLE_SIZE - 1)
     if corrections.visit_key[at] != tagged:
@@ -199,9 +165,8 @@ def count_visit(corrections, key, episode):
 
 @part
 def visit(values, corrections, state, best_q, visitor, grid, scratch):
-    """Count a visit to ``state``; renew the correction of its cell, or add one (see the module).
+    """Count a visit to ``state``, whose largest action value is ``best_q``; renew the correction of its cell, or add one.
 
-    :param best_q: the largest action value at ``state``
     :param visitor: (episode, tolerance, max_visits): a number that tells episodes (of all environments) apart; the excess
         of the interpolated value that is not corrected; visits in an episode before which nothing is
     """

@@ -14,20 +14,24 @@ from sb3_combrel.common.periodic import flag_array
 class GridArrays(NamedTuple):
     """What compiled code needs to know of a grid.
 
-    :param shape: int64, shape (n_variables,): points along each variable
-    :param strides: int64, same shape: what one step along a variable adds to a point's number
-    :param cells: float64, same shape: cells per unit
-    :param margin: float64, same shape: cells beyond either end of the unit box
-    :param periodic: bool, same shape: the last point along a variable is a cell away from the first; it has no margin
-
     A state with unit coordinates u has *grid coordinates* u * cells + margin: whole numbers at the grid points.
     """
 
-    shape: np.ndarray
-    strides: np.ndarray
-    cells: np.ndarray
-    margin: np.ndarray
-    periodic: np.ndarray
+    shape: np.ndarray  # int64, (n_variables,): points along each variable
+    strides: np.ndarray  # int64, (n_variables,): what one step along a variable adds to a point's number
+    cells: np.ndarray  # float64, (n_variables,): cells per unit
+    margin: np.ndarray  # float64, (n_variables,): cells beyond either end of the unit box
+    # The last point along a periodic variable is a cell away from the first; it has no margin.
+    periodic: np.ndarray  # bool, (n_variables,)
+
+
+@inlined
+def unit_coordinates_of(point, grid, at):
+    """Write the unit coordinates of a grid point to ``at``."""
+    for k in range(len(at)):
+        along = point // grid.strides[k]
+        point -= along * grid.strides[k]
+        at[k] = (along - grid.margin[k]) / grid.cells[k]
 
 
 @inlined
@@ -40,12 +44,10 @@ def wrapped(at, n):
 
 @inlined
 def corners_of(position, grid, corner_index, corner_weight):
-    """Grid points around ``position`` and their multilinear weights.
+    """Write the grid points around ``position`` and their multilinear weights; how many have a weight above 0.
 
     :param position: float64, shape (n_variables,): grid coordinates; wrapped or clipped into the grid
-    :param corner_index: int64 scratch, shape (2 ** n_variables,)
-    :param corner_weight: float64 scratch of the same shape
-    :return: how many corners have a weight above 0
+    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
     """
     corner_index[0] = 0
     corner_weight[0] = 1.0
@@ -88,11 +90,11 @@ def interpolate_once(values, position, grid, corner_index, corner_weight):
 
 
 class StateGrid:
-    """A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
+    """
+    A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
 
-    Effects are relative, so a predicted successor can lie outside the box. In the margin it has a value of its own;
-    beyond that it counts as the nearest point of the grid. Along a periodic variable the grid has no end: there are
-    2**resolution points and no margin.
+    In the margin a predicted successor outside the box has a value of its own; beyond that it counts as the nearest point.
+    Along a periodic variable there are 2**resolution points and no margin.
 
     :param n_variables: number of state variables
     :param resolution: one number for all variables, or one for each
@@ -127,34 +129,18 @@ class StateGrid:
         return self.states_of(np.arange(self.n_points))
 
     def states_of(self, points: np.ndarray) -> np.ndarray:
-        """
-        Some grid points.
-
-        :param points: their numbers, int64, shape (n,)
-        :return: unit coordinates, shape (n, n_variables)
-        """
+        """Unit coordinates, shape (n, n_variables), of grid points given by their numbers."""
         coordinates = np.stack(np.unravel_index(points, tuple(self.arrays.shape)), axis=-1)
         return (coordinates - self.arrays.margin) / self.arrays.cells
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
-        """Multilinear interpolation.
-
-        :param values: at the grid points, shape (n_points,)
-        :param state: unit coordinates, shape (n_variables,); outside the grid the nearest point of it counts
-        """
+        """Multilinear interpolation of values at the grid points at a state; outside the grid its nearest point counts."""
         position = state * self.arrays.cells + self.arrays.margin
         return interpolate_once(values, position, self.arrays, self._corner_index, self._corner_weight)
 
 
 def default_resolution(n_variables: int, reach: float) -> int:
-    """A resolution of use: as fine as is cheap, and a cell's diagonal must not exceed the kernel's reach.
-
-    A grid point farther than the reach from every state that can be visited in its cell would stay optimistic for
-    ever. Interpolation spreads values over a cell at every step, so plans look shorter than they are on a coarse grid:
-    up to two variables a fine one costs next to nothing.
-
-    :param reach: distance at which the kernel falls to ``min_weight``, unit coordinates
-    """
+    """As fine as is cheap, and a cell's diagonal no longer than the kernel's reach, or points may stay optimistic for ever."""
     finest_that_is_cheap = {1: 6, 2: 6, 3: 4}.get(n_variables, 3)
     return max(finest_that_is_cheap, coarsest_in_reach(n_variables, reach))
 
@@ -180,8 +166,8 @@ def fitting_grid(
 ) -> StateGrid:
     """The grid for a task: of the given resolution, or of one that suits the kernel.
 
-    Up to two variables it has a margin of one cell, as the original has states outside the box: there it finds the
-    shorter of two plans more often. With more variables the margin would double the grid for little.
+    Up to two variables it has a margin of one cell, as the original has states outside the box; with more it would double the
+    grid for little.
 
     :param periodic: one bool for each state variable; None: none is periodic
     :raises ValueError: if the grid would not fit in memory

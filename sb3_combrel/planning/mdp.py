@@ -16,21 +16,15 @@ NEVER_LEAVES = 1e-9
 
 
 class MDPArrays(NamedTuple):
-    """The finite MDP for compiled code.
+    """The finite MDP for compiled code."""
 
-    :param rows: successors of each pair: the *other* grid points that it leads to, with discounted probabilities
-        (see :func:`finish_row`)
-    :param predecessors: for each grid point those whose rows have led to it, with a bound on that probability
-    :param reward: float64, shape (n_pairs,): reward of the pair until its state is left
-    :param modelled: bool, shape (n_pairs,): the pair has a model
-    :param n_optimistic: int64, shape (n_points,): actions of a grid point that have none
-    """
-
+    # Successors of each pair: the *other* grid points that it leads to, with discounted probabilities (see finish_row).
     rows: ListStore
+    # For each grid point those whose rows have led to it, with a bound on that probability.
     predecessors: ListStore
-    reward: np.ndarray
-    modelled: np.ndarray
-    n_optimistic: np.ndarray
+    reward: np.ndarray  # float64, (n_pairs,): reward of the pair until its state is left
+    modelled: np.ndarray  # bool, (n_pairs,): the pair has a model
+    n_optimistic: np.ndarray  # int64, (n_points,): actions of a grid point that have none
 
     def plain(self) -> tuple[Any, ...]:
         """The same as plain tuples (see ``common.compiled``)."""
@@ -44,23 +38,15 @@ def as_mdp(plain):
 
 
 class RowScratch(NamedTuple):
-    """Work space for the row of one pair.
+    """Work space for the row of one pair."""
 
-    :param at: int64, shape (n_variables,): grid coordinates of the pair's point
-    :param position: float64, shape (n_variables,): grid coordinates of a successor
-    :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
-    :param dense: float64, shape (n_points,), all 0 between calls: probability of each successor
-    :param touched: int64, shape (2 * n_points,): successors with a probability above 0
-    :param before: float64, shape (n_points,), all 0 between calls: the pair's last row
-    """
-
-    at: np.ndarray
-    position: np.ndarray
-    corner_index: np.ndarray
-    corner_weight: np.ndarray
-    dense: np.ndarray
-    touched: np.ndarray
-    before: np.ndarray
+    at: np.ndarray  # int64, (n_variables,): grid coordinates of the pair's point
+    position: np.ndarray  # float64, (n_variables,): grid coordinates of a successor
+    corner_index: np.ndarray  # int64, (2 ** n_variables,)
+    corner_weight: np.ndarray  # float64, (2 ** n_variables,)
+    dense: np.ndarray  # float64, (n_points,), all 0 between calls: probability of each successor
+    touched: np.ndarray  # int64, (2 * n_points,): successors with a probability above 0
+    before: np.ndarray  # float64, (n_points,), all 0 between calls: the pair's last row
 
 
 class FiniteMDP:
@@ -111,9 +97,9 @@ class FiniteMDP:
 
         :param pairs: int64, shape (n,)
         :param modelled: bool, shape (n,): whether each has a model; the others become optimistic
-        :param probability: float64, shape (n, n_successors); what is missing to 1 ends the episode
-        :param effect: float64, shape (n, n_successors, n_variables): displacements, unit coordinates
-        :param reward: float64, shape (n,)
+        :param probability: shape (n, n_successors); what is missing to 1 ends the episode
+        :param effect: shape (n, n_successors, n_variables): displacements, unit coordinates
+        :param reward: shape (n,)
         """
         done = 0
         while done < len(pairs):
@@ -139,8 +125,7 @@ def next_power(weight):
 def note_predecessor(predecessors, to, point, weight):
     """Enter ``point`` among those that lead ``to`` a point with a probability of ``weight``; False if there is no room.
 
-    The next power of two is noted, so that a little more of the same changes nothing: to find a point among the
-    predecessors takes longer than to compute an entry of a row.
+    The next power of two is noted, so that a little more of the same changes nothing.
     """
     weight = next_power(weight)
     start = predecessors.start[to]
@@ -171,8 +156,7 @@ def coordinates_of(point, grid, at):
 def add_successor(p, effect, scratch, grid, n_touched):
     """Add a move by ``effect`` from the grid point at ``scratch.at``, of probability ``p``, to ``scratch.dense``.
 
-    :param n_touched: how many of ``scratch.touched`` are filled
-    :return: how many are now
+    :param n_touched: how many of ``scratch.touched`` are filled; how many are now is returned
     """
     for k in range(len(effect)):
         scratch.position[k] = scratch.at[k] + effect[k] * grid.cells[k]
@@ -188,14 +172,11 @@ def add_successor(p, effect, scratch, grid, n_touched):
 
 @part
 def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
-    """Turn the successors in ``scratch.dense`` into the row of a pair.
+    """Turn the successors in ``scratch.dense`` into the row of a pair; False if there is no room, and nothing is written.
 
     A grid point is often its own successor. Staying is summed as the geometric series it is: reward and probabilities are
     divided by 1 - gamma * P(stay), which leaves the fixed point of the value function as it was and saves most of the
     sweeps. A pair that never leaves gets an infinite reward (of the reward's sign), which the planner cuts to its bounds.
-
-    :param reward: expected reward of the pair
-    :return: False if there is no room, and nothing is written
     """
     if not reserve(mdp.rows, pair, n_touched):
         for t in range(n_touched):
@@ -217,8 +198,7 @@ def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
 def store_row(mdp, pair, point, n_touched, discount, scratch):
     """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and note its point as a predecessor.
 
-    :param discount: 0: the row is left empty
-    :return: False if there is no room for the predecessors; the row is empty then
+    False, and the row is empty, if there is no room for the predecessors; it is left empty if ``discount`` is 0, too.
     """
     slot = mdp.rows.start[pair]
     n_old = mdp.rows.length[pair]
@@ -258,12 +238,7 @@ def set_modelled(mdp, pair, modelled):
 
 @compiled
 def write_rows(mdp, grid, gamma, predictions, done, scratch):
-    """Write the rows of pairs from predictions (see :meth:`FiniteMDP.write_rows`).
-
-    :param predictions: pairs, and of each whether it is modelled, probabilities, effects and reward
-    :param done: how many of the pairs are done
-    :return: how many are now; fewer than all if there is no room
-    """
+    """Write rows from predictions, from number ``done`` on; how many are done, fewer than all if there is no room."""
     pairs, modelled, probability, effect, expected_reward = predictions
     n_points = len(mdp.n_optimistic)
     while done < len(pairs):

@@ -8,27 +8,18 @@ from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.planning.corrections import CorrectionArrays, ValueScratch, corrected_value, visit
 from sb3_combrel.planning.grid import GridArrays, corners_of
-
-NEVER_LEAVES = 1e-9
+from sb3_combrel.planning.mdp import NEVER_LEAVES
 
 
 class Prediction(NamedTuple):
-    """What a model predicts at one state, one row an action. Unit coordinates.
+    """What a model predicts at one state, one row an action. Unit coordinates."""
 
-    :param modelled: bool, shape (n_actions,): the action has a model; the others are optimistic
-    :param weight: float64, shape (n_actions,): weight of the target's own instances behind it
-    :param reward: float64, shape (n_actions,): expected reward
-    :param length: int64, shape (n_actions,): how many successors it has
-    :param probability: float64, shape (n_actions, max_successors); what is missing to 1 ends the episode
-    :param effect: float64, shape (n_actions, max_successors, n_variables): displacement to each successor
-    """
-
-    modelled: np.ndarray
-    weight: np.ndarray
-    reward: np.ndarray
-    length: np.ndarray
-    probability: np.ndarray
-    effect: np.ndarray
+    modelled: np.ndarray  # bool, (n_actions,): the action has a model; the others are optimistic
+    weight: np.ndarray  # float64, (n_actions,): weight of the target's own instances behind it
+    reward: np.ndarray  # float64, (n_actions,): expected reward
+    length: np.ndarray  # int64, (n_actions,): how many successors it has
+    probability: np.ndarray  # float64, (n_actions, max_successors); what is missing to 1 ends the episode
+    effect: np.ndarray  # float64, (n_actions, max_successors, n_variables): displacement to each successor
 
     @classmethod
     def empty(cls, n_actions: int, max_successors: int, n_variables: int) -> "Prediction":
@@ -44,22 +35,14 @@ class Prediction(NamedTuple):
 
 
 class ValueFunction(NamedTuple):
-    """The value of any state.
+    """The value of any state."""
 
-    :param values: float64, shape (n_points,), at the grid points
-    :param corrections: caps on what is interpolated between them
-    :param grid: the grid
-    :param gamma: discount factor
-    :param bounds: (min_value, max_value)
-    :param upper: float64, shape (n_points,): value of an optimistic action at the grid points
-    """
-
-    values: np.ndarray
-    corrections: CorrectionArrays
+    values: np.ndarray  # float64, (n_points,), at the grid points
+    corrections: CorrectionArrays  # caps on what is interpolated between them
     grid: GridArrays
     gamma: float
-    bounds: tuple[float, float]
-    upper: np.ndarray
+    bounds: tuple[float, float]  # min_value, max_value
+    upper: np.ndarray  # float64, (n_points,): value of an optimistic action at the grid points
 
 
 # The same as plain tuples (see ``common.compiled``).
@@ -88,9 +71,6 @@ def q_values(prediction, state, function, q, scratch):
 
     An effect of exactly nothing leads back to the state itself, whose value is the maximum sought, not the
     interpolated one: as in ``finish_row``, staying is summed as a geometric series.
-
-    :param function: a ValueFunction
-    :param q: receives the values, shape (n_actions,)
     """
     n_optimistic = 0
     for action in range(len(q)):
@@ -132,15 +112,16 @@ def optimistic_value(state, function, scratch):
     return value
 
 
-@part
+@compiled
 def evaluate_actions(prediction, state, function, q, visitor, scratch):
-    """Compute the action values at a state, and count and correct the visit there.
+    """Compute the action values at a state, count and correct the visit there; the best action, -1 if several are.
 
-    :param function: a ValueFunction
-    :param q: receives the values, shape (n_actions,)
+    :param q: receives the values, shape (n_actions,); plain tuples for the rest
     :param visitor: see ``corrections.visit``; an episode of -1: the agent is not there, nothing is counted or corrected
-    :return: the best action, -1 if several are
     """
+    prediction, scratch = Prediction(*prediction), ValueScratch(*scratch)
+    values, corrections, grid, gamma, bounds, upper = function
+    function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds, upper)
     q_values(prediction, state, function, q, scratch)
     best = 0
     ties = 0
@@ -155,26 +136,13 @@ def evaluate_actions(prediction, state, function, q, visitor, scratch):
     return -1 if ties > 0 else best
 
 
-@compiled
-def evaluate_actions_plain(prediction, state, function, q, visitor, scratch):
-    """:func:`evaluate_actions` for callers from Python, with plain tuples."""
-    values, corrections, grid, gamma, bounds, upper = function
-    function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds, upper)
-    return evaluate_actions(Prediction(*prediction), state, function, q, visitor, ValueScratch(*scratch))
-
-
-_evaluate_actions = EntryPoint(evaluate_actions_plain)
+_evaluate_actions = EntryPoint(evaluate_actions)
 # An episode that is none: see ``visitor``.
 NOBODY = (-1, 0.0, 0)
 
 
 class QValues:
-    """
-    Action values at exact states, with work space of their own.
-
-    :param n_actions: number of actions
-    :param n_variables: number of state variables
-    """
+    """Action values at exact states, with work space of their own."""
 
     def __init__(self, n_actions: int, n_variables: int):
         self.q = np.empty(n_actions)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
-from sb3_combrel.planning.exploitation import exploitation_sweep
 from sb3_combrel.planning.grid import GridArrays, corners_of
 from sb3_combrel.planning.mdp import FiniteMDP, RowScratch, as_mdp
 
@@ -14,39 +13,23 @@ NOWHERE = np.empty(0)
 
 
 class SweepQueue(NamedTuple):
-    """Grid points that are due for a backup, in a ring, and bounds on what a backup of the others would change.
+    """Grid points that are due for a backup, in a ring, and bounds on what a backup of the others would change."""
 
-    :param ring: int32, shape (n_points,)
-    :param ends: int64, shape (2,): where in the ring the first point is, and how many are queued
-    :param queued: bool, shape (n_points,)
-    :param propagated: float64, shape (n_points,): the value of a point that was last propagated to its predecessors
-    :param priority: float64, shape (n_points,): sum of the changes propagated to a point since its last backup, each times
-        its probability: a bound on the change that a backup would make
-    :param greedy: int16, shape (n_points,): the action that gave the point its value, -1 if none did
-    :param q: float64, shape (n_points, n_actions): Q of each pair when it was last computed
-    :param slack: float64, same shape: how far Q may have moved since, besides ``priority``; inf: by any amount
-    :param upper: float64, shape (n_points,): upper bound of each point's value, and its value while an action is optimistic
-    """
-
-    ring: np.ndarray
-    ends: np.ndarray
-    queued: np.ndarray
-    propagated: np.ndarray
-    priority: np.ndarray
-    greedy: np.ndarray
-    q: np.ndarray
-    slack: np.ndarray
-    upper: np.ndarray
+    ring: np.ndarray  # int32, (n_points,)
+    ends: np.ndarray  # int64, (2,): where in the ring the first point is, and how many are queued
+    queued: np.ndarray  # bool, (n_points,)
+    propagated: np.ndarray  # float64, (n_points,): the value of a point that was last propagated to its predecessors
+    # Sum of the changes propagated to a point since its last backup, each times its probability: a bound on the change that a
+    # backup would make.
+    priority: np.ndarray  # float64, (n_points,)
+    greedy: np.ndarray  # int16, (n_points,): the action that gave the point its value, -1 if none did
+    q: np.ndarray  # float64, (n_points, n_actions): Q of each pair when it was last computed
+    slack: np.ndarray  # float64, the same: how far Q may have moved since, besides ``priority``; inf: by any amount
+    upper: np.ndarray  # float64, (n_points,): upper bound of each point's value, its value while an action is optimistic
 
     @classmethod
     def empty(cls, values: np.ndarray, n_actions: int, upper: np.ndarray) -> "SweepQueue":
-        """
-        Make a queue of no points.
-
-        :param values: at the grid points; they count as propagated
-        :param n_actions: number of actions
-        :param upper: upper bounds; not copied
-        """
+        """Make a queue of no points; ``values`` count as propagated, ``upper`` is not copied."""
         n_points = len(values)
         return cls(
             ring=np.empty(n_points, dtype=np.int32),
@@ -99,8 +82,7 @@ def compute_q(values, mdp, queue, point, action):
 def bellman_backup(values, mdp, queue, point, bounds, tolerance):
     """V(point) = max over a of Q(point, a), Fitted R-Max's backup; the upper bound while an action is optimistic.
 
-    Starts with the action that was best. Of the others, only those are computed that can have become better: rows lie all
-    over the memory, and to read them takes most of the time of planning.
+    Starts with the action that was best; of the others, only those are computed that can have become better.
     """
     priority = queue.priority[point]
     greedy = np.int64(queue.greedy[point])
@@ -160,10 +142,7 @@ def propagate(values, mdp, queue, point, tolerance):
 
 @part
 def backup_around(values, mdp, queue, state, grid, bounds, tolerance, scratch):
-    """Back up the grid points around ``state`` that a change has been propagated to; the number of backups.
-
-    Where the agent is, a value that is too large must be lowered at once: until then the agent stays.
-    """
+    """Back up the grid points around ``state`` that a change has been propagated to, or the agent stays; how many."""
     for k in range(len(state)):
         scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
     backups = 0
@@ -176,19 +155,18 @@ def backup_around(values, mdp, queue, state, grid, bounds, tolerance, scratch):
     return backups
 
 
-@part
+@compiled
 def sweep(values, mdp, queue, grid, limits, changed, around, scratch):
-    """Back up the points of the pairs ``changed``, then the points in the queue, first in, first out.
+    """Back up the points of the pairs ``changed``, then the points in the queue, first in, first out; backups done.
 
     With the largest change first, states from which no known way leads on would be backed up again and again, their
     values falling by a step's reward each time, before any other.
 
-    :param values: float64, shape (n_points,), updated in place
-    :param limits: (bounds, tolerance, max_backups): (min_value, max_value); changes that are not propagated; backups of
-        points in the queue, the others stay there
+    :param values: float64, shape (n_points,), updated in place; then plain tuples
+    :param limits: ((min_value, max_value), tolerance, max_backups: of points in the queue, the others stay there)
     :param around: a state around which all is backed up, unit coordinates; or nothing, shape (0,)
-    :return: backups done
     """
+    mdp, queue, grid, scratch = as_mdp(mdp), SweepQueue(*queue), GridArrays(*grid), RowScratch(*scratch)
     bounds, tolerance, max_backups = limits
     for c in range(len(changed)):
         backup_after_change(values, mdp, queue, changed[c], bounds, tolerance)
@@ -210,20 +188,10 @@ def sweep(values, mdp, queue, grid, limits, changed, around, scratch):
 
 
 @compiled
-def sweep_plain(values, mdp, queue, grid, limits, changed, around, scratch):
-    """:func:`sweep` for callers from Python, with plain tuples."""
-    arrays, grid, scratch = as_mdp(mdp), GridArrays(*grid), RowScratch(*scratch)
-    return sweep(values, arrays, SweepQueue(*queue), grid, limits, changed, around, scratch)
-
-
-@compiled
 def sweep_all(values, mdp, queue, bounds, tolerance, max_passes):
     """Back up all points, up and down the grid in turn, until little changes; predecessors of the rest are queued.
 
-    Points in the order in which their rows lie in memory take a fourth of the time of points here and there: where
-    most of the model is new this converges several times sooner than :func:`sweep`.
-
-    :return: backups done
+    Points in the order in which their rows lie in memory: where most of the model is new this is quicker than :func:`sweep`.
     """
     n_points = len(values)
     backups = 0
@@ -250,7 +218,49 @@ def sweep_all(values, mdp, queue, bounds, tolerance, max_passes):
     return backups
 
 
-_sweep, _sweep_all, _exploitation_sweep = EntryPoint(sweep_plain), EntryPoint(sweep_all), EntryPoint(exploitation_sweep)
+@compiled
+def exploitation_sweep(values, mdp, n_actions, grid, bounds, downwards):
+    """One Gauss-Seidel sweep for evaluation, over the pairs that have a model, without optimism; the largest change.
+
+    A grid point without any such pair takes the least value of its neighbours along the axes: no better than what is
+    known next to it, and so far no worse.
+    """
+    n_points = len(values)
+    largest = 0.0
+    for step in range(n_points):
+        point = n_points - 1 - step if downwards else step
+        if mdp.n_optimistic[point] == n_actions:
+            best = np.inf
+            rest = point
+            for k in range(len(grid.shape)):
+                at = rest // grid.strides[k]
+                rest -= at * grid.strides[k]
+                around = (grid.shape[k] - 1) * grid.strides[k]
+                if at > 0:
+                    best = min(best, values[point - grid.strides[k]])
+                elif grid.periodic[k]:
+                    best = min(best, values[point + around])
+                if at < grid.shape[k] - 1:
+                    best = min(best, values[point + grid.strides[k]])
+                elif grid.periodic[k]:
+                    best = min(best, values[point - around])
+        else:
+            best = bounds[0]
+            for pair in range(point, len(mdp.reward), n_points):
+                if not mdp.modelled[pair]:
+                    continue
+                q = mdp.reward[pair]
+                start = mdp.rows.start[pair]
+                for k in range(start, start + mdp.rows.length[pair]):
+                    q += mdp.rows.weight[k] * values[mdp.rows.item[k]]
+                best = max(best, q)
+            best = min(best, bounds[1])
+        largest = max(largest, abs(best - values[point]))
+        values[point] = best
+    return largest
+
+
+_sweep, _sweep_all, _exploitation_sweep = EntryPoint(sweep), EntryPoint(sweep_all), EntryPoint(exploitation_sweep)
 
 
 class Planner:
@@ -282,7 +292,7 @@ class Planner:
         """
         Back up the points of pairs whose rows have changed, and points in the queue.
 
-        :param pairs: the pairs, int64
+        :param pairs: int64
         :param max_backups: of points in the queue; the others stay there
         :param around: a state, unit coordinates: the grid points around it need not wait
         :return: backups done
@@ -299,12 +309,7 @@ class Planner:
         return int(_sweep_all.call(self.values, self.mdp.arrays, self.queue, self.bounds, self.tolerance, max_passes))
 
     def exploitation_values(self) -> np.ndarray:
-        """
-        Compute values at the grid points without optimism, for evaluation; once for each state of the MDP.
-
-        From the optimistic values downwards: where no known way leads anywhere the values keep falling, so the number
-        of sweeps is bounded.
-        """
+        """Values at the grid points without optimism, for evaluation; computed once for each state of the MDP."""
         if self._exploitation is None:
             mdp = self.mdp
             values = self.values.copy()

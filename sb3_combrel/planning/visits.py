@@ -1,9 +1,8 @@
-"""Visits to cells of the grid where all is known: what ends the optimism of grid points that the agent cannot get nearer to.
+"""Visits to cells of the grid where all is known end the optimism of grid points that the agent cannot get nearer to.
 
-The value of a state is interpolated between the grid points around it. One of these may stay optimistic for ever: no instance
-comes near enough, because nothing leads there, while at the states that the agent visits every action is known. Its
-optimistic value reaches the states beside it all the same, and draws the agent to them again and again. So a grid point
-around which the agent was often enough, with every action known where it was, counts as known from what instances it has.
+One of the grid points around a state may stay optimistic for ever, because nothing leads there, and would draw the agent to
+that state again and again. So a grid point around which the agent was often enough, with every action known where it was,
+counts as known from what instances it has.
 """
 
 import numpy as np
@@ -15,15 +14,13 @@ ENOUGH_VISITS = 3
 
 
 @compiled
-def note_visit_plain(state, weight, threshold, n_optimistic, visits, grid, scratch):
+def note_visit(state, weight, threshold, n_optimistic, visits, grid, scratch):
     """Count a visit to the grid points around ``state`` that have an optimistic action, if every action is known there.
 
     :param weight: float64, shape (n_actions,): of the own instances at ``state``
-    :param n_optimistic: int64, shape (n_points,): how many actions of each point are optimistic
-    :param visits: int32, shape (n_points,)
-    :param scratch: position, corner_index, corner_weight (see ``corners_of``); the points that have been visited often
-        enough are moved to the front of ``corner_index``
-    :return: how many these are
+    :param n_optimistic: int64, shape (n_points,): optimistic actions of each point; ``visits``: int32, same shape
+    :param scratch: position, corner_index, corner_weight (see ``corners_of``)
+    :return: how many points have been visited often enough; they are moved to the front of ``corner_index``
     """
     for action in range(len(weight)):
         if weight[action] < threshold:
@@ -43,16 +40,11 @@ def note_visit_plain(state, weight, threshold, n_optimistic, visits, grid, scrat
     return found
 
 
-_note_visit = EntryPoint(note_visit_plain)
+_note_visit = EntryPoint(note_visit)
 
 
 class Visits:
-    """
-    Counts visits to grid points that have an optimistic action.
-
-    :param n_variables: number of state variables
-    :param n_points: number of grid points
-    """
+    """Counts visits to grid points that have an optimistic action."""
 
     def __init__(self, n_variables: int, n_points: int):
         self.counts = np.zeros(n_points, dtype=np.int32)
@@ -66,8 +58,7 @@ class Visits:
         Count a visit.
 
         :param state: unit coordinates, shape (n_variables,)
-        :param weight: of the own instances of each action there, shape (n_actions,)
-        :param threshold: weight that makes an action known
+        :param weight: of the own instances of each action there, shape (n_actions,); ``threshold``: what makes one known
         :param n_optimistic: optimistic actions of each grid point, shape (n_points,)
         :param grid: ``StateGrid.plain``
         :return: grid points that have an optimistic action and have been visited often enough, int64

@@ -15,8 +15,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.transfer.report import NotBoundError, TransferReport
 
 if TYPE_CHECKING:
-    from sb3_combrel.common.prior import PriorPredictions
-    from sb3_combrel.common.transferred import TransferredInstances
+    from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 
 
 #: What an algorithm, or this package, calls of a transfer method; ``dir`` leaves it out.

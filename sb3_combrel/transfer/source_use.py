@@ -8,8 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidate, MappedVariables

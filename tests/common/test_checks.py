@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.common.checks import as_count, check_count, count_text
@@ -16,6 +16,7 @@ def test_as_count_refuses_what_is_no_count_and_names_it(value):
         as_count("n_things", value, max=1000, why_max="so many fit")
 
 
+@settings(max_examples=30)
 @given(st.integers(1, 2**53))
 def test_as_count_converts_whole_floats(number):
     for written in (number, float(number), np.int64(number), np.float64(number)):

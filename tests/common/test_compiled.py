@@ -4,16 +4,21 @@ import copy
 import gc
 import os
 import pickle
-import subprocess
-import sys
+import runpy
+import shutil
+import types
 
 import numpy as np
 import pytest
-from numba import njit
+from numba import config, njit
 from numba.core.errors import TypingError
 
+from sb3_combrel.common import compiled
 from sb3_combrel.common.compiled import EntryPoint, remove_outdated
-from sb3_combrel.common.scaling import StateScaling, scale_into_box
+from sb3_combrel.common.observations import scale_into_box
+from sb3_combrel.common.scaling import StateScaling
+
+MESSAGE = "sb3_combrel: compiling"
 
 
 def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
@@ -31,11 +36,10 @@ def test_scale_into_box_is_to_unit_moved_into_the_box():
     scaling = StateScaling(np.array([-1.0, 0.0, 10.0]), np.array([1.0, 5.0, 11.0]))
     states = np.random.default_rng(0).uniform([-2.0, -1.0, 9.5], [2.0, 6.0, 11.5], (100, 3))
     units = np.empty_like(states)
-    low, ranges, flags = scaling.low, scaling.high - scaling.low, np.zeros(3, dtype=bool)
+    low, ranges, flags = scaling.low.copy(), scaling.high - scaling.low, np.zeros(3, dtype=bool)
     assert scale_into_box(states, low, ranges, flags, units)
     np.testing.assert_array_equal(units, np.clip(scaling.to_unit(states), 0.0, 1.0))
-    inside = scaling.to_raw(np.full((1, 3), 0.5))
-    assert not scale_into_box(inside, low, ranges, flags, units[:1])
+    assert not scale_into_box(scaling.to_raw(np.full((1, 3), 0.5)), low, ranges, flags, units[:1])
     assert scale_into_box(np.full((1, 3), np.nan), low, ranges, flags, units[:1])
 
 
@@ -54,149 +58,69 @@ def test_garbage_collection_waits_during_the_first_call_of_an_entry_point_only(c
     assert entry.call() == entry() == collecting
 
 
-def test_garbage_collection_is_as_before_when_the_function_does_not_compile(collecting):
-    entry = EntryPoint(njit(lambda x: x.nothing))
-    for _ in range(2):
-        with pytest.raises(TypingError, match="nothing"):
-            entry.call(1)
-        assert gc.isenabled() == collecting
+def fail(x):
+    raise RuntimeError("on purpose")
 
 
-def test_garbage_collection_is_as_before_when_the_function_raises(collecting):
-    def fail():
-        raise RuntimeError("on purpose")
-
-    with pytest.raises(RuntimeError, match="on purpose"):
-        EntryPoint(fail).call()
+@pytest.mark.parametrize(("function", "error"), [(njit(lambda x: x.nothing), TypingError), (fail, RuntimeError)])
+def test_garbage_collection_is_as_before_when_the_function_raises_or_does_not_compile(collecting, function, error):
+    with pytest.raises(error):
+        EntryPoint(function).call(1)
     assert gc.isenabled() == collecting
 
 
-MESSAGE = "sb3_combrel: compiling"
-
-
-def run(code, cache):
-    """What a fresh Python process prints to stdout and stderr, with compiled code cached in ``cache``."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout, done.stderr
-
-
-COMPILE_TWO = """
-import gc
-import numpy as np
-from sb3_combrel.common.compiled import EntryPoint, remove_outdated
-from sb3_combrel.common.instances import Instances, put_instance_at
-from sb3_combrel.common.scaling import scale_into_box
-
-one = np.zeros((1, 1))
-EntryPoint(scale_into_box).call(one, np.zeros(1), np.ones(1), np.zeros(1, dtype=bool), one.copy())
-EntryPoint(scale_into_box).call(one.astype(np.float32), np.zeros(1), np.ones(1), np.zeros(1, dtype=bool), one.copy())
-instances = Instances.empty(1, 1)
-put_instance_at.call(instances, (0, 0, np.zeros(1), np.ones(1), -1.0, False))
-assert instances.size[0] == 1 and gc.isenabled()
-"""
-
-
-@pytest.mark.integration
-def test_compilation_is_announced_once_and_what_is_cached_is_not_announced(tmp_path):
-    _, printed = run(COMPILE_TWO, tmp_path)
-    assert printed.count(MESSAGE) == 1
-    _, printed = run(COMPILE_TWO, tmp_path)
-    assert MESSAGE not in printed
-
-
-OTHER_PEOPLE_S_FUNCTIONS = """
-import gc
-import threading
-import types
-
-import sb3_combrel
-from numba import njit
-from numba.core import event
-from sb3_combrel import COMBREL, FittedRMax
-from sb3_combrel.common.compiled import EntryPoint, remove_outdated
-
-def plus(x):
-    return x + 1
-
-def without_module():
-    function = types.FunctionType(plus.__code__, {})
-    function.__module__ = None
+def function_of_module(name):
+    function = types.FunctionType((lambda x: x + 1).__code__, {})
+    function.__module__ = name
     return njit(function)
 
-def of_another_module():
-    function = types.FunctionType(plus.__code__, {})
-    function.__module__ = "somebody.elses"
-    return njit(function)
 
-seen = []
-
-class Listener(event.Listener):
-    def on_start(self, event):
-        seen.append(gc.isenabled())
-    def on_end(self, event):
-        pass
-
-with event.install_listener("numba:compile", Listener()):
-    for make in (without_module, of_another_module):
-        assert make()(1) == 2
-    assert seen == [True, True], "garbage is collected as ever"
-
-# Also while a function of the package is compiling, which others may do in another thread, or within it.
-def call_others():
-    return [make()(1) for make in (without_module, of_another_module)]
-
-assert EntryPoint(call_others).call() == [2, 2]
-print("fine")
-"""
+def test_compilation_of_functions_of_this_package_alone_is_announced_and_once(capsys, monkeypatch):
+    monkeypatch.setattr(compiled._announcement, "printed", False)
+    for name in (None, "somebody.elses"):
+        assert EntryPoint(function_of_module(name)).call(1) == 2
+    assert function_of_module("sb3_combrel.anything")(1) == 2, "not by an entry point"
+    assert MESSAGE not in capsys.readouterr().err
+    for _ in range(2):
+        assert EntryPoint(function_of_module("sb3_combrel.anything")).call(1) == 2
+    assert capsys.readouterr().err.count(MESSAGE) == 1
 
 
-@pytest.mark.integration
-def test_the_import_leaves_the_compilation_of_other_people_s_functions_alone(tmp_path):
-    printed, errors = run(OTHER_PEOPLE_S_FUNCTIONS, tmp_path)
-    assert printed == "fine\n"
-    assert MESSAGE not in errors, "only functions of this package are announced"
+def test_what_is_cached_is_not_announced(capsys, monkeypatch, tmp_path):
+    (tmp_path / "loops.py").write_text("from numba import njit\n\n\n@njit(cache=True)\ndef plus(x):\n    return x + 1\n")
+    for times in (1, 0):
+        monkeypatch.setattr(compiled._announcement, "printed", False)
+        plus = runpy.run_path(str(tmp_path / "loops.py"), run_name="sb3_combrel.loops")["plus"]
+        assert EntryPoint(plus).call(1) == 2
+        assert capsys.readouterr().err.count(MESSAGE) == times
 
 
-def test_compiled_code_older_than_any_source_file_is_removed(tmp_path):
-    cache = tmp_path / "room" / "__pycache__"
-    cache.mkdir(parents=True)
-    for name, age in (("old.f-1.nbi", 100), ("new.f-1.nbi", 0), ("old.f-1.1.nbc", 100), ("a.cpython-311.pyc", 100)):
-        (cache / name).touch()
-        os.utime(cache / name, (2_000_000_000 - age,) * 2)
-    for name, age in (("a.py", 1000), ("room/b.py", 50)):
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (2_000_000_000 - age,) * 2)
-    remove_outdated([tmp_path])
-    assert sorted(file.name for file in cache.iterdir()) == ["a.cpython-311.pyc", "new.f-1.nbi", "old.f-1.1.nbc"]
+def touch(path, age):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    os.utime(path, (2_000_000_000 - age,) * 2)
+    return path
 
 
-CALLER, CALLED = (
-    "from numba import njit\nfrom called import plus\n\n@njit(cache=True)\ndef call(x):\n    return plus(x)\n",
-    """
-from numba import njit
+def test_compiled_code_older_than_any_source_file_beside_some_is_removed_when_asked_for_and_not_by_the_import(tmp_path):
+    rooms = tmp_path / "package" / "planning", tmp_path / "package" / "models"
+    touch(rooms[0] / "grid.py", 1000)
+    touch(rooms[1] / "lists.py", 50)
+    touch(tmp_path / "package" / "experiments" / "has_no_compiled_code.py", 0)
+    old = [touch(room / "__pycache__" / "old.f-1.nbi", 100) for room in rooms]
+    kept = [touch(rooms[0] / "__pycache__" / name, age) for name, age in (("new.nbi", 10), ("old.nbc", 100), ("a.pyc", 100))]
+    (tmp_path / "package" / "common").mkdir()
+    module = shutil.copy(compiled.__file__, tmp_path / "package" / "common")
+    touch(tmp_path / "package" / "common" / "compiled.py", 100)
+    runpy.run_path(module)
+    assert all(file.exists() for file in [*old, *kept])
+    remove_outdated(tmp_path / "package")
+    assert not any(file.exists() for file in old) and all(file.exists() for file in kept)
 
-@njit(cache=True)
-def plus(x):
-    return x + {}
-""",
-)
 
-
-@pytest.mark.integration
-@pytest.mark.parametrize("removes", [False, True])
-def test_a_function_is_compiled_again_in_numba_cache_dir_when_what_it_calls_has_changed(tmp_path, removes):
-    """Numba alone does not notice; that it does not is shown too, so that this is looked at again when it does."""
-    room, cache = tmp_path / "room", tmp_path / "cache"
-    room.mkdir()
-    (room / "caller.py").write_text(CALLER)
-    remove = f"from pathlib import Path; remove_outdated([Path({str(room)!r})], {str(cache)!r});" if removes else ""
-    code = f"from sb3_combrel.common.compiled import remove_outdated; import sys; sys.path.insert(0, {str(room)!r});"
-    code += f"{remove} from caller import call; print(call(1))"
-    printed = []
-    for added in (1, 2):
-        (room / "called.py").write_text(CALLED.format(added))
-        printed.append(run(code, cache)[0])
-        assert list(cache.glob("room_*/caller.call-*.nbi"))
-    assert printed == ["2\n", "3\n" if removes else "2\n"]
+def test_compiled_code_in_numba_cache_dir_is_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    folder = njit(cache=True)(scale_into_box.py_func).stats.cache_path
+    index = touch(tmp_path / folder / "observations.f-1.nbi", 2_000_000_000)
+    remove_outdated(compiled.PACKAGE / "common", str(tmp_path))
+    assert index.is_relative_to(tmp_path) and not index.exists()

@@ -60,7 +60,7 @@ operations = st.lists(
 )
 
 
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(deadline=None, derandomize=True, max_examples=40)
 @given(operations, st.sampled_from([4, 16, 1024]))
 def test_a_list_store_has_the_lists_of_a_dict_of_lists(steps, capacity):
     store, expected = ListStore.empty(N_LISTS, capacity), {p: [] for p in range(N_LISTS)}
@@ -81,20 +81,12 @@ def test_a_list_store_has_the_lists_of_a_dict_of_lists(steps, capacity):
     assert_slots_are_apart(store)
 
 
-def test_lists_are_empty_at_first():
-    assert_same_lists(ListStore.empty(N_LISTS, 16), {p: [] for p in range(N_LISTS)})
-
-
-def test_a_store_with_room_stays_the_same_object():
-    store = ListStore.empty(2, 16)
-    assert append(store, 0, 1, 1.0)
-    assert store.with_room() is store
-
-
 def test_a_store_without_room_stays_as_it_is_until_it_has_grown():
     store = ListStore.empty(2, 4)
+    assert len(store.entries(0)[0]) == 0
     for item in range(4):
         assert append(store, 0, item, float(item))
+        assert store.with_room() is store
     assert not append(store, 1, 9, 9.0) and not append(store, 0, 9, 9.0)
     larger = store.with_room()
     assert larger is not store and larger.with_room() is larger

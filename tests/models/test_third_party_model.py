@@ -5,15 +5,11 @@ import inspect
 import numpy as np
 import pytest
 import torch as th
-from helpers.dashboard import run_folder
 from helpers.walk import GOAL, STRIDE, Walk, small, walk_source
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping
-from sb3_combrel.callbacks import DashboardCallback
-from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model, Predictions
 
 
@@ -80,6 +76,12 @@ def test_a_third_party_model_is_saved_loaded_and_learns_on_as_the_original(trans
         one.learn(100, reset_num_timesteps=False)
     assert_same_parameters(loaded, model)
     assert loaded.agent.statistics()["model/instances"] > 100
+    model.policy.save(tmp_path / "policy")
+    policy = type(model.policy).load(tmp_path / "policy")
+    assert isinstance(policy.agent.model, NearestNeighbour)
+    observations = np.column_stack([np.linspace(-1.0, 1.0, 21), np.ones(21)]).astype(np.float32)
+    expected = model.predict(observations, deterministic=True)[0]
+    np.testing.assert_array_equal(policy.predict(observations, deterministic=True)[0], expected)
 
 
 def assert_same_parameters(one, other):
@@ -87,31 +89,6 @@ def assert_same_parameters(one, other):
     assert one.keys() == other.keys()
     for name, tensor in one.items():
         assert th.equal(tensor, other[name]), name
-
-
-def test_the_policy_of_a_third_party_model_is_saved_and_loaded(tmp_path):
-    model = third_party(TRANSFERS["none"]).learn(100)
-    model.policy.save(tmp_path / "policy")
-    loaded = type(model.policy).load(tmp_path / "policy")
-    assert isinstance(loaded.agent.model, NearestNeighbour)
-    observations = np.column_stack([np.linspace(-1.0, 1.0, 21), np.ones(21)]).astype(np.float32)
-    np.testing.assert_array_equal(
-        loaded.predict(observations, deterministic=True)[0], model.predict(observations, deterministic=True)[0]
-    )
-
-
-def test_a_third_party_model_is_shown_on_the_dashboard(transfer, tmp_path):
-    pytest.importorskip("matplotlib")
-    dashboard = DashboardCallback(picture_freq=100, scalar_share=1.0)
-    model = third_party(transfer, tensorboard_log=str(tmp_path)).learn(200, callback=dashboard)
-    found = EventAccumulator(str(run_folder(tmp_path)), size_guidance={"images": 0, "scalars": 0}).Reload()
-    assert {"model/known", "model/instances", "planner/residual", "planner/backups"} <= set(found.Tags()["scalars"])
-    known = found.Scalars("model/known")
-    assert 0.0 < known[-1].value <= 1.0 and known[-1].step <= 200
-    pictures = [tag for tag in found.Tags()["images"] if tag.startswith("value_and_policy/")]
-    assert len(pictures) == 1
-    assert [picture.step for picture in found.Images(pictures[0])] == [100, 200]
-    assert model.agent.settings == FittedRMaxSettings(model_breadth=0.15, resolution=3)
 
 
 def test_beyond_max_instances_a_third_party_model_replaces_its_oldest_instances(tmp_path):

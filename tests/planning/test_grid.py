@@ -12,24 +12,17 @@ from hypothesis import strategies as st
 from sb3_combrel.planning.grid import StateGrid, fitting_grid
 
 
-@settings(deadline=None, derandomize=True, max_examples=60)
+@settings(deadline=None, derandomize=True, max_examples=20)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6))
 def test_interpolation_is_multilinear_between_grid_points_and_constant_beyond_them(grid, seed):
     rng = np.random.default_rng(seed)
     own, naive = make_grid(grid), NaiveGrid(*grid)
     values = rng.normal(size=own.n_points)
+    assert own.n_points == np.prod(naive.shape)
+    np.testing.assert_allclose([own.interpolate(values, state) for state in own.points()], values)
     for state in rng.uniform(-0.8, 1.8, (10, own.n_variables)):
         expected = sum(weight * values[point] for point, weight in naive.corners(state).items())
         assert own.interpolate(values, state) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize("grid", GRIDS, ids=str)
-def test_interpolation_at_a_grid_point_is_its_value(grid):
-    own = make_grid(grid)
-    values = np.random.default_rng(0).normal(size=own.n_points)
-    assert len(own.points()) == own.n_points == np.prod(NaiveGrid(*grid).shape)
-    for point, state in enumerate(own.points()):
-        assert own.interpolate(values, state) == pytest.approx(values[point])
 
 
 def test_one_resolution_counts_for_all_variables():

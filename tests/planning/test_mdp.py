@@ -42,7 +42,7 @@ def random_predictions(rng, n, n_successors, n_variables):
     return probability, rng.normal(0.0, 0.4, moves.shape) * moves, rng.normal(size=n)
 
 
-@settings(deadline=None, derandomize=True, max_examples=40)
+@settings(deadline=None, derandomize=True, max_examples=20)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6), st.integers(1, 5), st.sampled_from([1.0, 0.9]))
 def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
     np.testing.assert_array_equal(mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
 
 
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(deadline=None, derandomize=True, max_examples=12)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6))
 def test_predecessors_include_every_point_that_a_row_leads_from_with_at_least_its_probability(grid, seed):
     rng = np.random.default_rng(seed)
@@ -99,37 +99,15 @@ def test_predecessors_include_every_point_that_a_row_leads_from_with_at_least_it
                 assert all(found[point] < 2 * p * (1 + 1e-12) for point, p in needed.items()), "the next power of two at most"
 
 
-def test_every_pair_is_optimistic_at_first():
-    mdp, _ = make_mdp(((2, 2), 1))
-    assert not mdp.arrays.modelled.any()
-    assert (mdp.arrays.n_optimistic == N_ACTIONS).all()
-    assert all(row_of(mdp, point, action) == {} for point in range(mdp.grid.n_points) for action in range(N_ACTIONS))
-
-
-@pytest.mark.parametrize(("margin", "edge"), [(0, 4), (1, 6)])
-def test_a_successor_beyond_the_grid_is_its_edge(margin, edge):
-    mdp, _ = make_mdp(((2,), margin))
-    write(mdp, [2], [[1.0]], [[3.0]], [-1.0])
-    assert row_of(mdp, 2) == pytest.approx({edge: 1.0})
-
-
-def test_probability_missing_to_one_ends_the_episode():
-    mdp, _ = make_mdp(gamma=0.5)
-    write(mdp, [2], [[0.25, 0.5]], [[0.25, -0.25]], [-1.0])
-    assert row_of(mdp, 2) == pytest.approx({3: 0.125, 1: 0.25})
-    assert mdp.arrays.reward[2] == -1.0
+def test_staying_is_summed_in_closed_form_and_probability_missing_to_one_ends_the_episode():
+    mdp, _ = make_mdp(gamma=0.8)
+    write(mdp, [2], [[0.6, 0.3]], [[0.0, 0.25]], [-1.0])
+    leave = 1.0 - 0.8 * 0.6
+    assert row_of(mdp, 2) == pytest.approx({3: 0.8 * 0.3 / leave})
+    assert mdp.arrays.reward[2] == pytest.approx(-1.0 / leave)
     write(mdp, [2], [[0.0, 0.0]], [[0.25, -0.25]], [-3.0])
     assert row_of(mdp, 2) == {} and mdp.arrays.reward[2] == -3.0
     assert mdp.arrays.modelled[2], "a pair that always ends the episode has a model"
-
-
-@pytest.mark.parametrize("gamma", [1.0, 0.8])
-def test_staying_is_summed_in_closed_form(gamma):
-    mdp, _ = make_mdp(gamma=gamma)
-    write(mdp, [2], [[0.6, 0.3]], [[0.0, 0.25]], [-1.0])
-    leave = 1.0 - gamma * 0.6
-    assert row_of(mdp, 2) == pytest.approx({3: gamma * 0.3 / leave})
-    assert mdp.arrays.reward[2] == pytest.approx(-1.0 / leave)
 
 
 @pytest.mark.parametrize(("reward", "expected"), [(-1.0, -np.inf), (2.0, np.inf), (0.0, 0.0)])
@@ -140,18 +118,6 @@ def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, exp
     write(mdp, [2], [[0.5, 0.5]], [[0.0, 0.25]], [reward])
     assert row_of(mdp, 2) == pytest.approx({3: 1.0}), "and an ordinary row once it leaves"
     assert mdp.arrays.reward[2] == pytest.approx(2 * reward)
-
-
-def test_a_pair_that_loses_its_model_is_optimistic_again():
-    mdp, _ = make_mdp()
-    write(mdp, [2, 7], [[1.0], [1.0]], [[0.25], [0.25]], [-1.0, -2.0])
-    assert mdp.arrays.n_optimistic.tolist() == [2, 2, 0, 2, 2]
-    write(mdp, [2], [[1.0]], [[0.25]], [-1.0], modelled=False)
-    assert not mdp.arrays.modelled[2] and row_of(mdp, 2) == {} and mdp.arrays.reward[2] == 0.0
-    assert mdp.arrays.n_optimistic.tolist() == [2, 2, 1, 2, 2]
-    assert mdp.arrays.modelled[7] and row_of(mdp, 2, action=1) == pytest.approx({3: 1.0})
-    write(mdp, [2], [[1.0]], [[-0.25]], [-4.0])
-    assert row_of(mdp, 2) == pytest.approx({1: 1.0}) and mdp.arrays.n_optimistic[2] == 0
 
 
 def test_the_stores_grow_and_keep_the_rows_that_were_written_before():

@@ -35,7 +35,7 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     return agent, naive
 
 
-@settings(deadline=None, derandomize=True, max_examples=60)
+@settings(deadline=None, derandomize=True, max_examples=25)
 @given(
     st.integers(0, 10**6),
     st.integers(1, 3),
@@ -97,16 +97,6 @@ def line():
     return OneVariable()
 
 
-def test_below_the_threshold_an_action_has_max_value_exactly(line):
-    assert (line.q_values(0.4) == 0.0).all()
-    line.learn(0.5, 0.1, times=1)
-    assert line.q(0.5 + 1e-3) == 0.0, "one instance weighs less than 1 anywhere but at its own state"
-    assert line.q(0.5) < 0.0, "and 1 there, which reaches the threshold of 1"
-    line.learn(0.5, 0.1, times=1)
-    assert line.q(0.5 + 1e-3) < 0.0
-    assert (line.q_values(0.5)[1:] == 0.0).all(), "instances of one action do not count for the others"
-
-
 def test_below_the_threshold_an_action_has_the_bound_interpolated_between_grid_points(line):
     bounds = -np.arange(line.agent.grid.n_points, dtype=float) ** 2
     line.agent.planner.set_upper(bounds)
@@ -118,30 +108,6 @@ def test_below_the_threshold_an_action_has_the_bound_interpolated_between_grid_p
     assert line.q_values(0.5)[1] == pytest.approx(-9.0)
     line.agent.planner.set_upper(None)
     assert (line.q_values(0.3) == 0.0).all()
-
-
-def test_an_action_is_known_as_far_as_its_weights_reach_the_threshold(line):
-    line.learn(0.5, 0.1, times=2)
-    edge = 0.2 * np.sqrt(np.log(2))  # two instances weigh 1 here
-    assert line.q(0.5 + edge - 1e-6) < 0.0
-    assert line.q(0.5 + edge + 1e-6) == 0.0
-
-
-def test_q_interpolates_the_values_of_successors_between_grid_points(line):
-    line.learn(0.5, 0.05)
-    assert line.q(0.5) == pytest.approx(-1.0 - (4 * 0.55 + 1))
-
-
-def test_q_applies_effects_relative_to_the_state_asked_for(line):
-    line.learn(0.5, 0.05)
-    assert line.q(0.53) == pytest.approx(-1.0 - (4 * 0.58 + 1))
-
-
-def test_q_gives_instances_that_ended_the_episode_a_successor_of_value_0(line):
-    line.learn(0.5, 0.1, reward=-2.0, terminated=True)
-    assert line.q(0.5) == pytest.approx(-2.0)
-    line.learn(0.5, 0.1, reward=-1.0)
-    assert line.q(0.5) == pytest.approx(-1.5 - 0.5 * (4 * 0.6 + 1))
 
 
 def test_staying_is_worth_the_state_s_own_q_and_not_the_interpolated_value(line):
@@ -158,11 +124,6 @@ def test_staying_for_ever_is_worth_the_bound_on_the_side_of_the_reward(line):
     assert line.q_values(0.5)[1] == 0.0
 
 
-def test_q_counts_successors_beyond_the_grid_as_its_edge(line):
-    line.learn(1.0, 0.5)
-    assert line.q(1.0) == pytest.approx(-1.0 - 6.0), "the margin ends at 1.25"
-
-
 def test_pushing_against_the_edge_of_the_grid_is_staying():
     agent, _ = agent_and_definition(3, 1, breadth=0.5, min_fraction=0.01)
     agent.planner.bounds = (-100.0, 0.0)
@@ -172,42 +133,30 @@ def test_pushing_against_the_edge_of_the_grid_is_staying():
     assert agent.q_values(corner)[0] == -100.0
 
 
-def test_q_stays_within_the_bounds_of_the_values(line):
-    line.learn(0.5, 0.1, reward=1e6)
-    line.learn(0.5, 0.1, reward=-1e6, action=1)
-    assert list(line.q_values(0.5)[:2]) == [0.0, -100.0]
-
-
-def test_asking_for_q_changes_nothing(line):
+def test_asking_for_q_changes_nothing_and_gives_an_array_of_the_caller_s_own(line):
     line.learn(0.5, 0.05)
-    before = copy.deepcopy(line.agent)
-    first = line.q_values(0.52)
-    np.testing.assert_array_equal(line.q_values(0.52), first)
-    assert_same_state(line.agent, before)
-
-
-def test_q_values_are_the_caller_s_own_array(line):
-    line.learn(0.5, 0.05)
-    first = line.q_values(0.52)
+    before, first = copy.deepcopy(line.agent), line.q_values(0.52)
     expected = first.copy()
     line.q_values(0.1)[:] = np.nan
     np.testing.assert_array_equal(first, expected)
+    np.testing.assert_array_equal(line.q_values(0.52), expected)
+    assert_same_state(line.agent, before)
 
 
 def test_q_does_not_depend_on_the_states_asked_for_before():
     """A search starts from what the last one found; wherever that was, the result is the same bit for bit."""
     rng = np.random.default_rng(3)
     agent, _ = agent_and_definition(2, 3, breadth=0.15, min_fraction=0.05)
-    states = np.round(rng.random((300, 2)) * 12) / 12
+    states = np.round(rng.random((150, 2)) * 12) / 12
     for state in states:
         agent.model.add(state, int(rng.integers(N_ACTIONS)), -1.0, np.clip(state + 0.05, 0, 1), False)
     values = rng.normal(size=len(agent.planner.values)) - 5.0
     untouched = copy.deepcopy(agent)
-    queries = np.round(rng.random((40, 2)) * 24) / 24
+    queries = np.round(rng.random((20, 2)) * 24) / 24
     first = [agent.q_values(state, values) for state in queries]
     for number in rng.permutation(len(queries)):
         np.testing.assert_array_equal(agent.q_values(queries[number], values), first[number])
-        np.testing.assert_array_equal(copy.deepcopy(untouched).q_values(queries[number], values), first[number])
+    np.testing.assert_array_equal(untouched.q_values(queries[7], values), first[7])
 
 
 HERE, ELSEWHERE = np.array([0.3]), np.array([0.7])
@@ -246,9 +195,7 @@ def test_an_evaluation_prefers_known_actions_to_transferred_ones_that_look_bette
     assert best > second and agent.act(HERE) == 1
     assert agent.act(HERE, explore=False) == 0
     assert agent.act(ELSEWHERE, explore=False) == 1, "where nothing is known, the best of what was transferred"
-
-
-def test_an_evaluation_takes_a_transferred_end_that_is_worth_as_much_as_optimism(line_agent):
+    # A transferred end that is worth as much as optimism.
     agent = line_agent(ends_anywhere(0.0))
     agent.prepare()
     assert agent.q_values(HERE)[1] == agent.planner.bounds[1] > agent.q_values(HERE)[0]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import N_ACTIONS, make_model
+from helpers.kernel_models import N_ACTIONS, add_instances, make_model
 from helpers.naive_fitted_rmax import NaiveFittedRMax
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -32,9 +32,11 @@ class Problem:
         return pairs, self.planner.update(pairs, max_backups)
 
     def learn(self, transitions, max_backups=NO_LIMIT):
-        for transition in transitions:
+        for transition in (transitions := list(transitions)):
             self.update(transition, max_backups)
-            self.naive.add(*transition)
+        add_instances(self.naive, transitions)
+        # Which is tested with the models, and slow to find out here.
+        self.naive.known[:] = self.model.known.reshape(self.naive.known.shape)
 
     def plan(self, max_backups=NO_LIMIT):
         return self.planner.update(np.empty(0, dtype=np.int64), max_backups)
@@ -58,64 +60,43 @@ def walk(seed, n, n_variables=2, goal=0.8, reward=lambda rng: -1.0):
         yield state, action, reward(rng), next_state, bool((next_state > goal).all())
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("resolution", "margin", "gamma", "max_value", "periodic"),
     [
-        ((2, 2), 1, 0.9, 5.0, None),
         ((4,), 0, 0.97, 10.0, None),
         ((1, 2, 1), 0, 0.8, 3.0, None),
-        ((3, 2), 0, 1.0, 0.0, None),
         ((2, 2), 1, 1.0, 0.0, None),
-        ((2, 3), 1, 0.9, 5.0, (False, True)),
-        ((3, 3), 0, 0.9, 5.0, (True, True)),
+        ((2, 3), 0, 0.9, 5.0, (False, True)),
     ],
 )
-def test_sweeping_to_convergence_gives_the_values_of_exact_value_iteration(
-    resolution, margin, gamma, max_value, periodic, seed
-):
+def test_sweeping_to_convergence_gives_the_values_of_exact_value_iteration(resolution, margin, gamma, max_value, periodic):
     problem = Problem(resolution, margin, gamma, max_value, periodic=periodic)
     noise = (lambda rng: -1.0) if gamma == 1.0 else (lambda rng: float(rng.normal()))
-    problem.learn(walk(seed, 120, len(resolution), reward=noise))
+    problem.learn(walk(1, 80, len(resolution), reward=noise))
     assert problem.planner.n_queued == 0
     np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
     assert np.unique(np.round(problem.planner.values, 6)).size > 5, "a problem without interest"
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_passes_over_the_grid_reach_the_same_values_and_leave_nothing_queued(seed):
-    problem = Problem((3, 2), 1, gamma=0.9, max_value=5.0)
-    problem.learn(walk(seed, 120), max_backups=0)
-    problem.planner.sweep_all(10_000)
-    assert problem.planner.n_queued == 0
-    np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
-
-
-def test_a_few_passes_leave_the_rest_of_the_work_queued():
-    problem = Problem((3, 2), 1, gamma=0.99, max_value=5.0)
-    problem.learn(walk(1, 120), max_backups=0)
+def test_passes_over_the_grid_reach_the_same_values_and_a_few_leave_the_rest_of_the_work_queued():
+    problem = Problem((3, 2), 0, gamma=0.95, max_value=5.0)
+    problem.learn(walk(1, 80), max_backups=0)
     problem.planner.sweep_all(2)
     assert problem.planner.n_queued > 0
     problem.plan()
-    np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
-
-
-def test_values_stay_exact_while_pairs_become_known_one_by_one():
-    problem = Problem((3,), 1, gamma=0.95)
-    at_first = problem.optimistic.copy()
-    for transition in walk(5, 60, 1):
-        problem.learn([transition])
-        np.testing.assert_allclose(problem.planner.values, problem.exact(), atol=1e-7)
-        assert (problem.planner.values[problem.optimistic] == 0.0).all(), "optimistic points have max_value exactly"
-    assert at_first.all() and not problem.optimistic.all()
+    exact = problem.exact()
+    np.testing.assert_allclose(problem.planner.values, exact, atol=1e-7)
+    problem.planner.restore(np.where(problem.optimistic, 5.0, exact - 3.0))
+    problem.planner.sweep_all(10_000)
+    assert problem.planner.n_queued == 0
+    np.testing.assert_allclose(problem.planner.values, exact, atol=1e-7)
 
 
 def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again():
-    """With room for two instances an action, old pairs lose all instances and become optimistic again."""
     problem = Problem((3,), 0, gamma=0.9, max_value=2.0, max_instances=2)
     lost = 0
     known = problem.model.known.copy()
-    for transition in walk(2, 80, 1):
+    for transition in walk(2, 40, 1):
         problem.update(transition)
         lost += int((known & ~problem.model.known).sum())
         known = problem.model.known.copy()
@@ -152,7 +133,7 @@ def values_of_rows(problem, optimistic=True, upper=np.inf):
     raise AssertionError("value iteration did not converge")
 
 
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(deadline=None, derandomize=True, max_examples=10)
 @given(
     st.integers(0, 10**6), st.integers(0, 60), st.lists(st.sampled_from(["lower", "raise", "none"]), min_size=1, max_size=4)
 )
@@ -170,22 +151,12 @@ def test_values_are_bounded_by_what_is_given_and_optimistic_ones_are_that(seed, 
         np.testing.assert_allclose(problem.planner.values, values_of_rows(problem, upper=np.inf if upper is None else upper))
         optimistic = problem.model.mdp.arrays.n_optimistic > 0
         np.testing.assert_array_equal(problem.planner.values[optimistic], problem.planner.upper[optimistic])
+        problem.planner.set_upper(None if upper is None else upper.copy())
+        assert problem.planner.n_queued == 0, "the same bounds again leave the queue alone"
         assert problem.planner.upper.max() <= 2.0
 
 
-def test_the_same_bounds_again_leave_the_queue_alone():
-    problem = Problem((3,), 1, gamma=0.9, max_value=2.0)
-    for transition in walk(0, 60, 1):
-        problem.update(transition)
-    bounds = np.linspace(-3.0, 1.0, problem.model.grid.n_points)
-    problem.planner.set_upper(bounds)
-    assert problem.planner.n_queued > 0
-    problem.plan()
-    problem.planner.set_upper(bounds.copy())
-    assert problem.planner.n_queued == 0
-
-
-@pytest.mark.parametrize("upper", [np.zeros(3), np.zeros((11, 1)), 0.0, np.full(11, np.nan), np.full(11, np.inf)])
+@pytest.mark.parametrize("upper", [np.zeros(3), np.zeros((11, 1)), 0.0, np.full(11, np.nan)])
 def test_bounds_that_are_not_one_number_a_point_are_refused(upper):
     problem = Problem((3,), 1, gamma=0.9, max_value=2.0)
     assert problem.model.grid.n_points == 11
@@ -205,7 +176,7 @@ def neighbours_of(point, grid):
 
 @pytest.mark.parametrize(
     ("resolution", "seed", "n", "periodic"),
-    [((4,), 0, 4, None), ((4,), 5, 4, None), ((3, 3), 1, 14, None), ((4,), 0, 3, (True,)), ((3, 3), 1, 14, (False, True))],
+    [((4,), 0, 4, None), ((3, 3), 1, 14, None), ((3, 3), 1, 14, (False, True))],
 )
 def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, seed, n, periodic):
     problem = Problem(resolution, 0, gamma=0.9, max_value=2.0, tolerance=1e-12, periodic=periodic)
@@ -218,9 +189,6 @@ def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, s
     np.testing.assert_allclose(values, values_of_rows(problem, optimistic=False), atol=1e-5)
     assert (values <= before + 1e-9).all() and (values < before).any()
     np.testing.assert_array_equal(problem.planner.values, before)
-    for transition in walk(seed + 1, 5, len(resolution)):
-        problem.update(transition)
-    np.testing.assert_allclose(problem.planner.exploitation_values(), values_of_rows(problem, optimistic=False), atol=1e-5)
 
 
 def test_bounded_work_leaves_the_rest_queued_and_later_calls_finish_it():
@@ -270,9 +238,8 @@ def test_restored_values_converge_to_the_same_as_before():
     np.testing.assert_allclose(problem.planner.values, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize("tolerance", [0.3, 0.03])
-def test_a_change_up_to_the_tolerance_is_not_propagated_and_costs_no_more_than_that(tolerance):
-    gamma = 0.9
+def test_a_change_up_to_the_tolerance_is_not_propagated_and_costs_no_more_than_that():
+    gamma, tolerance = 0.9, 0.1
     problem = Problem((3, 2), 0, gamma, tolerance=tolerance)
     problem.learn(walk(4, 90))
     exact = problem.exact()

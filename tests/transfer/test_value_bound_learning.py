@@ -8,7 +8,7 @@ from helpers import factored as f
 from helpers.oscillators import Oscillators, episodes
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
-from sb3_combrel.common.prior import PriorPredictions
+from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import Transfer
 
 

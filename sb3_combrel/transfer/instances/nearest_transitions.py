@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner, part
-from sb3_combrel.common.kernels import any_periodic, difference
+from sb3_combrel.common.kernels import any_periodic
+from sb3_combrel.common.periodic import difference
 
 
 class ComplianceCache(NamedTuple):

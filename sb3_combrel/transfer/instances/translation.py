@@ -8,7 +8,8 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, part
 from sb3_combrel.common.instances import BLOCK
-from sb3_combrel.common.kernels import difference, list_room
+from sb3_combrel.common.kernels import list_room
+from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates

@@ -13,8 +13,7 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_boolean, check_positive
 from sb3_combrel.common.periodic import differences
-from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
 from sb3_combrel.sources.recipes import check_source

@@ -9,8 +9,7 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.periodic import differences
-from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
 from sb3_combrel.transfer.methods.soft_mapping import (

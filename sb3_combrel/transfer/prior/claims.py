@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.prior import PriorPredictions
+from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import GOES_ON, Outcomes
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes

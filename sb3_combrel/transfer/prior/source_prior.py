@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.prior import PriorPredictions
+from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
 from sb3_combrel.transfer.placed_errors import PlacedErrors
