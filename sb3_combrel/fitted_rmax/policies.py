@@ -24,7 +24,6 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
-from sb3_combrel.transfer.instances.instance_transfer import ALL_USED
 
 # What was the policy's in version 0.1.0, and where it is in the agent; the old names work for one version.
 MOVED_TO_AGENT = {
@@ -212,9 +211,6 @@ class FittedRMaxPolicy(BasePolicy):
             # Version 0.1.0, which had the kernel average only, did not have them.
             for name in {"visits", "transfer_check", "transfer_errors"} & expected.keys():
                 state_dict.setdefault(prefix + name, th.zeros(expected[name].shape, dtype=th.float64))
-        if "transfer_relevance_of" in expected:
-            # Version 0.2.0 did not have it.
-            state_dict.setdefault(prefix + "transfer_relevance_of", th.full((1,), ALL_USED, dtype=th.float64))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
