@@ -3,13 +3,9 @@
 import pytest
 import torch
 
-from sb3_combrel.common.compiled import remove_outdated
-
 
 def pytest_configure(config):
-    """Nothing that was compiled from other sources is tested; and pytest-benchmark does not warn of parallel runs."""
-    if not hasattr(config, "workerinput"):
-        remove_outdated()
+    """Without this pytest-benchmark warns, in parallel runs, that it cannot measure."""
     if hasattr(config.option, "benchmark_skip"):
         config.option.benchmark_skip = not config.option.benchmark_only
 

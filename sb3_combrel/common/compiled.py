@@ -13,6 +13,7 @@ import hashlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,15 @@ from numba.core import event
 PACKAGE = Path(__file__).absolute().parent.parent
 
 
+@lru_cache(1)
+def _remove_outdated_once() -> None:
+    remove_outdated()
+
+
 def remove_outdated(package: Path = PACKAGE, cache: str = str(getattr(config, "CACHE_DIR", ""))) -> None:
     """
-    Remove compiled code that is older than any source file in the folders that have some: for developers.
+    Remove compiled code that is older than any source file in the folders that have some; done before the first
+    call of a compiled function.
 
     Numba compiles a function again when its own file has changed, not when a file has changed whose functions it calls.
 
@@ -93,6 +100,7 @@ class EntryPoint:
         return self.call(*arguments)
 
     def _first_call(self, *arguments: Any) -> Any:
+        _remove_outdated_once()
         with _compilation():
             result = self.function(*arguments)
         self.call = self.function

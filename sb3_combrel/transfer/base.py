@@ -6,7 +6,7 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FOR_THE_ALGORITHM = frozenset(
     (
         *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
-        *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "renamed_arguments", "makes_choices"),
+        *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "makes_choices"),
         *("informs_model", "value_bound"),
     )
 )
@@ -37,9 +37,7 @@ class TargetTask:
     :param n_actions: number of actions
     :param sample_states: the finite sample of states that is planned with, unit coordinates, shape (n_points, n_variables)
     :param exploration_threshold: weight that own and transferred instances of a state-action pair must reach together. It
-        stays as it is where the model lowers its own after many episodes that reached their time limit: with that, the
-        model no longer waits for data of the target that cannot be had, whereas a source must always bring the full
-        weight. Otherwise time limits, which are evidence against what was transferred, would extend its reach.
+        stays where the model lowers its own: time limits, which are evidence against a source, must not extend its reach
     :param min_weight: instances with less weight do not count
     :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
     :param state_names: names of the state variables, for display
@@ -77,26 +75,21 @@ class Transfer(ABC):
     """
     A transfer method: it observes transitions of the target task, and returns instances for states and actions of it.
 
-    It is asked where the target's own instances do not suffice. A transfer object given to an algorithm is a description:
-    the algorithm binds a copy of it to its task. Only :meth:`transferred` and :meth:`observe` have to be written. States
-    and effects are in unit coordinates of the target throughout.
+    It is asked where the target's own instances do not suffice. A transfer object given to an algorithm is a description: the
+    algorithm binds a copy of it to its task. Only :meth:`transferred` and :meth:`observe` have to be written. States and
+    effects are in unit coordinates of the target.
     """
 
     #: The target task and the random number generator, from :meth:`bind` on.
     task: TargetTask | None = None
     rng: np.random.Generator
 
-    #: How the model uses the source: "instances": as instances that join the target's own where these do not suffice; "prior":
-    #: as the mean that they are fitted to, see :meth:`prior`; "actions": not at all, the method decides actions only, see
-    #: :meth:`action`.
+    #: How the model uses the source: "instances": they join the target's own where these do not suffice; "prior": it is the
+    #: mean that they are fitted to, see :meth:`prior`; "actions": not at all, see :meth:`action`.
     use: str = "instances"
 
-    #: Number of the environment, of several that are learned from at once, of the next call of :meth:`action`,
-    #: :meth:`observe` or :meth:`end_episode`.
+    #: Which of several environments the next call of :meth:`action`, :meth:`observe` or :meth:`end_episode` is about.
     environment: int = 0
-
-    #: Arguments of the constructor under the names that they had before: a file may still have them.
-    renamed_arguments: ClassVar[dict[str, str]] = {}
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         """
@@ -126,26 +119,23 @@ class Transfer(ABC):
         Return instances for states of the finite sample, as :meth:`transferred`; a method may store results by state.
 
         :param points: rows of ``task.sample_states``, int64, shape (n,)
-        :param actions: int64, shape (n,)
-        :param own_weight: shape (n,)
         """
         assert self.task is not None
         return self.transferred(self.task.sample_states[points], actions, own_weight)
 
     @property
     def informs_model(self) -> bool:
-        """Whether the target's model uses the source, in either way: not with ``use="actions"``."""
+        """Whether the target's model uses the source."""
         return self.use != "actions"
 
     def action(self, state: np.ndarray) -> int | None:
         """
         Decide an action for the agent while it learns, or leave it to the agent.
 
-        Called once for each step of learning, never for predictions, and only of a method that overrides it. The transition
-        that follows is learned from and observed as any other.
+        Called once for each step of learning, never for predictions, and only of a method that overrides it.
 
         :param state: unit coordinates, shape (n_variables,)
-        :return: the action, from 0 on; None leaves it to the agent, and is what is returned by default
+        :return: the action, from 0 on; None leaves it to the agent
         """
         return None
 
@@ -194,8 +184,7 @@ class Transfer(ABC):
         """
         Return a number that grows whenever what :meth:`prior` returns may have changed.
 
-        All pairs of the sample and all of the target's own instances are then asked for again: a few dozen times in a run, not
-        at every step.
+        All pairs of the sample and all of the target's own instances are then asked for again: not at every step.
         """
         return 0
 
@@ -203,9 +192,8 @@ class Transfer(ABC):
         """
         Return an upper bound on the return from each state of the sample, the value of what is not known there.
 
-        Asked only if :attr:`use` is "prior", and again whenever :meth:`prior_version` has grown. The lower it is, the less is
-        explored; it must not be too low, or what is best may never be tried (Asmuth, Littman & Zinkov, "Potential-based
-        shaping in model-based reinforcement learning", AAAI 2008).
+        Asked only if :attr:`use` is "prior", and again whenever :meth:`prior_version` has grown. If it is too low, the best
+        may never be tried (Asmuth, Littman & Zinkov, "Potential-based shaping in model-based RL", AAAI 2008).
 
         :return: raw, shape (n_points,); None: ``task.max_value`` everywhere, which is the default
         """
@@ -227,8 +215,6 @@ class Transfer(ABC):
     def note_use(self, transferred: TransferredInstances) -> None:  # noqa: B027 - a method may well ignore it
         """
         Take in that the agent acts on the instances last returned by :meth:`transferred`, at one state with every action.
-
-        Not called for predictions: what is counted here are the agent's own steps.
         """
 
     def lowest_reward(self) -> float:
@@ -239,12 +225,11 @@ class Transfer(ABC):
         """
         Return the constructor's arguments that make this object, unbound; from them a saved model is rebuilt.
 
-        By default the attributes that bear the arguments' names. They may be numbers, text, arrays, source instances,
-        mappings, sets of mappings, and sequences and dicts of these; arrays and tuples come back as lists.
+        By default the attributes that bear their names: numbers, text, arrays, source instances, mappings, sets of mappings,
+        and sequences and dicts of these. Arrays and tuples come back as lists.
 
         :raises AttributeError: if an argument has no such attribute
         """
-        # A constructor that takes *args or **kwargs fails here as well, unless it keeps them by these names.
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
     def get_state(self) -> dict[str, np.ndarray]:

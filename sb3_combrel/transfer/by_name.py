@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import inspect
 import warnings
 from typing import Any
 
@@ -11,14 +12,17 @@ from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
 from sb3_combrel.transfer.base import Transfer
 
 SAVED = "transfer"
+PACKAGE = __name__.partition(".")[0]
+METHODS = f"{PACKAGE}.transfer.methods."
 
 
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
     """
     Make a transfer object of the algorithm's own from what the user gave.
 
-    :param transfer: None; a transfer object, which is copied; a class or its dotted name; or a dict of one entry, from
-        the (dotted) name to the arguments, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``
+    :param transfer: None; a transfer object, which is copied; a class or its name; or a dict of one entry, from the name to
+        the arguments, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``. Methods of this package may go by their
+        class alone; others are imported: "package.module.Class" or "package.module:Class"
     :raises ValueError: if it is none of these, or the name is not that of a transfer method
     """
     if transfer is None:
@@ -38,18 +42,21 @@ def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | N
 
 
 def _method(name: str) -> Any:
-    module_name, _, attribute = name.rpartition(".")
+    module_name, _, attribute = name.replace(":", ".").rpartition(".")
+    own = _own_methods()
+    public = _public(f"{module_name or PACKAGE}.{attribute}")
+    if public in own:
+        return own[public]
     try:
-        return getattr(importlib.import_module(module_name or "sb3_combrel"), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"transfer names {name!r}, which does not exist; known are {', '.join(_known_names())}") from error
+        return getattr(importlib.import_module(module_name or PACKAGE), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"transfer names {name!r}, which does not exist; known are {', '.join(sorted(own))}") from error
 
 
-def _known_names() -> list[str]:
-    """The names of the package's own transfer methods."""
-    package = importlib.import_module("sb3_combrel")
-    methods = ((name, getattr(package, name)) for name in package.__all__)
-    return [f"{package.__name__}.{name}" for name, each in methods if isinstance(each, type) and issubclass(each, Transfer)]
+def _own_methods() -> dict[str, type[Transfer]]:
+    """The package's own transfer methods that are complete, by their public names."""
+    methods = (each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS) and not inspect.isabstract(each))
+    return {_name(each): each for each in methods}
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
@@ -81,7 +88,7 @@ def restore_transfer(transfer: Any) -> Any:
 
     A file may come from anyone: nothing is imported, only classes that are defined already are considered.
 
-    :raises ValueError: if the method is not known or was not saved, or if the description is damaged
+    :raises ValueError: if the method is not known or was not saved, or the arguments do not fit it
     """
     if not isinstance(transfer, dict) or transfer.get(KIND) != SAVED:
         return transfer
@@ -93,9 +100,7 @@ def restore_transfer(transfer: Any) -> Any:
             f"the model was saved with the transfer method {name}, which {missing} pass it again, load(..., transfer=...)"
         )
     try:
-        given = from_plain(arguments)
-        renamed = found[-1].renamed_arguments
-        return found[-1](**{renamed.get(argument, argument): value for argument, value in given.items()})
+        return found[-1](**from_plain(arguments))
     except TypeError as error:
         raise ValueError(f"what was saved of the transfer method {name} does not fit it ({error})") from error
 
@@ -105,9 +110,8 @@ def _name(method: type) -> str:
 
 
 def _public(name: str) -> str:
-    """The public name of a method of this package, which stays when modules move: files have had that of the module."""
-    package, _, method = name.rpartition(".")
-    return f"sb3_combrel.{method}" if package.startswith("sb3_combrel.transfer.") else name
+    """The public name of a method of this package, which stays when modules move."""
+    return f"{PACKAGE}.{name.rpartition('.')[2]}" if name.startswith(METHODS) else name
 
 
 def _subclasses(method: Any) -> list[type[Transfer]]:

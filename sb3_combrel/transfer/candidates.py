@@ -21,7 +21,6 @@ OneSource = SourceInstances | str | os.PathLike[str] | Mapping[str, Any]
 SourceLike = OneSource | Sequence[OneSource]
 MappingsLike = str | InterTaskMapping | FactoredMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
-
 # Compliance is stored with every candidate, for thousands of transitions.
 MAX_WHOLE_MAPPINGS = 20_000
 
@@ -30,8 +29,7 @@ class Candidate(NamedTuple):
     """
     What a candidate stands for.
 
-    :param target_action: number of the target action
-    :param source_action: name of the source action that it is mapped to
+    :param target_action: number of the target action; ``source_action``: name of what it is mapped to
     :param state_mapping: the pairs of target and source variables, as text
     :param action_mapping: names of the source actions of all target actions, where whole mappings are candidates; else ()
     """
@@ -44,13 +42,11 @@ class Candidate(NamedTuple):
 
 class MappedVariables(NamedTuple):
     """
-    What a candidate makes of each target variable under its target action, in numbers; those of no source variable are -1.
+    What a candidate makes of each target variable under its target action, in numbers; -1 for no source variable.
 
-    :param target_action: number of the target action
     :param source: number of the source task, int64, shape (n_target_variables,)
-    :param variable: variable of that source, int64, same shape
-    :param sign: -1 for a mirrored variable, 1 for others, 0 for those of no source variable, int64, same shape
-    :param action: action of that source that moves the variable, int64, same shape
+    :param variable: variable of that source; ``action``: action of it that moves the variable; int64, same shape
+    :param sign: -1 for a mirrored variable, 1 for others, 0 for no source variable, int64, same shape
     """
 
     target_action: int
@@ -67,14 +63,7 @@ class MappedVariables(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """
-    Where a candidate comes from.
-
-    :param source: number of the source task
-    :param target_action: number of the target action
-    :param state_index: number of the state mapping in that source's set
-    :param source_action: number of the action in that source task
-    """
+    """Where a candidate comes from: numbers of source task, target action, state mapping of its set, and its action."""
 
     source: int
     target_action: int
@@ -87,8 +76,7 @@ class CandidateArrays(NamedTuple):
     The candidates of all target actions: ``first[a]`` to ``first[a + 1]`` are those of action a.
 
     :param first: int64, shape (n_target_actions + 1,)
-    :param row: int64, shape (n_candidates,): state mapping, a row of the mapping table
-    :param action: int64, shape (n_candidates,): source action
+    :param row: int64, shape (n_candidates,): state mapping, a row of the mapping table; ``action``: source action
     """
 
     first: np.ndarray
@@ -112,9 +100,9 @@ class Candidates:
     """
     The candidates of each target action: pairs of a state mapping and a source action.
 
-    Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The rest of a
-    mapping, the source actions of other target actions, plays no part in what is translated for an action. It does where
-    whole mappings are to be distinguished: then each is a candidate of every action, in the same order.
+    Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
+    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished:
+    then each is a candidate of every action, in the same order.
 
     :param source: instances, a path to them, or a list of several
     :param mappings: mappings from the target to the source (see ``resolve``)
@@ -179,11 +167,7 @@ class Candidates:
         return len(self.origins)
 
     def with_own(self, instances: Instances) -> Candidates:
-        """
-        Return the same candidates, each with instances of its own to translate, in place of those of its source action.
-
-        :param instances: those of "action" c are candidate c's, in coordinates of its source
-        """
+        """Return the same candidates, each with instances of its own: those of "action" c are candidate c's."""
         made = copy.copy(self)
         made.instances = instances
         made.arrays = self.arrays._replace(action=np.arange(len(self), dtype=np.int64))
@@ -241,9 +225,8 @@ class Candidates:
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
     """
-    Return the source instances that a user means; a task is learned, unless that was done before.
+    Return the source instances that a user means, as :func:`~sb3_combrel.sources.recipes.find_source`, of one or of several.
 
-    :param source: what :func:`~sb3_combrel.sources.recipes.find_source` takes, or a list of such
     :raises FileNotFoundError: if there is neither a file nor a task of that name
     :raises ValueError: if it is something else, or the task cannot be learned
     """
@@ -258,12 +241,12 @@ def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, ta
     """
     Return the set of mappings that a user means for each source, with names.
 
-    :raises ValueError: if ``mappings`` is factored, or does not fit the tasks
+    :raises ValueError: if it is factored, or does not fit the tasks
     """
     if isinstance(mappings, FactoredMapping):
         raise ValueError(f'factored mappings need use="prior", got mappings={mappings!r}')
     return [
-        resolve(mappings, **_sizes(one, task)).with_names(
+        resolve(mappings, **sizes(one, task)).with_names(
             one.state_names, task.state_names, one.action_names, task.action_names
         )
         for one in sources
@@ -272,11 +255,10 @@ def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, ta
 
 def load_one_source(source: SourceLike, method: str) -> SourceInstances:
     """
-    Return the source instances of a method that takes those of one task.
+    Return the source instances of a method that takes those of one task, as :func:`load_sources`.
 
     :param method: its name, for the message
-    :raises FileNotFoundError: if there is no file at a path
-    :raises ValueError: if it is not instances, a path, or a list of one of these
+    :raises ValueError: also if there are several
     """
     found = load_sources(source)
     if len(found) > 1:
@@ -288,8 +270,7 @@ def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
     """
     Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
 
-    They are sorted along a curve that fills the space, so that a search passes over most blocks. A variable counts as
-    periodic if it is in all sources that have it.
+    They are sorted along a curve that fills the space. A variable is periodic if it is in all sources that have it.
     """
     n_actions = sum(source.n_actions for source in sources)
     n_variables = max(source.n_variables for source in sources)
@@ -316,7 +297,8 @@ def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:
     )
 
 
-def _sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:
+def sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:
+    """Return how many variables and actions a source and a target have, as the mappings' functions name them."""
     return {
         "n_source_variables": source.n_variables,
         "n_target_variables": task.n_variables,

@@ -3,11 +3,10 @@
 This is the specification: one function an equation, written to be read and compared with, not to be fast. The compiled
 code of this package computes the same.
 
-Notation and units. Index i runs over target transitions, j over source instances; t and m are their numbers, d is the
-number of target variables. States are unit coordinates (:class:`~sb3_combrel.common.scaling.StateScaling`), an *effect*
-is next state minus state in unit coordinates, rewards are raw. Actions are discrete: two transitions with different
-actions are infinitely far apart, so a target transition is compared only with the source instances whose action its own
-action is mapped to ("only to the target task instances that apply action a", Section 5.1).
+Index i runs over target transitions, j over source instances; t and m are their numbers, d is the number of target variables.
+States are unit coordinates (:class:`~sb3_combrel.common.scaling.StateScaling`), an *effect* is next state minus state, rewards
+are raw. Two transitions with different actions are infinitely far apart, so a target transition is compared only with the
+source instances whose action its own is mapped to ("only to the target task instances that apply action a", Section 5.1).
 """
 
 import math
@@ -65,8 +64,8 @@ class Bandwidths(NamedTuple):
 class VirtualSource(NamedTuple):
     """Source instances of one target action, translated to the target task and seen from t target states.
 
-    :param start: where each instance starts, shape (t, m, d). It depends on the state from which it is seen: a target
-        variable mapped to None keeps the value that it has there, and so adds nothing to any distance
+    :param start: where each instance starts, shape (t, m, d). A target variable mapped to None has the value of the state
+        from which it is seen, and so adds nothing to any distance
     :param effect: s'_j - s_j, shape (m, d); 0 for variables mapped to None: they are predicted not to change
     :param reward: shape (m,)
     :param terminated: bool, shape (m,)
@@ -98,7 +97,6 @@ def phi(x: Floats, delta: float) -> Floats:
 
     :param x: distances, any shape
     :param delta: bandwidth, in squared units of ``x``
-    :return: values in [0, 1], same shape
     """
     return np.exp(-(x**2) / delta)
 
@@ -106,8 +104,8 @@ def phi(x: Floats, delta: float) -> Floats:
 def virtual_source(source: Transitions, mapping: InterTaskMapping, action: int, states: Floats) -> VirtualSource:
     """Translate the source instances that ``mapping`` gives to a target action (lines 4-5 of Algorithm 1).
 
-    :param source: source instances, in the source's unit coordinates
-    :param action: target action; only instances with the source action that it maps to are translated
+    :param source: in the source's unit coordinates
+    :param action: target action
     :param states: target states from which the instances are seen, shape (t, d)
     """
     chosen = source.with_action(mapping.source_action(action))
@@ -132,7 +130,6 @@ def normalized_weights(distances: Floats, delta: float, axis: int = 1) -> Floats
     """Compute w_ij of Eq. 2: the kernel of the distance, normalised over the source instances j.
 
     :param distances: of where transitions and instances start, shape (t, m)
-    :param delta: delta_sa
     :param axis: over which the weights add up to 1: 1 for the source instances (compliance), 0 for the target
         transitions (w_ji, relevance)
     :return: shape (t, m); 0 where all kernels are 0 to machine precision
@@ -149,7 +146,6 @@ def transition_compliances(weights: Floats, effects: Floats, virtual: VirtualSou
 
     :param weights: w_ij, shape (t, m)
     :param effects: s'_i - s_i of the target transitions, shape (t, d)
-    :param delta: delta_s'
     :return: shape (t, m)
     """
     return weights * phi(np.linalg.norm(effects[:, None, :] - virtual.effect, axis=2), delta)
@@ -160,7 +156,6 @@ def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource,
 
     :param weights: w_ij, shape (t, m)
     :param rewards: r_i of the target transitions, shape (t,)
-    :param delta: delta_r
     :return: shape (t, m)
     """
     return weights * phi(np.abs(rewards[:, None] - virtual.reward), delta)
@@ -169,13 +164,10 @@ def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource,
 def compliance(of_transitions: Floats, of_rewards: Floats, axis: int = 1) -> Floats:
     """Compute lambda_i = (sum_j lambda^P_ij) (sum_j lambda^R_ij), Eqs. 1, 3 and 5 without Z^P and Z^R.
 
-    Each sum is a mean weighted by w_ij, so a transition that the instances predict perfectly has 1. Z^P and Z^R are left
-    out because all mappings must share them: a common factor does not change which mapping is best. Computed for each
-    mapping on its own, they would make the sums over the whole target sample equal for all mappings, and erase the
-    difference that is to be measured.
+    Each sum is a mean weighted by w_ij, so a transition that the instances predict perfectly has 1. Z^P and Z^R, which all
+    mappings must share, do not change which one is best; of each mapping on its own they would erase all differences.
 
-    :param of_transitions: lambda^P_ij, shape (t, m)
-    :param of_rewards: lambda^R_ij, same shape
+    :param of_transitions: lambda^P_ij, shape (t, m); ``of_rewards``: lambda^R_ij, same shape
     :param axis: 1 to sum over source instances; 0 to sum over target transitions, for lambda_{T,sigma_j} of Eq. 7
     :return: values in [0, 1], shape (t,), or (m,) for ``axis=0``
     """
@@ -188,10 +180,8 @@ def sample_compliance(
     """Compute the compliance of each target transition with one virtual source task (Eq. 5; lines 9-13 of Algorithm 1).
 
     :param transitions: target sample, with any actions
-    :param source: source instances
-    :param min_evidence: a transition near which the kernels of all instances, sum_j phi(d_ij) with delta_sa, add up to
-        less has compliance 0. Without such a guard an instance far away looks as good as one near by, since weights are
-        normalised. 0 is the paper: only a sum that is 0 to machine precision, for which Eq. 2 is not defined, gives 0
+    :param min_evidence: a transition for which sum_j phi(d_ij) with delta_sa is less has compliance 0: since weights are
+        normalised, an instance far away would look as good as one near by. 0 is the paper
     :return: values in [0, 1], shape (t,)
     """
     found = np.zeros(len(transitions.reward))
@@ -220,13 +210,10 @@ def task_compliance(compliances: Floats, prior: float = 1.0) -> float:
 def average_distance(distances: Floats, weights: Floats, mu: float) -> float:
     """Compute d_j of Eq. 4: the mean distance from a source instance to the h_j nearest target transitions.
 
-    h_j is the largest number of transitions, nearest first (that is, largest weight first), whose weights w_ji add up to
-    less than mu: the transition with which they would reach mu does not count. Where the nearest one alone reaches mu,
-    h_j would be 0 and the mean undefined; then the nearest one counts.
+    h_j is the largest number of transitions, nearest first, whose weights w_ji add up to less than mu; at least 1.
 
     :param distances: from the instance to the transitions, shape (t,), t > 0
     :param weights: w_ji, adding up to 1 over the transitions, same shape
-    :param mu: fraction of the weight, in (0, 1]
     :raises ValueError: if ``mu`` is outside (0, 1]
     """
     if not 0.0 < mu <= 1.0:
@@ -240,8 +227,7 @@ def average_distance(distances: Floats, weights: Floats, mu: float) -> float:
 def relevance(with_target: float, distance: float) -> float:
     """Compute rho_j = exp(-((lambda_{T,sigma_j} - 1) / d_j)^2), Eq. 7.
 
-    :param with_target: lambda_{T,sigma_j}, 1 for an instance that agrees perfectly with the target's transitions
-    :param distance: d_j
+    :param with_target: lambda_{T,sigma_j}; ``distance``: d_j
     :return: value in [0, 1]; for d_j = 0 the limit: 1 at perfect compliance, 0 otherwise
     """
     off, distance = float(with_target) - 1.0, float(distance)
@@ -255,15 +241,9 @@ def near_relevances(with_target: Floats, evidence: Floats) -> Floats:
 
     rho_j = (e_j lambda_j + mean) / (e_j + 1), where mean = sum_j e_j lambda_j / sum_j e_j.
 
-    Eq. 7 tends to 1 with the distance d_j whatever the compliance is: an instance far from all transitions, even one that the
-    nearest of them contradict, comes before one that near transitions bear out but for a little. Here distance is lack of
-    evidence and nothing else: the relevance of an instance is its compliance, estimated from evidence e_j together with what
-    is known of all instances, which counts as one transition at the same place. So one without near transitions is as
-    relevant as the instances are on average: it comes after those that are borne out and before those that are contradicted.
-
-    Measured with COMBREL on MountainCar4D (instances through "injective", ``degree=0``, breadth 0.1, 12 episodes, 3 seeds): in
-    the order of distance 3,209, 3,444 and 3,201 steps; of Eq. 7 11,357, 8,259 and 5,918; of this one times the weight 3,224,
-    3,084 and 3,257.
+    Eq. 7 tends to 1 with the distance d_j whatever the compliance is. Here distance is lack of evidence and nothing else: the
+    compliance of an instance is estimated from evidence e_j and the mean of all instances, which counts as one transition. So
+    one without near transitions comes after those that are borne out and before those that are contradicted.
 
     :param with_target: lambda_{T,sigma_j}, shape (m,)
     :param evidence: e_j = sum_i phi(d_ij) with delta_sa, the weights w_ji before they are normalised, same shape
@@ -274,12 +254,12 @@ def near_relevances(with_target: Floats, evidence: Floats) -> Floats:
     return (evidence * with_target + mean) / (evidence + 1.0)
 
 
-def source_near_relevances(
+def instance_compliances(
     source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths
-) -> Floats:
-    """Compute :func:`near_relevances` of the source instances of one target action.
+) -> tuple[Floats, Floats, Floats]:
+    """Compute lambda_{T,sigma_j} of the source instances of one target action, for Eq. 7.
 
-    Parameters and order: see :func:`source_relevances`.
+    :return: distances d_ij and weights w_ji, shape (t, m), and the compliances, shape (m,)
     """
     states, _, effects, rewards, _ = transitions.with_action(action)
     virtual = virtual_source(source, mapping, action, states)
@@ -287,7 +267,15 @@ def source_near_relevances(
     weights = normalized_weights(distances, bandwidths.start, axis=0)
     of_transitions = transition_compliances(weights, effects, virtual, bandwidths.outcome)
     of_rewards = reward_compliances(weights, rewards, virtual, bandwidths.reward)
-    return near_relevances(compliance(of_transitions, of_rewards, axis=0), phi(distances, bandwidths.start).sum(axis=0))
+    return distances, weights, compliance(of_transitions, of_rewards, axis=0)
+
+
+def source_near_relevances(
+    source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths
+) -> Floats:
+    """Compute :func:`near_relevances` of the source instances of one target action (see :func:`source_relevances`)."""
+    distances, _, compliances = instance_compliances(source, mapping, action, transitions, bandwidths)
+    return near_relevances(compliances, phi(distances, bandwidths.start).sum(axis=0))
 
 
 def source_relevances(
@@ -300,14 +288,8 @@ def source_relevances(
     :return: values in [0, 1], in the order of the instances of :func:`virtual_source`, shape (m,). An instance without a
         near transition (all kernels 0 to machine precision) has 1: there is no evidence against its transfer
     """
-    states, _, effects, rewards, _ = transitions.with_action(action)
-    virtual = virtual_source(source, mapping, action, states)
-    distances = start_distances(states, virtual)
-    weights = normalized_weights(distances, bandwidths.start, axis=0)
-    of_transitions = transition_compliances(weights, effects, virtual, bandwidths.outcome)
-    of_rewards = reward_compliances(weights, rewards, virtual, bandwidths.reward)
-    compliances = compliance(of_transitions, of_rewards, axis=0)
-    found = np.ones(len(virtual.reward))
+    distances, weights, compliances = instance_compliances(source, mapping, action, transitions, bandwidths)
+    found = np.ones(len(compliances))
     for j in np.flatnonzero(weights.sum(axis=0) > 0.0):
         found[j] = relevance(compliances[j], average_distance(distances[:, j], weights[:, j], mu))
     return found
@@ -318,13 +300,10 @@ def nearest_transitions(
 ) -> Ints:
     """Find the k target transitions nearest to a state and action (line 17 of Algorithm 1).
 
-    :param state: unit coordinates, shape (d,)
     :param n_neighbors: k
     :param action_distance: distance between two different actions, in unit coordinates. Infinity: only transitions with
-        the same action are neighbours, and of an action mapping only this action matters. Finite: neighbours run over
-        states and actions together, with each of them compliance depends on its own action, and so mappings that differ
-        in other actions differ here too. Table 2 needs this second reading: two mappings that agree in the action have
-        different shares there
+        the same action are neighbours, and of an action mapping only this action matters. Finite: mappings that differ in
+        other actions differ here too, as in Table 2
     :return: rows of ``transitions``, the nearest first, at most k
     """
     apart = np.where(transitions.action == action, 0.0, action_distance)
@@ -358,17 +337,13 @@ def transferred_instances(
     """Choose the translated instances that complete the model at a state and action (lines 16, 18, 21 and 22).
 
     They are added in the order of their relevance or, without it, of their distance (as in TIMBREL), until their weights
-    exp(-d^2 / b^2) and the weight of the target's own instances reach the threshold. If they cannot reach it, nothing is
-    transferred, and the pair stays unknown.
+    exp(-d^2 / b^2) and the weight of the target's own instances reach the threshold. If they cannot, nothing is transferred.
 
     :param state: unit coordinates, shape (d,)
     :param own_weight: sum of the weights of the target's own instances there
-    :param virtual: instances seen from this state alone, ``start`` of shape (1, m, d). Those of several mappings may be
-        joined (the pool of TIMBREL)
-    :param relevances: shape (m,), or None for the order of distance. ``min_fraction`` applies to that order only: the
-        most relevant instance may be a light one, and heavier ones come after it
-    :param times_weight: in the order of relevance times weight, so that instances which are equally relevant come in the order
-        of distance: with :func:`near_relevances`, where all of them are equal as long as there is no evidence
+    :param virtual: instances seen from this state alone, ``start`` of shape (1, m, d); of several mappings for TIMBREL's pool
+    :param relevances: shape (m,), or None for the order of distance, the only one to which ``min_fraction`` applies
+    :param times_weight: in the order of relevance times weight, for :func:`near_relevances`
     :return: numbers of the instances, in the order in which they are added, int64, and their weights, same shape
     """
     [weights] = phi(start_distances(state[None, :], virtual), rules.breadth**2)
@@ -388,11 +363,9 @@ def transferred_instances(
 def running_scales(effects: Floats) -> Floats:
     """Compute what squared errors are compared with when the source's own model is judged (``use="prior"``; no equation).
 
-    Of each variable the square of the mean size of its effects so far. The mean of their squares would be that of a few
-    large ones, such as those of a car that hits the wall, beside which nothing else counts.
+    Of each variable the square of the mean size of its effects so far. A mean of squares would be that of a few large ones.
 
-    :param effects: of the target's transitions, in the order in which they came, shape (t, d)
-    :return: at each transition, shape (t, d)
+    :param effects: of the target's transitions, in the order in which they came, shape (t, d); so is what is returned
     """
     so_far = np.cumsum(np.abs(effects), axis=0) / np.arange(1, len(effects) + 1)[:, None]
     return so_far**2
@@ -402,8 +375,7 @@ def prediction_compliances(effects: Floats, predicted: Floats, scales: Floats) -
     """Compute the compliance of target transitions with what a source's model predicts of them through one mapping.
 
     The outcome's factor of Eq. 2, with one prediction in place of a weighted mean over instances, and a scale for each
-    variable. Being a product over variables, it factorises over the copies of a factored mapping: each copy has the
-    compliance of its own variables, whatever moves the others.
+    variable. A product over variables, it factorises over the copies of a factored mapping.
 
     :param effects: s'_i - s_i, shape (t, d), of the variables that count; ``predicted`` and ``scales``: the same shape
     :return: values in [0, 1], shape (t,); 1 where all is predicted exactly

@@ -29,7 +29,6 @@ class RecordedTransitions:
         Record one transition.
 
         :param state: shape (n_variables,); ``effect``: next state minus state, same shape
-        :param action: target action
         :param reward: raw
         :return: its number
         """
@@ -43,15 +42,9 @@ class RecordedTransitions:
         self.n += 1
         return i
 
-    def of_action(self, action: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return states, effects and rewards of the transitions with one action."""
-        rows = np.flatnonzero(self.actions[: self.n] == action)
-        return self.states[rows], self.effects[rows], self.rewards[rows]
-
     def rows(self) -> np.ndarray:
         """Return all of them, one a row: state, effect, reward, action; shape (n, 2 * n_variables + 2)."""
-        n = self.n
-        return np.hstack([self.states[:n], self.effects[:n], self.rewards[:n, None], self.actions[:n, None]])
+        return np.column_stack([getattr(self, name)[: self.n] for name in self.columns])
 
     def restore(self, rows: np.ndarray, n_actions: int) -> None:
         """
@@ -61,15 +54,11 @@ class RecordedTransitions:
         """
         d = self.states.shape[1]
         for row in rows:
-            self.add(row[:d], int(np.clip(row[-1], 0, n_actions - 1)), float(row[-2]), row[d : 2 * d])
+            self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])
 
 
 class RecordedEpisodes(RecordedTransitions):
-    """
-    Recorded transitions, and how the episode of each went on: ``GOES_ON``, ``TERMINATED`` or ``TIME_LIMIT``.
-
-    :param n_variables: number of state variables of the target
-    """
+    """Recorded transitions, and how the episode of each went on: ``GOES_ON``, ``TERMINATED`` or ``TIME_LIMIT``."""
 
     columns = (*RecordedTransitions.columns, "ended")
     GOES_ON, TERMINATED, TIME_LIMIT = 0, 1, 2
@@ -79,11 +68,6 @@ class RecordedEpisodes(RecordedTransitions):
         self.ended = np.empty(64, dtype=np.int64)
 
     def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
-        """
-        Record one transition; parameters: see :meth:`RecordedTransitions.add`.
-
-        :param terminated: it ended its episode in a terminal state
-        """
         i = super().add(state, action, reward, effect)
         self.ended[i] = self.TERMINATED if terminated else self.GOES_ON
         return i
@@ -93,10 +77,6 @@ class RecordedEpisodes(RecordedTransitions):
         if self.n:
             self.ended[self.n - 1] = self.TIME_LIMIT
 
-    def rows(self) -> np.ndarray:
-        """Return all of them, one a row: state, effect, reward, action, how it ended; shape (n, 2 * n_variables + 3)."""
-        return np.column_stack([super().rows(), self.ended[: self.n]])
-
     def restore(self, rows: np.ndarray, n_actions: int) -> None:
-        super().restore(rows[:, :-1], n_actions)
+        super().restore(rows, n_actions)
         self.ended[: self.n] = rows[:, -1]

@@ -26,18 +26,15 @@ class MappingReport:
     """
     What one target action was taken for.
 
-    Compliance is the mean of exp(-squared error / scale) over the target's own transitions with this action, from 0 to 1;
-    errors are mean squared errors of predicted effects over those of "no change", so 1 is as good as that and 0 is exact. What
-    cannot be told is NaN.
+    Compliance is the mean of exp(-squared error / scale) over the target's own transitions with this action; errors are mean
+    squared errors of predicted effects over those of "no change". What cannot be told is NaN.
 
     :param target_action: name of the target action
-    :param mapping: source action and variables, by name: "Right on (x, vx), Neutral on (y, vy)"; with ``use="instances"`` of
-        the mapping used most
+    :param mapping: source action and variables, by name; with ``use="instances"`` of the mapping used most
     :param share: fraction of this action's transfers that used this mapping
     :param n_mappings: number of mappings that were used for this action
     :param compliance: of this mapping; with ``use="instances"`` of what was chosen, averaged over states
-    :param next_best: the mapping of the highest compliance among the others, by name; "" for none, and with
-        ``use="instances"``, where it may be another in each state
+    :param next_best: the mapping of the highest compliance among the others, by name; "" for none or another in each state
     :param next_best_compliance: its compliance
     :param no_change_compliance: compliance of the prediction that no variable changes
     :param error: prediction error of what was transferred
@@ -95,8 +92,8 @@ class TransferReport:
     :param use: "instances" or "prior"
     :param sources: the source tasks
     :param n_steps: steps of the target that were observed; None if the method does not count them
-    :param n_rested: of these, steps that rested on the source: with ``use="instances"`` those whose action was predicted by
-        transferred instances, with ``use="prior"`` those whose outcome the source claimed to know; None as above
+    :param n_rested: of these, steps whose action transferred instances predicted, or whose outcome the source, as a prior,
+        claimed to know; None as above
     :param mappings: one for each target action that was mapped
     :param next_best: with a factored mapping, the next best division of the target's variables, by name; else ""
     :param next_best_error: its prediction error; ``error``: that of what was transferred, over all actions

@@ -22,9 +22,7 @@ def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadt
     """
     Write what each action, held until the cell is left, does at each point of a grid over the source's states.
 
-    :param source: instances of the source task
-    :param model: of these instances
-    :param gamma: discount factor
+    :param model: of the source's instances
     :param breadth: kernel breadth of the model, in unit coordinates of the source; the grid is chosen for it
     :param min_weight: weight of the model's prediction from which on a pair has a model; the others are optimistic
     """

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inner
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
@@ -20,26 +20,11 @@ DEFAULT_N_NEIGHBORS = 24
 DEFAULT_OUTCOME_BREADTH = 0.05
 
 
-class SourceArrays(NamedTuple):
-    """A source's local linear model for compiled code.
-
-    :param instances: Instances, as a plain tuple
-    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
-    :param kernel: Kernel, as a plain tuple
-    :param near: NearestLists, as a plain tuple: work space
-    """
-
-    instances: tuple
-    effect_range: np.ndarray
-    kernel: tuple
-    near: tuple
-
-
 class SourcePredictions(NamedTuple):
     """What a source predicts of n state-action pairs of its own. Unit coordinates of the source.
 
     :param effect: float64, shape (n, n_variables): predicted displacement
-    :param reward: float64, shape (n,)
+    :param reward: float64, shape (n,), raw
     :param end: float64, shape (n,): probability of termination
     :param weight: float64, shape (n,): how well founded the prediction is, see :class:`SourceModel`
     """
@@ -50,14 +35,19 @@ class SourcePredictions(NamedTuple):
     weight: np.ndarray
 
 
+@inlined
+def source_arrays(plain):
+    """Instances, range of effects, Kernel and NearestLists from ``SourceModel.plain``."""
+    return Instances(*plain[0]), plain[1], Kernel(*plain[2]), NearestLists(*plain[3])
+
+
 @inner
 def predict_source(instances, effect_range, kernel, near, action, state, effect):
     """Predict one state and action of the source.
 
-    :param instances: Instances; ``kernel``: Kernel; ``near``: NearestLists
+    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
     :param effect: receives the predicted displacement, shape (n_variables,)
-    :return: reward, probability of termination, weight (see :class:`SourceModel`); 0 throughout, and no displacement, for an
-        action without instances
+    :return: reward, probability of termination, weight (see :class:`SourceModel`); all 0 for an action without instances
     """
     item, distance = near.item[action], near.distance[action]
     length = nearest_instances(instances, action, state, kernel.reach, item, distance, near.length[action])
@@ -97,8 +87,7 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
 def beyond_data(sums, factor, state, scratch):
     """The squared distance of a state from the mean of the instances of a fit, in units of their spread along that way.
 
-    :param sums: of the fit; ``factor``: Cholesky factor of the spread, as :func:`solve_regression` leaves it
-    :param scratch: float64, at least n_variables long
+    :param factor: Cholesky factor of the spread, as :func:`solve_regression` leaves it
     """
     distance = 0.0
     for j in range(len(state)):
@@ -112,9 +101,8 @@ def beyond_data(sums, factor, state, scratch):
 
 @compiled
 def predict_many(source, states, actions, predictions):
-    """Predict many states and actions; ``source``: SourceArrays, ``predictions``: SourcePredictions, as plain tuples."""
-    instances, effect_range, kernel, near = source
-    instances, kernel, near = Instances(*instances), Kernel(*kernel), NearestLists(*near)
+    """Predict many states and actions; ``source``: ``SourceModel.plain``, ``predictions``: SourcePredictions as a tuple."""
+    instances, effect_range, kernel, near = source_arrays(source)
     effect, reward, end, weight = predictions
     for i in range(len(actions)):
         reward[i], end[i], weight[i] = predict_source(instances, effect_range, kernel, near, actions[i], states[i], effect[i])
@@ -134,9 +122,7 @@ class SourceModel:
 
     The weight of a prediction is the sum of exp(-d^2 / breadth^2) over these instances, divided by 1 + z^2, where z is how
     far the state is from their mean in units of their spread along that way: so the variance of what a linear fit predicts
-    grows, and weight / (1 + z^2) instances all around the state would predict as well. At the edge of its data, and beyond,
-    a source knows less than the mere number of instances nearby suggests. In MountainCar2D no transition starts beyond the
-    goal, where one car of MountainCar4D waits for the other.
+    grows. At the edge of its data a source knows less than the number of instances nearby suggests.
 
     :param instances: of the source, in unit coordinates of it
     :param breadth: unit coordinates of the source
@@ -175,9 +161,8 @@ class SourceModel:
             fit=np.empty(d + d * d),
             outcome=np.empty(3 + 2 * d),
         )
-        # Plain tuples for compiled code (see ``common.compiled``).
-        self.arrays = SourceArrays(tuple(instances), effect_range, tuple(self.kernel), tuple(near))
-        self.plain = tuple(self.arrays)
+        #: For compiled code, see :func:`source_arrays`.
+        self.plain = tuple(instances), effect_range, tuple(self.kernel), tuple(near)
 
     @property
     def n_variables(self) -> int:

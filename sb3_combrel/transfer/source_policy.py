@@ -18,11 +18,10 @@ MIN_WEIGHT = 1.0
 
 class SourcePolicy:
     """
-    What is best in a source task, as far as its instances tell.
+    What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
 
-    The source's local linear model predicts every action at the states of a grid, and value iteration on these predictions
-    gives the value function: Fitted R-Max's planning, but without optimism. An action with too few instances near a state
-    cannot be taken there, and a grid point without any such action counts as the worst of its neighbours.
+    An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst
+    of its neighbours.
 
     :param source: instances of the source task
     :param gamma: discount factor, below 1, as the least and the largest value are computed with it

@@ -6,14 +6,14 @@ from helpers import factored as f
 from helpers.factored import bound, inside, show
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping
-from sb3_combrel.transfer.borne_out import GOES_ON
+from sb3_combrel.transfer.outcome_evidence import GOES_ON
 from sb3_combrel.transfer.prior.claims import PRESUMED, part_explained, trust_in
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
 
 
 @pytest.mark.parametrize(
-    ("missed", "founded", "trust"),
+    ("unexplained", "n_covered", "trust"),
     [
         # Nothing seen; too little seen, however exact.
         (0.0, 0.0, 0.0),
@@ -31,15 +31,15 @@ TWO = f.copies_mapping(2, (0, 2, 1, 3))
         (200.0, 100.0, 0.0),
     ],
 )
-def test_trust_is_what_is_explained_in_steps_or_nothing(missed, founded, trust):
+def test_trust_is_what_is_explained_in_steps_or_nothing(unexplained, n_covered, trust):
     # Of a second variable everything is explained, of a second action nothing.
-    missed, founded = np.array([[missed, 0.0], [founded, 0.0]]), np.full((2, 2), founded)
-    np.testing.assert_allclose(trust_in(missed, founded), [trust, 0.0], atol=1e-12)
+    unexplained, n_covered = np.array([[unexplained, 0.0], [n_covered, 0.0]]), np.full((2, 2), n_covered)
+    np.testing.assert_allclose(trust_in(unexplained, n_covered), [trust, 0.0], atol=1e-12)
 
 
 def test_what_is_explained_is_that_of_the_variable_of_which_least_is():
-    missed, founded = np.array([[1.0, 5.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[10.0, 10.0, 2.0], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(part_explained(missed, founded), [min(9.0 / 13.0, 5.0 / 13.0, 2.0 / 5.0), 0.0])
+    unexplained, n_covered = np.array([[1.0, 5.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[10.0, 10.0, 2.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(part_explained(unexplained, n_covered), [min(9.0 / 13.0, 5.0 / 13.0, 2.0 / 5.0), 0.0])
 
 
 def test_claims_are_ten_times_the_weight_of_the_data_times_trust():
@@ -97,17 +97,6 @@ def test_noise_in_a_variable_that_an_action_leaves_alone_is_no_motion(size, trus
     assert trust[0] == 0.0 and ((trust[1:] > 0.75).all() if trusted else not trust[1:].any())
 
 
-def test_a_typical_effect_is_that_of_the_action_that_moves_a_variable_most():
-    def effects(states, actions):
-        moved = np.where(actions == 2, 0.08, 0.001)
-        return np.column_stack([moved, np.full(len(states), 0.02)])
-
-    copies = bound(COMBREL(f.oscillator_source(effects=effects), "factored", use="prior"), 2, 3).source_prior.copies
-    both = int(np.flatnonzero((copies.state == [0, 1]).all(axis=1))[0])
-    np.testing.assert_allclose(copies.table.most[both], (0.25 * np.array([0.08, 0.02])) ** 2, rtol=0.1)
-    np.testing.assert_allclose(copies.table.least[both], (0.25 * np.array([0.001, 0.02])) ** 2, rtol=0.1)
-
-
 @pytest.mark.parametrize(("moved", "compared"), [(0.0001, 0.001), (0.01, 0.01), (0.5, 0.08)])
 def test_errors_are_compared_with_what_the_target_moves_between_what_the_source_does(moved, compared):
     def effects(states, actions):
@@ -119,7 +108,7 @@ def test_errors_are_compared_with_what_the_target_moves_between_what_the_source_
         prior.observe(np.array([0.5, 0.5]), action, -1.0, np.array([effect, 0.02]), False)
     both = int(np.flatnonzero((prior.copies.state == [0, 1]).all(axis=1))[0])
     expected = min(2.0, (0.001 / (0.25 * compared)) ** 2)
-    assert prior.sums.missed[both, 0, 0, 0] / prior.sums.founded[both, 0, 0] == pytest.approx(expected, rel=0.05)
+    assert prior.sums.unexplained[both, 0, 0, 0] / prior.sums.n_covered[both, 0, 0] == pytest.approx(expected, rel=0.05)
 
 
 def drive_to_the_end(n=200):

@@ -34,7 +34,7 @@ def test_with_whole_mappings_compliance_is_over_all_variables_those_unmapped_sta
     np.testing.assert_allclose(sums.compliance[3, :, 1], [each[actions == a].sum() for a in range(5)], rtol=1e-6)
 
 
-def test_what_is_missed_is_compared_with_what_the_target_moves_so_far_within_what_the_source_does():
+def test_what_is_unexplained_is_compared_with_what_the_target_moves_so_far_within_what_the_source_does():
     _, copies, sums, (states, actions, effects) = measured(2, 40, noise=0.01)
     [source] = copies.sources
     sizes = np.abs(source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))
@@ -49,13 +49,13 @@ def test_what_is_missed_is_compared_with_what_the_target_moves_so_far_within_wha
             seen = [np.abs(effects[: i + 1, v][actions[: i + 1] == a]) for a in range(5)]
             motion = max(each.mean() for each in seen if len(each))
             compared = max(effects[i, v] ** 2, (0.25 * min(max(motion, low[k]), high[k])) ** 2)
-            expected[action] += founded(copies, states[[i]], copy, u) * min(
+            expected[action] += covered(copies, states[[i]], copy, u) * min(
                 2.0, (effects[i, v] - predicted[i]) ** 2 / compared
             )
-        np.testing.assert_allclose(sums.missed[copy, :, u, v], expected, rtol=1e-4, err_msg=str((copy, v, u)))
+        np.testing.assert_allclose(sums.unexplained[copy, :, u, v], expected, rtol=1e-4, err_msg=str((copy, v, u)))
 
 
-def founded(copies, state, copy, u):
+def covered(copies, state, copy, u):
     """The weight of the source's data at a state, at most 1."""
     uses = copies.uses(np.array([[copy]]), np.array([[u]]))
     return min(1.0, copies.predict(uses, copies.work_space(uses), state, np.array([0]))[3][0])

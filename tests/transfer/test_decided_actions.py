@@ -55,26 +55,16 @@ def test_it_is_asked_once_at_each_step_of_learning_with_the_state_that_is_observ
     assert {action for *_, action, _ in method.observed[1::2]} == {1}
     assert {action for *_, action, _ in method.observed[::2]} == {0, 1}
     assert model.agent.model.n_instances == 70
-
-
-@pytest.mark.parametrize("deterministic", [True, False])
-def test_it_is_not_asked_for_predictions(deterministic):
-    model = small(transfer=Deciding()).learn(40)
-    model.predict(OBSERVATIONS, deterministic=deterministic)
+    for deterministic in (True, False):
+        model.predict(OBSERVATIONS, deterministic=deterministic)
     model.agent.q_values(np.array([0.5, 0.5]))
-    assert len(model.policy.transfer.asked) == 40
+    assert len(method.asked) == 70, "it is not asked for predictions"
 
 
 @pytest.mark.parametrize("method", [Silent, Undecided])
 def test_one_that_decides_nothing_leaves_learning_as_it_is_without_transfer(method):
     alone, with_it = small().learn(100), small(transfer=method()).learn(100)
     assert same_parameters(alone, with_it)
-
-
-def test_a_method_without_one_is_not_asked(monkeypatch):
-    agent = make_agent(1, 2, Silent())
-    monkeypatch.setattr(agent, "_decided_by_transfer", None)
-    assert agent.act(np.array([0.5])) in (0, 1)
 
 
 def test_each_environment_has_its_number():

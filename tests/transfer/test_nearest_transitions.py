@@ -1,7 +1,6 @@
 """Drawn choices: each candidate in proportion to its mean compliance, the same however often one asks."""
 
 import numpy as np
-import pytest
 from helpers import naive_transfer as naive
 from helpers.asking import changed_pairs
 from hypothesis import given, settings
@@ -9,7 +8,7 @@ from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL
 from sb3_combrel.transfer import equations
-from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
+from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose, select
 
 N_DRAWS = 4000
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -31,13 +30,13 @@ def shares(near, cache, n_candidates, n_before=5):
     first = np.array([0, n_before, n_before + n_candidates])
     actions = np.ones(N_DRAWS, dtype=np.int64)
     rows, each_near = np.arange(N_DRAWS, 2 * N_DRAWS), np.tile(near, (2 * N_DRAWS, 1))
-    choose_plain(rows, actions, each_near, tuple(cache), first, draws, choice)
+    choose(rows, actions, each_near, tuple(cache), first, draws, choice)
     assert (choice[:N_DRAWS] == -7).all()
     chosen = np.where(choice[N_DRAWS:] < 0, n_candidates, choice[N_DRAWS:] - n_before)
     return np.bincount(chosen, minlength=n_candidates + 1) / N_DRAWS
 
 
-@settings(deadline=None, derandomize=True, max_examples=40)
+@settings(deadline=None, derandomize=True, max_examples=20)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from([0.0, 0.4, 0.6, 2.0]))
 def test_each_candidate_is_drawn_in_proportion_to_its_mean_compliance(seed, n_candidates, least):
     rng = np.random.default_rng(seed)
@@ -51,7 +50,7 @@ def test_each_candidate_is_drawn_in_proportion_to_its_mean_compliance(seed, n_ca
     np.testing.assert_allclose(shares(near, cache, n_candidates), expected, atol=1.5 / N_DRAWS)
 
 
-@settings(deadline=None, derandomize=True, max_examples=40)
+@settings(deadline=None, derandomize=True, max_examples=20)
 @given(st.integers(0, 10**6), st.booleans(), st.sampled_from([(False, False), (True, False), (True, True)]))
 def test_at_a_sample_state_the_choice_is_the_same_as_on_the_grid(seed, drawn, periodic):
     rng = np.random.default_rng(seed)
@@ -67,12 +66,12 @@ def test_at_a_sample_state_the_choice_is_the_same_as_on_the_grid(seed, drawn, pe
     np.testing.assert_array_equal(due, near[:, :, 0] >= 0)
     on_grid, each = np.full(n_actions * len(POINTS), -1), np.repeat(np.arange(n_actions), len(POINTS))
     of_pairs = draws[each] if drawn else draws
-    choose_plain(np.arange(len(on_grid)), each, near.reshape(-1, 3), tuple(cache), first, of_pairs, on_grid)
+    choose(np.arange(len(on_grid)), each, near.reshape(-1, 3), tuple(cache), first, of_pairs, on_grid)
     recorded = states, *by_action(actions, n_actions), np.array(periodic)
     for p, state in enumerate(POINTS):
         asked = np.tile(state, (n_actions, 1)), np.arange(n_actions), np.zeros(n_actions)
         found = room_for(n_actions)
-        assert select_plain(asked, recorded, (1.0, limit), tuple(cache), first, draws, found)
+        assert select(asked, recorded, (1.0, limit), tuple(cache), first, draws, found)
         np.testing.assert_array_equal(found[0], near[:, p])
         np.testing.assert_array_equal(np.sort(found[0], axis=1), nearest(state, states, actions, periodic, limit))
         np.testing.assert_array_equal(candidates_of(found), on_grid.reshape(n_actions, -1)[:, p])
@@ -113,16 +112,6 @@ def by_action(actions, n_actions):
     return listed, np.bincount(actions, minlength=n_actions)
 
 
-def test_an_action_that_needs_nothing_has_no_neighbors():
-    query = np.zeros((2, 2)), np.arange(2), np.array([0.9, 1.0])
-    recorded = np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2), NOT_PERIODIC
-    found, cache = room_for(2), random_cache(np.random.default_rng(0), 3, 2, least=0.0)
-    assert select_plain(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found)
-    assert found[0].tolist() == [[0, -1, -1], [-1, -1, -1]]
-    first, second = candidates_of(found)
-    assert first in (0, 1) and second == -1
-
-
 def test_nothing_is_selected_before_all_neighbors_have_been_measured():
     query = np.zeros((2, 2)), np.arange(2), np.zeros(2)
     recorded = np.zeros((3, 2)), *by_action(np.array([0, 1, 1]), 2), NOT_PERIODIC
@@ -130,12 +119,12 @@ def test_nothing_is_selected_before_all_neighbors_have_been_measured():
     found[2][:], found[3][:] = 7, 7
     for i, complete in ((2, False), (0, True)):
         cache.measured[:] = [True, True, i != 2]
-        assert select_plain(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found) == complete
+        assert select(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found) == complete
         assert found[0].tolist() == [[0, -1, -1], [1, 2, -1]], "what is to be measured"
         assert (found[2] == 7).all() != complete
 
 
-@settings(deadline=None, derandomize=True, max_examples=60)
+@settings(deadline=None, derandomize=True, max_examples=25)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from([0.0, 0.375, 0.625, 2.0]))
 def test_the_best_candidate_is_the_best_mapping_of_algorithm_1(seed, n_candidates, least):
     rng = np.random.default_rng(seed)
@@ -146,7 +135,7 @@ def test_the_best_candidate_is_the_best_mapping_of_algorithm_1(seed, n_candidate
     transitions = equations.Transitions(sample, actions, np.zeros((20, 2)), np.zeros(20), np.zeros(20, dtype=bool))
     query, first = (rng.random((8, 2)), np.tile(np.arange(2), 4), np.zeros(8)), np.array([0, n_candidates, 2 * n_candidates])
     found, recorded = room_for(8, k), (sample, *by_action(actions, 2), NOT_PERIODIC)
-    assert select_plain(query, recorded, (1.0, np.inf), tuple(cache), first, np.empty(0), found)
+    assert select(query, recorded, (1.0, np.inf), tuple(cache), first, np.empty(0), found)
     for state, action, chosen in zip(query[0], query[1], candidates_of(found), strict=True):
         near = equations.nearest_transitions(state, action, transitions, k)
         best = equations.best_mapping(cache.compliance[near, :n_candidates], least)
@@ -170,10 +159,6 @@ class TestMethod:
         np.testing.assert_array_equal(one.choices(), same.choices())
         assert (one.choices() != other.choices()).mean() > 0.2
 
-    def test_the_choices_are_more_even_than_the_best_ones(self):
-        drawn, best = (self.bound(choice=choice).statistics()["transfer/choice_entropy"] for choice in ("drawn", "best"))
-        assert drawn > best + 0.1
-
     def selected(self, method, state):
         """The first candidates of the range selected for each action."""
         return method._instances.selector.select(np.tile(state, (2, 1)), np.arange(2), np.zeros(2))[0].tolist()
@@ -186,14 +171,3 @@ class TestMethod:
         assert method.rng.bit_generator.state == before[0]
         for name, array in method.get_state().items():
             np.testing.assert_array_equal(array, before[1][name])
-
-    def test_each_transition_draws_again(self):
-        method, seen = self.bound(max_transitions=15), set()
-        for _ in range(30):
-            seen.add(tuple(self.selected(method, np.full(2, 0.4))))
-            method.observe(np.full(2, 0.5), 0, -1.0, np.full(2, 0.6), False)
-        assert len(seen) > 5
-
-    def test_it_is_drawn_or_the_best(self):
-        with pytest.raises(ValueError, match='choice must be "best" or "drawn", got \'worst\''):
-            COMBREL(naive.random_source(np.random.default_rng(0), 10), choice="worst")

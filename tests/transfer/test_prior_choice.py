@@ -30,7 +30,7 @@ def all_divisions(members):
                 yield chosen
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 9))
 def test_the_best_division_is_the_best_of_all(seed, n_variables, n_copies):
     rng = np.random.default_rng(seed)
@@ -47,7 +47,7 @@ def test_the_best_division_is_the_best_of_all(seed, n_variables, n_copies):
     assert total(tuple(found)) == pytest.approx(max(map(total, all_divisions(members))))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_division_found_has_the_highest_score_of_all(seed):
     _, copies, sums, (states, actions, effects) = f.measured(2, 30, noise=0.02, seed=seed)
     scales = running_scales(effects)
@@ -131,7 +131,7 @@ def test_what_is_drawn_is_allowed_and_of_every_kind():
         *((2, 1), (4, 0), (4, 1), (4, 2))
     }
     seen = set()
-    for _ in range(300):
+    for _ in range(150):
         choice = draw_factored(copies, 5, rng)
         assert choice.copies.shape == choice.actions.shape == (5, 2)
         assert ((copies.state[choice.copies[0]] >= 0).sum(axis=0) == 1).all()

@@ -22,7 +22,7 @@ def random_instances(rng, n, d, n_actions):
     )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 4),
@@ -63,7 +63,7 @@ def test_far_from_all_instances_the_nearest_predict_with_next_to_no_weight():
     found = model.predict(far, np.array([1]))
     assert found.weight[0] < 1e-12
     assert all(np.isfinite(array).all() for array in found)
-    low, high = model.arrays.effect_range[:, 1]
+    low, high = model.plain[1][:, 1]
     assert (low <= found.effect[0]).all() and (found.effect[0] <= high).all()
 
 

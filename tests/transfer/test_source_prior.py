@@ -81,9 +81,8 @@ def test_before_any_transition_a_mapping_that_is_given_or_drawn_predicts_and_cla
     assert drawn.prior(states, actions).effect.any() and not drawn.prior(states, actions).weight.any()
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("n_copies", [2, 3])
-def test_an_exact_source_is_found_and_claims_what_it_knows(seed, n_copies):
+@pytest.mark.parametrize(("n_copies", "seed"), [(2, 0), (3, 1)])
+def test_an_exact_source_is_found_and_claims_what_it_knows(n_copies, seed):
     order = np.random.default_rng(seed).permutation(2 * n_copies).tolist()
     mapping = f.copies_mapping(n_copies, order)
     transfer = bound(COMBREL(f.oscillator_source(), "factored", use="prior"), 2 * n_copies, 2 * n_copies + 1, seed)
@@ -136,9 +135,8 @@ def shuffled_source(seed):
     return type(source)(**arrays, next_states=source.next_states[order])
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("make", [noise_source, shuffled_source])
-def test_sources_of_noise_claim_nothing(make, seed):
+def test_sources_of_noise_claim_nothing(make, seed=0):
     states, actions = inside(300, 4, 5)
     for transfer in (
         COMBREL(make(seed), "factored", use="prior"),
@@ -182,7 +180,7 @@ def test_a_wrong_source_action_is_not_believed_where_it_shows():
     assert effects[1][:, [0, 1, 3]].any(axis=0).all()
 
 
-@pytest.mark.parametrize("mappings", ["injective", "all", "signed_injective", [ALONG_FIRST, TWO.copies[1]]])
+@pytest.mark.parametrize("mappings", ["all", [ALONG_FIRST, TWO.copies[1]]])
 def test_sets_that_are_not_factored_give_one_mapping_for_each_action(mappings):
     transfer = bound(COMBREL(f.oscillator_source(), mappings, use="prior"))
     show(transfer, f.walk(TWO, 300))
@@ -195,16 +193,6 @@ def test_sets_that_are_not_factored_give_one_mapping_for_each_action(mappings):
             assert not found.effect[:, rest].any()
         # What it predicts to stay moves.
         assert not found.weight.any()
-
-
-def test_one_mapping_that_leaves_out_what_never_moves_claims_what_it_knows():
-    mapping = f.copies_mapping(1)
-    states, actions, effects = f.walk(mapping, 200)
-    still = np.full((200, 1), 0.7)
-    transfer = bound(TIMBREL(f.oscillator_source(), InterTaskMapping([0, 1, None], [0, 1, 2]), use="prior"), 3, 3)
-    show(transfer, (np.hstack([states, still]), actions, np.hstack([effects, 0.0 * still])))
-    states, actions = inside(200, 3, 3)
-    assert (transfer.prior(states, actions).weight > 1.0).mean() > 0.95
 
 
 def same(one, other, states, actions):
@@ -221,9 +209,7 @@ METHODS = {
     "factored": lambda: COMBREL(f.oscillator_source(noise=0.01), "factored", use="prior"),
     "few transitions": lambda: COMBREL(f.oscillator_source(), "factored", use="prior", max_transitions=30),
     "two sources": lambda: COMBREL([noise_source(3), f.oscillator_source()], "factored", use="prior"),
-    "injective": lambda: COMBREL(f.oscillator_source(), use="prior"),
     "given": lambda: TIMBREL(f.oscillator_source(), TWO, use="prior"),
-    "one for each action": lambda: TIMBREL(f.oscillator_source(), [ALONG_FIRST] * 5, use="prior"),
     "random": lambda: TIMBREL(f.oscillator_source(), "random", use="prior"),
     "random factored": lambda: TIMBREL(f.oscillator_source(), "random", mappings="signed_factored", use="prior"),
 }
@@ -231,7 +217,7 @@ METHODS = {
 
 @pytest.mark.filterwarnings("ignore:what was transferred")
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("n", [0, 7, 65, 560])
+@pytest.mark.parametrize("n", [0, 65])
 def test_what_was_learned_goes_on_after_saving_and_loading(name, n):
     ours, theirs = bound(METHODS[name](), seed=1), bound(METHODS[name](), seed=2)
     states, actions, effects = f.walk(TWO, n + 40, seed=4)
@@ -301,7 +287,7 @@ def test_asking_leaves_no_trace():
     same(ours, theirs, *asked)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 4), st.integers(1, 60))
 def test_whatever_the_target_does_predictions_are_finite(seed, n_actions, d, n):
     rng = np.random.default_rng(seed)

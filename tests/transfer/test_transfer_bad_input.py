@@ -1,12 +1,14 @@
-"""Sources, mappings and arguments of transfer that cannot work: an error when the model is made, that says what to change."""
+"""Sources, mappings and arguments of transfer that cannot work: an error that says what to change, before the first step."""
 
 import numpy as np
 import pytest
 from gymnasium import Env, spaces
+from helpers import factored as f
 from helpers import naive_transfer as naive
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.transfer.base import Transfer
 
 
 class Untouched(Env):
@@ -21,19 +23,26 @@ class Untouched(Env):
     step = reset
 
 
+OF_A_PRIOR, TWO = f.oscillator_source(60), f.copies_mapping(2)
+METHODS = [COMBREL, TIMBREL]
+
+
 @pytest.fixture
 def source():
     return naive.random_source(np.random.default_rng(0), 30, 2, 2)
 
 
-def refused(transfer, *says, error=ValueError):
+def refused(make, *says, error=ValueError, task=None):
+    """The method is refused when it is made or bound to a task of three variables and two actions, or to another one."""
     with pytest.raises(error) as caught:
-        FittedRMax(Untouched(), transfer=transfer() if callable(transfer) else transfer, resolution=3)
+        make().bind(naive.target_task(np.zeros((1, 3)), 2) if task is None else task, np.random.default_rng(0))
     for words in says:
         assert words in str(caught.value)
 
 
-METHODS = [COMBREL, TIMBREL]
+def test_a_model_is_refused_when_it_is_made(source):
+    with pytest.raises(ValueError, match="state must have 3 entries"):
+        FittedRMax(Untouched(), transfer=COMBREL(source, InterTaskMapping([0, 1], [0, 1])), resolution=3)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -49,95 +58,68 @@ METHODS = [COMBREL, TIMBREL]
     ids=["long state", "short state", "long action", "no such variable", "no such action"],
 )
 def test_a_mapping_that_does_not_fit_the_spaces_is_refused(method, mapping, says, source):
-    refused(method(source, mapping), *says)
-    refused(method(source, [mapping, mapping]), *says)
-    refused(method(source, {"state": list(mapping.state), "action": list(mapping.action)}), *says)
+    refused(lambda: method(source, mapping), *says)
+    refused(lambda: method(source, [mapping, mapping]), *says)
+    refused(lambda: method(source, {"state": list(mapping.state), "action": list(mapping.action)}), *says)
 
 
-def test_a_set_that_does_not_fit_the_spaces_is_refused(source):
-    refused(COMBREL(source, MappingSet.injective(2, 4, 2, 2)), "must", "3", "4")
-    refused(COMBREL(source, "paper_mountain_car"), "must", "3", "4")
-    refused(TIMBREL(source, "pool", mappings=MappingSet.injective(2, 3, 3, 2)), "indices from 0 to 1", "got 2")
-
-
-def test_an_unknown_set_is_refused_with_the_names_of_those_that_exist(source):
+def test_sets_that_do_not_exist_or_fit_are_refused(source):
+    refused(lambda: COMBREL(source, MappingSet.injective(2, 4, 2, 2)), "must", "3", "4")
+    refused(lambda: COMBREL(source, "paper_mountain_car"), "must", "3", "4")
+    refused(lambda: TIMBREL(source, "pool", mappings=MappingSet.injective(2, 3, 3, 2)), "indices from 0 to 1", "got 2")
     refused(lambda: COMBREL(source, "bijective"), "mappings must be one of", "injective", "paper_icub", "'bijective'")
     refused(lambda: COMBREL(source, []), "mappings must hold at least one")
-    refused(lambda: COMBREL(source, 7), "mappings must be", "7")
     refused(lambda: COMBREL(source, [7]), "mappings must be", "7")
     refused(lambda: COMBREL(source, {"state": [0, None, 1]}), "dict of state, action", "[0, None, 1]")
-
-
-def test_timbrel_needs_one_mapping_or_one_for_each_action(source):
     fits = InterTaskMapping([0, None, 1], [0, 1])
-    refused(TIMBREL(source, [fits] * 3), "mapping must be one mapping or one for each of the 2 target actions", "got 3")
+    refused(lambda: TIMBREL(source, [fits] * 3), "must be one mapping or one for each of the 2 target actions", "got 3")
     refused(lambda: TIMBREL(source, "best"), "mapping must be", '"random" or "pool"', "'best'")
-    refused(lambda: TIMBREL(source, []), "mappings must hold at least one")
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_source_file_that_is_missing_damaged_or_of_another_task_is_refused(method, source, tmp_path):
+def test_a_source_that_is_missing_damaged_or_of_another_task_is_refused(method, source, tmp_path):
     refused(lambda: method(tmp_path / "nowhere.npz"), "nowhere.npz", "SourceInstances.record", error=FileNotFoundError)
     path = source.save(tmp_path / "source.npz")
     mapping = InterTaskMapping([0, None, 2], [0, 1])
-    refused(method(str(path), mapping), "state must hold indices from 0 to 1", "the source task has 2 variables")
-    content = path.read_bytes()
-    for part in (content[: len(content) // 2], b"", b"not a source"):
-        path.write_bytes(part)
-        refused(method(path), "source.npz", "damaged")
-    np.savez(path, states=np.zeros((3, 2)))
-    refused(method(path), "source.npz", "damaged or not a file of source instances")
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("nothing", [[], None, 5, {}], ids=repr)
-def test_no_source_at_all_is_refused(method, nothing):
-    refused(lambda: method(nothing), "source must be SourceInstances, a path to them, or a list of these", repr(nothing))
-
-
-def test_an_empty_source_cannot_be_made(source):
-    with pytest.raises(ValueError, match="states must hold at least one instance, got none"):
-        source._with_rows(np.empty(0, dtype=np.int64), {})
+    refused(lambda: method(str(path), mapping), "state must hold indices from 0 to 1", "the source task has 2 variables")
+    path.write_bytes(b"not a source")
+    refused(lambda: method(path), "source.npz", "damaged")
+    for nothing in ([], None, 5, {}):
+        refused(lambda: method(nothing), "source must be SourceInstances, a path", repr(nothing))  # noqa: B023
 
 
 BAD_ARGUMENTS = [
     ("breadth", 0.0),
-    ("breadth", -0.1),
     ("breadth", np.nan),
-    ("breadth", np.inf),
     ("breadth", "wide"),
     ("breadth", None),
     ("breadth_decay", 0.0),
     ("breadth_decay", 1.1),
-    ("relevance_fraction", 0.0),
     ("relevance_fraction", 1.5),
     ("bandwidths", (0.1, 0.1)),
     ("bandwidths", (0.1, 0.0, 1.0)),
     ("bandwidths", (0.1, np.nan, 1.0)),
-    ("bandwidths", 0.1),
     ("bandwidths", "auto"),
-    ("relevance", np.nan),
     ("relevance", None),
     ("relevance", "no"),
     ("relevance", 1),
-    ("transfer_terminals", np.nan),
     ("transfer_terminals", None),
     ("transfer_terminals", 0.0),
+    ("source_breadth", 0.0),
+    ("source_breadth", np.nan),
+    ("use", "model"),
 ]
 BAD_ARGUMENTS_OF_COMBREL = [
     ("min_compliance", -0.1),
-    ("min_compliance", np.nan),
     ("min_compliance", None),
-    ("min_evidence", -0.1),
     ("min_evidence", np.nan),
-    ("min_evidence", None),
+    ("min_evidence", -0.1),
     ("n_neighbors", 0),
-    ("n_neighbors", -1),
     ("n_neighbors", 2.5),
-    ("n_neighbors", None),
     ("n_neighbors", True),
     ("measured", "never"),
-    ("measured", None),
+    ("choice", "worst"),
+    ("neighbors", "both"),
     ("max_transitions", 0),
     ("max_transitions", 1e3),
 ]
@@ -153,25 +135,70 @@ def test_an_argument_out_of_its_range_is_refused_at_once_by_name_and_value(metho
     assert any(repr(culprit) in str(error.value) for culprit in culprits)
 
 
-def test_the_dict_form_names_what_is_wrong(source, tmp_path):
-    path = str(source.save(tmp_path / "source.npz"))
-    refused({"sb3_combrel.COMBRELL": {"source": path}}, "COMBRELL", "does not exist", "sb3_combrel.COMBREL")
-    refused({"nowhere.COMBREL": {"source": path}}, "nowhere.COMBREL", "does not exist")
-    refused({"COMBREL": {"source": path}, "TIMBREL": {}}, "one entry", "COMBREL", "TIMBREL")
-    refused({}, "one entry")
-    refused({"sb3_combrel.FittedRMax": {}}, "must be a transfer method")
-    refused({"COMBREL": {"source": path, "n_neighbors": 0}}, "n_neighbors must be", "0")
-    refused(7, "transfer must be", "7")
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda s: COMBREL(s, "factored", use="instances"), 'factored mappings need use="prior", got use="instances"'),
+        (lambda s: TIMBREL(s, TWO), 'factored mappings need use="prior"'),
+        (lambda s: TIMBREL(s, {"copies": []}), 'factored mappings need use="prior"'),
+        (lambda s: TIMBREL(s, "random", mappings="signed_factored"), 'factored mappings need use="prior"'),
+        (lambda s: TIMBREL(s, "pool", use="prior"), 'mapping must be a mapping or "random"'),
+        (lambda s: TIMBREL(s, TWO, use="prior", relevance=True), "relevance must be False"),
+        (lambda s: TIMBREL(s, f.copies_mapping(3), use="prior"), "state must have 4 entries"),
+        (lambda s: TIMBREL(s, {"copies": [{"state": [0, 1, None, 2], "action": [0] * 5}]}, use="prior"), "from 0 to 1"),
+        (lambda s: TIMBREL(s, {"copies": [], "more": 1}, use="prior"), "dict of copies"),
+        (lambda s: TIMBREL(s, {"copies": []}, use="prior"), "at least one"),
+        (lambda s: TIMBREL(s, [InterTaskMapping([0, 1, None, None], [0] * 5)] * 2, use="prior"), "one for each of the 5"),
+        (lambda s: COMBREL(s, "factorised", use="prior"), "mappings must be one of"),
+    ],
+)
+def test_priors_that_cannot_be_are_refused(make, says):
+    refused(lambda: make(OF_A_PRIOR), says, task=f.target_task(4, 5))
+
+
+def test_sets_that_are_too_large_are_refused_with_what_to_do():
+    says = "at most 12 state variables, got 13; give a FactoredMapping"
+    refused(lambda: COMBREL(OF_A_PRIOR, "factored", use="prior"), says, task=f.target_task(13, 5))
+    wide = naive.random_source(np.random.default_rng(0), 9, 6, 1)
+    refused(lambda: COMBREL(wide, "factored", use="prior"), "more than the 2000", task=f.target_task(6, 5))
+    source, task = naive.random_source(np.random.default_rng(0), 20, 2, 4), naive.target_task(np.zeros((1, 6)), 8)
+    says = 'at most 20000 whole mappings with neighbors="state_action"', 'neighbors="action"'
+    refused(lambda: COMBREL(source, "all", neighbors="state_action"), *says, task=task)
+    f.bound(COMBREL(source, "all"), 6, 8)
+
+
+def test_a_kernel_average_takes_no_prior(source):
+    for transfer in (COMBREL(source, "factored", use="prior"), TIMBREL(source, TWO, use="prior")):
+        says = r"use=\"prior\"\) needs the local linear model, FittedRMax\(degree=1\), got degree=0"
+        with pytest.raises(ValueError, match=says):
+            transfer.check_degree(0)
+        transfer.check_degree(1)
+    COMBREL(source).check_degree(0)
+
+
+def test_what_is_asked_of_a_prior_needs_one(source):
+    class Promising(Transfer):
+        use = "prior"
+
+        def observe(self, *transition):
+            pass
+
+        def transferred(self, states, actions, own_weight):
+            raise AssertionError("never asked")
+
+    with pytest.raises(NotImplementedError, match="Promising"):
+        Promising().prior(np.zeros((1, 2)), np.zeros(1, dtype=np.int64))
+    assert Promising().prior_version() == 0
+    with pytest.raises(ValueError, match='use must be "prior"'):
+        f.bound(COMBREL(source)).describe_prior()
 
 
 def test_what_fits_is_taken_in_every_form(source, tmp_path):
     path = str(source.save(tmp_path / "source.npz"))
     mapping = {"state": [0, None, 1], "action": [0, 1]}
     for transfer in (
-        COMBREL(source),
         COMBREL([source, path]),
         {"sb3_combrel.COMBREL": {"source": path, "mappings": [mapping]}},
-        {"TIMBREL": {"source": path, "mapping": mapping}},
         {"TIMBREL": {"source": path, "mapping": [mapping, mapping]}},
     ):
         model = FittedRMax(Untouched(), transfer=transfer, resolution=3)

@@ -80,6 +80,7 @@ class Nothing(BoundOnly):
         return None
 
 
+@pytest.mark.long
 def test_the_source_s_values_alone_shorten_learning():
     source, mapping = f.oscillator_source(800), f.copies_mapping(1)
 
@@ -116,7 +117,7 @@ def same_as_in_learning(model):
 
 
 def test_a_frozen_policy_acts_on_bounded_values_as_in_learning_and_without_bounds_on_what_is_known():
-    bounded = FittedRMax(car(), degree=1, transfer=Bounded(), seed=0).learn(300)
-    unbounded = FittedRMax(car(), degree=1, transfer=Bounded(n_steps=1000), seed=0).learn(300)
+    bounded = FittedRMax(car(), degree=1, transfer=Bounded(), seed=0).learn(150)
+    unbounded = FittedRMax(car(), degree=1, transfer=Bounded(n_steps=1000), seed=0).learn(150)
     assert same_as_in_learning(bounded) == 1.0
     assert same_as_in_learning(unbounded) < 0.9

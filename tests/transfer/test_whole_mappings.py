@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from helpers import naive_transfer as naive
 from helpers.asking import bound, choices_of, pairs_of, show, transferred_to_pairs
-from helpers.walk import Walk, same_parameters, small, walk_source
 
-from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.transfer.equations import Bandwidths
 
@@ -77,16 +76,6 @@ def test_the_action_of_a_neighbor_decides_between_mappings_with_the_same_source_
     ]
 
 
-def test_descriptions_of_whole_mappings_differ():
-    sources = [
-        naive.random_source(np.random.default_rng(0), 20, 2, 2),
-        naive.random_source(np.random.default_rng(1), 20, 1, 3),
-    ]
-    method = bound(COMBREL(sources, neighbors="state_action"), naive.target_task(POINTS, 2))
-    words = [method.describe(c) for c in range(len(method.candidates))]
-    assert len(set(words)) == len(words) == 2 * sum(map(len, method.candidates.sets))
-
-
 def test_what_is_transferred_is_that_of_the_mapping_chosen():
     rng = np.random.default_rng(3)
     source, task = naive.random_source(rng, 200, 2, 2), naive.target_task(POINTS, 2)
@@ -105,24 +94,3 @@ def test_what_is_transferred_is_that_of_the_mapping_chosen():
         np.testing.assert_allclose(found.weight[pair, : len(expected)], [e[0] for e in expected], rtol=1e-9)
         n_transferred += len(expected)
     assert n_transferred > 20
-
-
-def test_too_many_whole_mappings_are_refused_with_what_to_do():
-    source, task = naive.random_source(np.random.default_rng(0), 20, 2, 4), naive.target_task(np.zeros((1, 6)), 8)
-    says = r'at most 20000 whole mappings with neighbors="state_action", got \d+; .* neighbors="action"'
-    with pytest.raises(ValueError, match=says):
-        bound(COMBREL(source, "all", neighbors="state_action"), task)
-    bound(COMBREL(source, "all"), task)
-    with pytest.raises(ValueError, match='neighbors must be "action" or "state_action", got \'both\''):
-        COMBREL(source, neighbors="both")
-
-
-def test_a_model_learns_with_it_is_saved_and_goes_on(tmp_path):
-    model = small(transfer=COMBREL(walk_source(), neighbors="state_action")).learn(60)
-    assert model.policy.transfer.mapping_counts()
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
-    assert loaded.policy.transfer.neighbors == "state_action"
-    assert same_parameters(model, loaded)
-    np.testing.assert_array_equal(loaded.policy.transfer.choices(), model.policy.transfer.choices())
-    assert loaded.learn(20, reset_num_timesteps=False).agent.model.n_instances == 80

@@ -17,9 +17,9 @@ N_SHARING = 20
 
 class CandidateBandwidths(NamedTuple):
     """
-    Bandwidths of compliance and relevance of all candidates.
+    Bandwidths of Eq. 2, of all candidates.
 
-    :param of_all: of Eq. 2
+    :param of_all: but for ``start``
     :param starts: the start bandwidth of each state mapping, float64, shape (n_state_mappings,)
     """
 
@@ -28,11 +28,7 @@ class CandidateBandwidths(NamedTuple):
 
 
 def candidate_bandwidths(candidates: Candidates, given: Sequence[float] | None) -> CandidateBandwidths:
-    """
-    Take the bandwidths given, the same for all mappings; or choose them from the data.
-
-    :param given: (start, outcome, reward), or None
-    """
+    """Take the bandwidths ``given``, (start, outcome, reward), the same for all mappings; or choose them from the data."""
     if given is not None:
         of_all = Bandwidths(*given)
         return CandidateBandwidths(of_all, np.full(len(candidates.table.variable), of_all.start))
@@ -44,9 +40,8 @@ def default_bandwidths(source: Instances) -> Bandwidths:
     """
     Choose bandwidths from a source's instances.
 
-    The start bandwidth is the squared distance to about the 20th instance of the same action (their median): that many
-    share in the prediction. The outcome bandwidth is the mean squared effect: an outcome missed by as much as things
-    usually move counts as 1/e. The reward bandwidth is the rewards' variance; 1 where they are all alike.
+    Of starts: the median squared distance to about the 20th instance of the same action. Of outcomes: the mean squared effect.
+    Of rewards: their variance; 1 where they are all alike.
     """
     from scipy.spatial import cKDTree
 
@@ -76,13 +71,8 @@ def start_bandwidths(candidates: Candidates, start: float) -> np.ndarray:
     Choose the start bandwidth of every state mapping, in proportion to how many variables it compares.
 
     A squared distance over more variables has more terms. With this bandwidth an instance that is equally far along each
-    variable weighs the same, however many there are, so mappings of more variables do not lose evidence for that reason.
-    They still have less where a source variable is used twice, off the diagonals on which translated instances lie: no
-    instance is near there. Bandwidths that make up for this as well (4 to 13 times as large) have such mappings selected
-    where their instances are of no use: 12 episodes of MountainCar4D with ``mappings="all"`` took 4,428 +- 180 steps
-    instead of 3,819 +- 150 (12 seeds; with one bandwidth for all 3,666 +- 87).
+    variable weighs the same, however many there are.
 
-    :param candidates: the candidates, with all state mappings
     :param start: start bandwidth for mappings that compare as many variables as their source has
     :return: float64, shape (n_state_mappings,)
     """

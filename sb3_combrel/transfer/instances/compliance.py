@@ -1,10 +1,9 @@
 """Compliance: how probable target transitions are under the source task, mapping by mapping (Eqs. 2, 3, 5 and 6).
 
-For a transition with target action a, compliance depends on the state mapping and on the one source action that a
-maps to. A table [state mapping, source action] for each transition therefore holds the compliance of every pair of a
-state and an action mapping, however many there are. And since the kernel exp(-d^2 / delta) of a Euclidean distance is
-a product of one factor a variable, the exponentials needed are one for each pair of a target and a source variable,
-whatever the number of state mappings.
+For a transition with target action a, compliance depends on the state mapping and on the one source action that a maps to. A
+table [state mapping, source action] for each transition therefore holds the compliance of every pair of a state and an action
+mapping. And since the kernel exp(-d^2 / delta) of a Euclidean distance is a product of one factor a variable, one exponential
+is needed for each pair of a target and a source variable, whatever the number of state mappings.
 """
 
 from collections.abc import Sequence
@@ -12,34 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inner_fast, part
+from sb3_combrel.common.compiled import EntryPoint, compiled, inner_fast, part
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import difference, flag_array
-from sb3_combrel.transfer.candidates import MappingTable
+from sb3_combrel.transfer.candidates import Candidates, MappingTable
 from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
-# The weight of one instance at a distance of sqrt(2.3 delta). Where the sum of start kernels is less, no instance is near
-# enough to be evidence: normalized, a far instance would look as good as a near one.
+# Where the sum of start kernels is less, no instance is near enough to be evidence: normalized, a far one would look as good.
 DEFAULT_MIN_EVIDENCE = 0.1
-
-
-class RewardCounts(NamedTuple):
-    """
-    The rewards of source instances.
-
-    :param value: the different ones, raw, shape (n,)
-    :param fraction: which fraction of all instances has each of them, same shape
-    """
-
-    value: np.ndarray
-    fraction: np.ndarray
-
-    @classmethod
-    def of_instances(cls, source: Instances) -> "RewardCounts":
-        """Count those of all source actions."""
-        rewards = [source.reward[action, :n] for action, n in enumerate(source.size)]
-        value, count = np.unique(np.concatenate(rewards), return_counts=True)
-        return cls(value, count / count.sum())
 
 
 class ComplianceScratch(NamedTuple):
@@ -49,16 +29,12 @@ class ComplianceScratch(NamedTuple):
     A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses; a *start
     factor* is one with a start bandwidth.
 
-    :param variable: int64, shape (n_factors,): target variable of each factor
-    :param source: int64, same shape: source variable
-    :param mirrored: bool, same shape
-    :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are
-        ``factors[first[m] : first[m + 1]]``
-    :param factors: int64
-    :param starts: int64, shape of ``factors``: the same for start factors
+    :param variable: int64, shape (n_factors,): target variable; ``source``: source variable; ``mirrored``: bool, same shape
+    :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are ``factors[first[m] : first[m + 1]]``
+    :param factors: int64; ``starts``: same shape, the same for start factors
     :param start_factor: int64, shape (n_start_factors,): the factor of each; ``start_bandwidth``: float64, same shape
     :param state: float64, shape (n_source_actions, n_source_variables, n): the source instances' states, variable by
-        variable: the inner loops read them in a row; ``effect``: the same of their effects
+        variable, as the inner loops read them; ``effect``: the same of their effects
     :param start: float64, shape (n_start_factors, n): kernel of where a transition and each source instance start
     :param outcome: float64, shape (n_factors, n): the same for outcomes
     :param reward: float64, shape (n,): the same for rewards
@@ -100,8 +76,6 @@ class ComplianceScratch(NamedTuple):
         Make work space for a table of state mappings and the instances of a source.
 
         :param start: start bandwidth, of all mappings or of each, shape (n_state_mappings,)
-        :param min_evidence: see the class
-        :param periodic: see the class; None: none is periodic
         """
         largest = int(source.size.max())
         number: dict[tuple[int, int, bool], int] = {}
@@ -144,8 +118,7 @@ FARTHEST = 40.0
 def _exponentiate(row, n):
     """Replace the first ``n`` entries x >= 0 by exp(-min(x, FARTHEST)), to 12 digits.
 
-    The Taylor polynomial of exp(-x / 64), raised to the 64th power by squaring six times: multiplications only, so the
-    loop runs in vector registers, which a call of exp would not.
+    The Taylor polynomial of exp(-x / 64), squared six times: multiplications only, so the loop runs in vector registers.
     """
     for j in range(n):
         x = row[j]
@@ -187,7 +160,7 @@ def _squares(at, of_source, bandwidth, periodic, row, n):
 
 @inner_fast
 def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
-    """Fill ``scratch.start``, ``outcome`` and ``reward`` for all source instances of ``action``."""
+    """Fill ``scratch.start``, ``outcome`` and ``reward`` for the source instances of ``action``."""
     n = source.size[action]
     for f in range(len(scratch.variable)):
         v = scratch.variable[f]
@@ -243,23 +216,22 @@ def _still_factors(effect, mappings, bandwidth, still):
         still[m] = np.exp(-missed / bandwidth)
 
 
-@part
+@compiled
 def transition_compliance(state, effect, reward, source, mappings, bandwidths, scratch, table):
     """
     Compute the compliance of one target transition through every state mapping, for every source action (Eq. 5).
 
     The transition function's factor is the mean of phi(d(s', s + (s_j' - s_j))) weighted by w_ij (Eq. 2), the reward
-    function's the mean of phi(|r - r_j|), both over the source instances of one action. Z^P and Z^R are left out: they
-    are the same for all mappings, and would hide what is to be compared if they were not. An unmapped variable adds
-    nothing to where a transition starts, and is predicted not to change.
+    function's the mean of phi(|r - r_j|), both over the source instances of one action. An unmapped variable adds nothing to
+    where a transition starts, and is predicted not to change.
 
-    :param state: unit coordinates of the target, shape (n_target_variables,)
-    :param effect: next state minus state, same shape
-    :param source: Instances of the source, in its own unit coordinates
-    :param bandwidths: of outcome and reward; those of starts are in ``scratch``
-    :param scratch: ComplianceScratch for ``mappings``
+    :param state: unit coordinates of the target, shape (n_target_variables,); ``effect``: next state minus state
+    :param source: Instances; ``mappings``: MappingTable; ``bandwidths``: Bandwidths; ``scratch``: ComplianceScratch for
+        ``mappings``, which has the start bandwidths; plain tuples
     :param table: receives the compliances, shape (n_state_mappings, n_source_actions); 0 where no instance is near
     """
+    source, mappings, scratch = Instances(*source), MappingTable(*mappings), ComplianceScratch(*scratch)
+    bandwidths = Bandwidths(*bandwidths)
     _still_factors(effect, mappings, bandwidths.outcome, scratch.still)
     for action in range(len(source.size)):
         _kernel_factors(state, effect, reward, source, action, bandwidths, scratch)
@@ -267,40 +239,50 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
             table[m, action] = scratch.still[m] * _mapping_compliance(m, source.size[action], scratch)
 
 
-@compiled
-def transition_compliance_plain(state, effect, reward, source, mappings, bandwidths, scratch, table):
-    """:func:`transition_compliance` for callers from Python, with plain tuples."""
-    source, mappings, scratch = Instances(*source), MappingTable(*mappings), ComplianceScratch(*scratch)
-    transition_compliance(state, effect, reward, source, mappings, Bandwidths(*bandwidths), scratch, table)
+_transition_compliance = EntryPoint(transition_compliance)
 
 
-def no_change_compliance(effect: np.ndarray, reward: float, rewards: RewardCounts, bandwidths: Bandwidths) -> float:
+class ComplianceTable:
     """
-    Return the compliance of one target transition with the no-change baseline.
+    Computes compliance with all candidates of a set, one transition after the other.
 
-    It predicts that no variable changes, and any of the source's rewards, each as often as it occurs there. A mapping that
-    predicts worse than this is of no use.
-
-    :param effect: next state minus state, shape (n_target_variables,)
-    :param reward: raw
+    :param candidates: the candidates of every target action
+    :param bandwidths: of Eq. 2, but for those of starts
+    :param starts: start bandwidth of each state mapping, shape (n_state_mappings,)
+    :param min_evidence: see ``ComplianceScratch``; ``periodic``: the same
     """
-    rewarded = rewards.fraction @ np.exp(-((reward - rewards.value) ** 2) / bandwidths.reward)
-    return float(np.exp(-(effect @ effect) / bandwidths.outcome) * rewarded)
 
+    def __init__(
+        self,
+        candidates: Candidates,
+        bandwidths: Bandwidths,
+        starts: np.ndarray | float,
+        min_evidence: float = DEFAULT_MIN_EVIDENCE,
+        periodic: Sequence[bool] | None = None,
+    ):
+        table, instances = candidates.table, candidates.instances
+        #: Compliance of the last transition, shape (n_state_mappings, n_source_actions).
+        self.values = np.empty((len(table.variable), len(instances.size)))
+        scratch = ComplianceScratch.for_mappings(table, instances, starts, min_evidence, periodic)
+        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
+        self._given = tuple(instances), tuple(table), tuple(bandwidths), tuple(scratch), self.values
+        self._bandwidths = bandwidths
+        rewards = np.concatenate([instances.reward[action, :n] for action, n in enumerate(instances.size)])
+        # The different rewards of source instances, and which fraction of all has each of them.
+        self._rewards, count = np.unique(rewards, return_counts=True)
+        self._fraction = count / count.sum()
 
-@compiled
-def compliance_table(states, effects, rewards, source, mappings, bandwidths, scratch, tables):
-    """:func:`transition_compliance` of many transitions; ``tables`` has one table a transition."""
-    for i in range(len(rewards)):
-        transition_compliance(states[i], effects[i], rewards[i], source, mappings, bandwidths, scratch, tables[i])
+    def measure(self, transitions: RecordedTransitions, i: int) -> None:
+        """Compute the compliance of transition ``i``."""
+        transition = transitions.states[i], transitions.effects[i], float(transitions.rewards[i])
+        _transition_compliance.call(*transition, *self._given)
 
+    def no_change(self, transitions: RecordedTransitions, i: int) -> float:
+        """
+        Return the compliance of transition ``i`` with the no-change baseline.
 
-def task_compliance(tables: np.ndarray, actions: np.ndarray, state_index: int, action_mapping: np.ndarray) -> float:
-    """
-    Return the compliance of the whole target sample with one virtual source task (Eq. 6, all mappings equally likely).
-
-    :param tables: shape (n_transitions, n_state_mappings, n_source_actions)
-    :param actions: target action of each transition, shape (n_transitions,)
-    :param action_mapping: source action of each target action, shape (n_target_actions,)
-    """
-    return float(tables[np.arange(len(actions)), state_index, np.asarray(action_mapping)[actions]].mean())
+        It predicts that no variable changes, and any of the source's rewards, each as often as it occurs there.
+        """
+        effect, reward = transitions.effects[i], float(transitions.rewards[i])
+        rewarded = self._fraction @ np.exp(-((reward - self._rewards) ** 2) / self._bandwidths.reward)
+        return float(np.exp(-(effect @ effect) / self._bandwidths.outcome) * rewarded)

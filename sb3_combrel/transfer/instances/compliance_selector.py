@@ -7,28 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
-from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths
-from sb3_combrel.transfer.instances.compliance import (
-    ComplianceScratch,
-    RewardCounts,
-    no_change_compliance,
-    transition_compliance_plain,
-)
-from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose_plain, select_plain
-from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
+from sb3_combrel.transfer.instances.compliance import ComplianceTable
+from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose, select
+from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, SelectorParts
 
-# Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: every
-# transition changes some choices, and to plan again with each would cost more than all the rest.
-RENEWAL_GROWTH = 1.2
+# Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: to plan again
+# with every transition would cost more than all the rest.
+CHOICE_GROWTH = 1.2
 # The confidence in choices is averaged over so many states of the sample, at most, evenly spread.
 MAX_COMPARED = 500
 NO_DRAWS = np.empty(0)
 
-_transition_compliance, _add_to_sample = EntryPoint(transition_compliance_plain), EntryPoint(add_to_sample)
-_choose, _select = EntryPoint(choose_plain), EntryPoint(select_plain)
+_add_to_sample, _choose, _select = EntryPoint(add_to_sample), EntryPoint(choose), EntryPoint(select)
 
 
 @dataclass(frozen=True)
@@ -36,16 +27,12 @@ class SelectionOptions:
     """
     How candidates are selected by compliance.
 
-    :param bandwidths: of compliance
-    :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
-    :param n_neighbors: k of line 2
+    Those that are not named here are arguments of :class:`~sb3_combrel.transfer.methods.combrel.COMBREL`.
+
+    :param bandwidths: of compliance; ``starts``: the start bandwidth of each state mapping, shape (n_state_mappings,)
     :param all_actions: transitions of all actions are neighbours, not those with the same action; for whole mappings
-    :param neighbor_radius: how far a neighbour may be, unit coordinates; None: any distance
     :param drawn: candidates are drawn in proportion to their mean compliance, instead of line 20
     :param online: transitions of all episodes are recorded and used at once, not those of the first after its end
-    :param max_transitions: how many are recorded
-    :param min_evidence: sum of start kernels below which a candidate has no compliance
-    :param min_compliance: a candidate's mean compliance must exceed this many times that of the no-change baseline
     """
 
     bandwidths: Bandwidths
@@ -64,10 +51,7 @@ class ComplianceSelector(Selector):
     """
     Selects the candidate with the highest mean compliance with the nearest recorded transitions (Algorithm 1).
 
-    The methods stand in the order of the algorithm. It computes the compliance of every transition of the first episode
-    (lines 9-13); here that of a transition is computed when a choice first needs it.
-
-    Parameters: see :class:`~sb3_combrel.transfer.instances.selectors.Selector`, and
+    The compliance of a transition (lines 9-13) is computed when a choice first needs it.
 
     :param options: how candidates are selected
     """
@@ -75,39 +59,24 @@ class ComplianceSelector(Selector):
     makes_choices = True
     needs_transitions = True
 
-    def __init__(
-        self,
-        candidates: Candidates,
-        task: TargetTask,
-        transitions: RecordedTransitions,
-        rng: np.random.Generator,
-        options: SelectionOptions,
-    ):
-        super().__init__(candidates, task, transitions, rng)
+    def __init__(self, parts: SelectorParts, options: SelectionOptions):
+        super().__init__(parts)
         self.options = options
         # An empty place counts as a neighbour at the limit: what is farther away does not enter.
         self.limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
         self.first_episode = True
         self.n_switches = 0
+        of_compliance = options.bandwidths, options.starts, options.min_evidence
+        self._table = ComplianceTable(self.candidates, *of_compliance, self.task.periodic)
+        self._limits = float(self.task.exploration_threshold), self.limit
         self._allocate()
-        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
-        scratch = ComplianceScratch.for_mappings(
-            candidates.table, candidates.instances, options.starts, options.min_evidence, task.periodic
-        )
-        source, mappings = tuple(candidates.instances), tuple(candidates.table)
-        self._measuring = source, mappings, tuple(options.bandwidths), tuple(scratch), self._table
-        self._limits = float(task.exploration_threshold), self.limit
 
     def _allocate(self) -> None:
-        """Make the arrays: compliance of transitions, nearest transitions and choices."""
         candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
-        n_rows, n_source_actions = len(candidates.table.variable), len(candidates.instances.size)
         n_neighbors = self.options.n_neighbors
-        self._table = np.empty((n_rows, n_source_actions))
-        # Where in that table the candidates of each action stand.
-        columns = candidates.arrays.row * n_source_actions + candidates.arrays.action
+        # Where in the table the candidates of each action stand.
+        columns = candidates.arrays.row * len(candidates.instances.size) + candidates.arrays.action
         self._columns = np.split(columns, self.first[1:-1])
-        self._rewards = RewardCounts.of_instances(candidates.instances)
         self._set_cache(ComplianceCache.empty(int(np.diff(self.first).max())))
         self._listed = np.empty((n_actions, 64), dtype=np.int64)
         self._n_listed = np.zeros(n_actions, dtype=np.int64)
@@ -162,12 +131,10 @@ class ComplianceSelector(Selector):
         """Compute the compliance with every candidate of those of these transitions that have not been measured yet."""
         near = near[near >= 0]
         for i in set(near[~self._cache.measured[near]].tolist()):
-            effect, reward = self.transitions.effects[i], float(self.transitions.rewards[i])
-            _transition_compliance.call(self.transitions.states[i], effect, reward, *self._measuring)
-            compliance = self._table.ravel()[self._columns[int(self.transitions.actions[i])]]
+            self._table.measure(self.transitions, i)
+            compliance = self._table.values.ravel()[self._columns[int(self.transitions.actions[i])]]
             self._cache.compliance[i, : len(compliance)] = compliance
-            no_change = no_change_compliance(effect, reward, self._rewards, self.options.bandwidths)
-            self._cache.required[i] = self.options.min_compliance * no_change
+            self._cache.required[i] = self.options.min_compliance * self._table.no_change(self.transitions, i)
             self._cache.measured[i] = True
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
@@ -189,7 +156,7 @@ class ComplianceSelector(Selector):
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         if self.transitions.n < self._renewal_due:
             return False
-        self._renewal_due = RENEWAL_GROWTH * self.transitions.n
+        self._renewal_due = CHOICE_GROWTH * self.transitions.n
         due = np.flatnonzero(self._due & ~known)
         changed = np.zeros(known.shape, dtype=np.bool_)
         changed.ravel()[self._renew(due)] = True
@@ -198,7 +165,7 @@ class ComplianceSelector(Selector):
     def _use(self, i: int) -> None:
         """Make transition ``i`` a neighbour for its action, or for all."""
         if i >= len(self._cache.required):
-            self._set_cache(self._cache.with_room(i))
+            self._set_cache(self._cache.grown())
         for action in range(self.task.n_actions) if self.options.all_actions else [int(self.transitions.actions[i])]:
             self._use_for(i, action)
 
@@ -231,12 +198,7 @@ class ComplianceSelector(Selector):
         return self._choice.copy()
 
     def mean_compliance(self, pairs: np.ndarray) -> np.ndarray:
-        """
-        Return the mean compliance of the chosen candidate with the nearest transitions (line 19).
-
-        :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
-        :return: float64, shape (n,); NaN where nothing is chosen
-        """
+        """Return the mean compliance of the chosen candidate of pairs of the sample (line 19); NaN where nothing is chosen."""
         near = self._near_of_pair[pairs]
         self._measure(near)
         counted = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
@@ -264,15 +226,10 @@ class ComplianceSelector(Selector):
             mean = self._cache.compliance[near, :n_candidates].mean(axis=0)
             chosen = int(self._choice[pair] - self.first[action])
             others = np.delete(mean, chosen)
-            compared[row] = mean[chosen], others.max(initial=-np.inf), self._no_change(near)
+            no_change = np.mean([self._table.no_change(self.transitions, i) for i in near.tolist()])
+            compared[row] = mean[chosen], others.max(initial=-np.inf), no_change
         chosen_mean, next_best, no_change = compared.mean(axis=0).tolist()
         return Confidence(chosen_mean, next_best if n_candidates > 1 else np.nan, no_change)
-
-    def _no_change(self, near: np.ndarray) -> float:
-        """Mean compliance of some transitions with the no-change baseline."""
-        seen, bandwidths = self.transitions, self.options.bandwidths
-        each = (no_change_compliance(seen.effects[i], float(seen.rewards[i]), self._rewards, bandwidths) for i in near)
-        return float(np.mean(list(each)))
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {

@@ -7,19 +7,17 @@ from typing import Protocol
 
 import numpy as np
 
+from sb3_combrel.common.prior import PriorPredictions
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
 from sb3_combrel.transfer.instances.selectors import Ranges, Selector
 from sb3_combrel.transfer.instances.translation import Translator
-from sb3_combrel.transfer.placed_errors import PlacedErrors
-from sb3_combrel.transfer.source_use import SourceUse
+from sb3_combrel.transfer.region_errors import RegionErrors
 
 # Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
 RELEVANCE_GROWTH = 1.2
 MIN_TRANSITIONS_FOR_RELEVANCE = 50
-#: What stands in files that do not say by how many transitions relevance was measured: by all that were used.
-ALL_USED = -1
 
 
 class MeasureRelevance(Protocol):
@@ -28,9 +26,12 @@ class MeasureRelevance(Protocol):
     def __call__(self, *, n_used: int, values: np.ndarray) -> None: ...
 
 
-class InstanceTransfer(SourceUse):
+class InstanceTransfer:
     """
     Transfers source instances through mappings: a selector chooses the mappings, a translator the instances.
+
+    Methods of the same name mean what they do of :class:`~sb3_combrel.transfer.base.Transfer` and of
+    :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
 
     :param selector: it holds the candidates, the target task and the recorded transitions
     :param translator: of the candidates' instances
@@ -39,14 +40,17 @@ class InstanceTransfer(SourceUse):
     :param measure_relevance: used where the translator's instances come in the order of their relevance
     """
 
-    candidates: Candidates
+    #: There is no prior.
+    version = 0
 
     def __init__(
         self, selector: Selector, translator: Translator, *, breadth_decay: float, measure_relevance: MeasureRelevance
     ):
         self.task = task = selector.task
-        self.candidates = selector.candidates
+        self.candidates: Candidates = selector.candidates
         self.sources = selector.candidates.sources
+        #: Transitions of the target that were observed.
+        self.n_observed = 0
         self.transitions = selector.transitions
         self.selector = selector
         self.translator = translator
@@ -57,10 +61,10 @@ class InstanceTransfer(SourceUse):
         self._n_of_relevance = 0
         #: Compares what was transferred with what happened, wherever the agent acted on it.
         self.check = InstancesCheck(self.sources, float(task.exploration_threshold))
-        #: Errors of what was transferred, by place.
-        self.errors = PlacedErrors(task)
-        #: Whether what has been returned for any state of the sample may have changed. Where the selection depends on
-        #: transitions nothing is returned before the first.
+        #: Errors of what was transferred.
+        self.errors = RegionErrors(task)
+        #: Whether what has been returned for any state of the sample may have changed. Nothing has where the selection depends
+        #: on transitions.
         self.all_changed = not selector.needs_transitions
         self._last_selected: Ranges = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         self._last_state = np.empty(0)
@@ -84,7 +88,14 @@ class InstanceTransfer(SourceUse):
             return True
         return of_selector
 
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
+        raise NotImplementedError('there is no prior with use="instances"')
+
+    def value_bound(self) -> None:
+        return None
+
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
+        """Take in a transition of the target; ``effect``: next state minus state, unit coordinates, shape (n_variables,)."""
         self.n_observed += 1
         predicted = self.check.observe(state, action, reward, effect, terminated)
         if predicted is not None:
@@ -99,11 +110,9 @@ class InstanceTransfer(SourceUse):
 
     def end_episode(self, truncated: bool) -> None:
         """
-        Take in the end of an episode.
+        Narrow the kernel after an episode that reached its time limit, if the target has contradicted what was transferred.
 
-        One that reached its time limit narrows the kernel of transferred instances, if the target's own transitions have
-        contradicted them: where they reach the threshold everywhere, wrongly, nothing is optimistic and nothing would ever be
-        explored. A time limit alone says nothing against them.
+        Where wrong instances reach the threshold everywhere, nothing would ever be explored.
         """
         if self.check.end_episode(truncated) and self.breadth_decay < 1.0:
             self.translator.set_breadth(self.translator.rules.breadth * self.breadth_decay)
@@ -121,7 +130,6 @@ class InstanceTransfer(SourceUse):
 
     def _renew_relevance(self, n_used: int) -> None:
         self.measure_relevance(n_used=n_used, values=self.translator.relevance)
-        self.translator.order_by_relevance()
         self._n_of_relevance = n_used
         # Another order, for all states: one that is asked for when it is loaded must not differ from the others.
         self.all_changed = True
@@ -175,8 +183,7 @@ class InstanceTransfer(SourceUse):
         self.n_observed = int(state["errors"][0])
         self.errors.sums.ravel()[:] = state["errors"][1:]
         if self._by_relevance:
-            n_used, saved = self.selector.n_used(), int(state["relevance_of"][0])
-            n = n_used if saved == ALL_USED else min(saved, n_used)
+            n = min(int(state["relevance_of"][0]), self.selector.n_used())
             if n > 0:
                 self._renew_relevance(n)
         # All pairs of the sample are asked for again with what is restored here.

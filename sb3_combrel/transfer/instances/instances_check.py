@@ -8,12 +8,12 @@ import numpy as np
 
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, Outcomes, warn_of_error
+from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, OutcomeEvidence, warn_of_error
 
 # The error is a mean in which the last so many transitions have most of the weight.
 WINDOW = 200
 # So much must be new since the kernel was last narrowed: transitions that were compared, ends predicted that did not come.
-MIN_TRANSITIONS, MIN_CONTRADICTIONS = 20, 3
+MIN_COMPARED, MIN_CONTRADICTIONS = 20, 3
 # So many episodes that ran into their time limit without a single transferred instance tried, and none that ended in between.
 EPISODES_IN_VAIN = 3
 # Predictions that wait for their transition, at most: of many environments at once, or of actions never carried out.
@@ -27,12 +27,11 @@ class InstancesCheck:
     Their prediction is the mean of the instances that were transferred to a state and action, by weight. After an episode that
     ran into its time limit they are contradicted if, since they last were,
 
-    - at least ``MIN_TRANSITIONS`` were compared, and the error of the predicted effects is larger than that of "no change"; or
-    - the ends that they predict did not come on at least ``MIN_CONTRADICTIONS`` visits (see :class:`Outcomes`), and never one
-      has come where it was predicted. Without this, right dynamics with a wrong goal are not found out; or
+    - at least ``MIN_COMPARED`` transitions were compared, and the error of the effects is larger than that of "no change"; or
+    - the ends that they predict did not come on at least ``MIN_CONTRADICTIONS`` visits (see :class:`OutcomeEvidence`), and
+      never one has come where it was predicted: right dynamics with a wrong goal; or
     - nothing can be found out any more: ``EPISODES_IN_VAIN`` episodes, and none that ended by itself in between, ran into
-      their time limit without one step on transferred instances, and all rewards are alike and not above 0. Where instances
-      are transferred to all other states and lead nowhere, nothing is optimistic, and nothing would ever be explored.
+      their time limit without one step on transferred instances, and all rewards are alike and not above 0.
 
     Wrong rewards do not count: the target's own transitions correct them where the agent goes.
 
@@ -41,7 +40,7 @@ class InstancesCheck:
     """
 
     def __init__(self, sources: Sequence[SourceInstances], threshold: float):
-        self.outcomes = Outcomes(np.concatenate([source.rewards for source in sources]), threshold)
+        self.evidence = OutcomeEvidence(np.concatenate([source.rewards for source in sources]), threshold)
         self.n_compared = 0
         self._sources = sources
         self._threshold = threshold
@@ -56,12 +55,7 @@ class InstancesCheck:
         self._pending: dict[bytes, TransferredInstances] = {}
 
     def note_use(self, state: np.ndarray, given: TransferredInstances, n_actions: int) -> None:
-        """
-        Keep what is transferred to a state until the transition from it is observed.
-
-        :param state: unit coordinates, shape (n_variables,)
-        :param given: the instances of each action
-        """
+        """Keep what is transferred to a state, for each action, until the transition from it is observed."""
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
         self._pending[state.tobytes()] = TransferredInstances(*(array[:n_actions].copy() for array in given))
@@ -69,18 +63,12 @@ class InstancesCheck:
     def observe(
         self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool
     ) -> np.ndarray | None:
-        """
-        Compare a transition with what was transferred to its state and action, if anything was.
-
-        :param state: unit coordinates; ``effect``: next state minus state
-        :param reward: raw
-        :return: the effect that was predicted, None if nothing was transferred
-        """
+        """Compare a transition with what was transferred to its state and action; the predicted effect, None if nothing."""
         given = self._pending.pop(state.tobytes(), None)
         n = 0 if given is None else int(given.length[action])
         if given is None or n == 0:
             # A visit to where an end was predicted may be over.
-            self.outcomes.note(0.0, 0.0, 0.0, reward, terminated)
+            self.evidence.note(0.0, 0.0, 0.0, reward, terminated)
             return None
         weight = given.weight[action, :n] / given.weight[action, :n].sum()
         predicted: np.ndarray = weight @ given.effect[action, :n]
@@ -89,17 +77,12 @@ class InstancesCheck:
         self._sums += error @ error, effect @ effect
         self.n_compared += 1
         end, predicted_reward = float(weight @ given.terminated[action, :n]), float(weight @ given.reward[action, :n])
-        self.outcomes.note(self._threshold, end, predicted_reward, reward, terminated)
+        self.evidence.note(self._threshold, end, predicted_reward, reward, terminated)
         return predicted
 
     def end_episode(self, truncated: bool) -> bool:
-        """
-        Take in the end of an episode.
-
-        :param truncated: by its time limit
-        :return: whether what was transferred has been contradicted, see the class
-        """
-        self.outcomes.end_episode(truncated)
+        """Take in the end of an episode; return whether what was transferred has been contradicted, see the class."""
+        self.evidence.end_episode(truncated)
         if not self._warned and self.n_compared >= TRANSITIONS_BEFORE_WARNING and self.error() > 1.0:
             self._warned = True
             warn_of_error(self._sources, WINDOW, self.error())
@@ -107,36 +90,30 @@ class InstancesCheck:
         self._n_before = self.n_compared
         if not (truncated and self._contradicted()):
             return False
-        self._used_up = self.n_compared, self.outcomes.contradicted
+        self._used_up = self.n_compared, self.evidence.contradicted
         return True
 
     def _contradicted(self) -> bool:
         compared, contradicted = self._used_up
-        wrong_effects = self.n_compared - compared >= MIN_TRANSITIONS and self.error() > 1.0
-        new_contradictions = self.outcomes.contradicted - contradicted
-        wrong_ends = self.outcomes.confirmed == 0 and new_contradictions >= MIN_CONTRADICTIONS
-        low, high = self.outcomes.reward_range
+        wrong_effects = self.n_compared - compared >= MIN_COMPARED and self.error() > 1.0
+        new_contradictions = self.evidence.contradicted - contradicted
+        wrong_ends = self.evidence.confirmed == 0 and new_contradictions >= MIN_CONTRADICTIONS
+        low, high = self.evidence.reward_range
         return wrong_effects or wrong_ends or (self._in_vain >= EPISODES_IN_VAIN and high <= min(0.0, low + 1e-9))
 
     def error(self) -> float:
-        """
-        Return the mean squared error of the predicted effects, over that of "no change".
-
-        On the transitions that were compared, mostly the last ``WINDOW`` of them; NaN before the first that moves.
-        """
+        """Return the mean squared error over that of "no change", mostly of the last ``WINDOW``; NaN if nothing moved."""
         wrong, baseline = self._sums.tolist()
         return wrong / baseline if baseline > 0.0 else np.nan
 
     def get_state(self) -> np.ndarray:
-        """What was found so far, float64, shape (16,)."""
+        """What was found so far, float64, shape (17,)."""
         figures = *self._sums, self.n_compared, *self._used_up, self._in_vain, self._n_before, self._warned
-        return np.concatenate([np.array(figures, dtype=np.float64), self.outcomes.get_state()])
+        return np.concatenate([np.array(figures, dtype=np.float64), self.evidence.get_state()])
 
     def set_state(self, state: np.ndarray) -> None:
-        """Take over what :meth:`get_state` returned; zeros stand for nothing so far."""
-        if not state.any():
-            return
+        """Take over what :meth:`get_state` returned."""
         self._sums = np.array(state[:2])
         self.n_compared, compared, contradicted, self._in_vain, self._n_before = (int(value) for value in state[2:7])
         self._used_up, self._warned = (compared, contradicted), bool(state[7] > 0.5)
-        self.outcomes.set_state(state[8:])
+        self.evidence.set_state(state[8:])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inner, part
-from sb3_combrel.common.kernels import any_periodic
+from sb3_combrel.common.kernels import any_periodic, squared_distance
 from sb3_combrel.common.periodic import difference
 
 
@@ -26,7 +26,6 @@ class ComplianceCache(NamedTuple):
 
     @classmethod
     def empty(cls, max_candidates: int, capacity: int = 64) -> "ComplianceCache":
-        """Make room for ``capacity`` transitions."""
         return cls(
             compliance=np.empty((capacity, max_candidates)),
             required=np.empty(capacity),
@@ -34,10 +33,8 @@ class ComplianceCache(NamedTuple):
             total=np.empty(max_candidates),
         )
 
-    def with_room(self, i: int) -> "ComplianceCache":
-        """Return itself, or a copy of twice the size if transition ``i`` would not fit."""
-        if i < len(self.required):
-            return self
+    def grown(self) -> "ComplianceCache":
+        """Return a copy of twice the size."""
         return self._replace(
             compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
             required=np.concatenate([self.required, np.empty_like(self.required)]),
@@ -54,7 +51,7 @@ def add_to_sample(i, state, sample, near, distance, due, apart):
         which variables are periodic, bool, shape (n_variables,))
     :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
     :param distance: squared distances to them, the limit for none, updated
-    :param due: bool, shape (n_points,): becomes True where it was added: the choice there has to be renewed
+    :param due: bool, shape (n_points,): becomes True where it was added
     :param apart: float64 scratch, shape (n_points,)
     """
     n_points = len(apart)
@@ -95,8 +92,8 @@ def find_nearest(query, recorded, limits, near, distance):
     """
     Find the nearest transitions of exact states and actions (line 17).
 
-    :param query: (states, actions, own_weight), shapes (n, n_variables), (n,) and (n,): where ``own_weight`` reaches the
-        threshold none are needed, and none are found
+    :param query: (states, actions, own_weight), shapes (n, n_variables), (n,) and (n,): none are found where ``own_weight``
+        reaches the threshold
     :param recorded: (states of the recorded transitions; those that count for each action, int64, shape (n_actions,
         capacity); how many these are, shape (n_actions,); which state variables are periodic, bool, shape (n_variables,))
     :param limits: (threshold, squared distance from which on a transition does not count)
@@ -117,12 +114,7 @@ def find_nearest(query, recorded, limits, near, distance):
         action = actions[r]
         for n in range(n_listed[action]):
             i = listed[action, n]
-            apart = 0.0
-            for v in range(states.shape[1]):
-                along = at[i, v] - states[r, v]
-                if wraps:
-                    along = difference(along, 0.0, periodic[v])
-                apart += along * along
+            apart = squared_distance(at[i], states[r], periodic, wraps)
             if apart < distance[r, last]:
                 add_neighbor(i, apart, near[r], distance[r])
 
@@ -133,7 +125,7 @@ def choose_one(near, compliance, required, n_candidates, draw, total):
     Choose a candidate by the mean compliance of the transitions ``near``; -1 if none exceeds what is required (lines 19-20).
 
     :param n_candidates: of the action
-    :param draw: a random number from [0, 1): each candidate that exceeds it is chosen with a probability in
+    :param draw: a random number from [0, 1): each candidate that exceeds what is required is chosen with a probability in
         proportion to its mean compliance; below 0: the one with the highest is (of equal ones the first)
     :param total: see ``ComplianceCache``
     """
@@ -175,7 +167,7 @@ def same_neighbors(near, others):
     return True
 
 
-@part
+@compiled
 def choose(rows, actions, near, cache, first, draws, choice):
     """
     Renew the choices of some rows; those for which it changed are moved to the front of ``rows``.
@@ -183,12 +175,13 @@ def choose(rows, actions, near, cache, first, draws, choice):
     :param rows: int64, shape (n,): rows of ``near`` and ``choice``
     :param actions: int64, shape (n,): their actions
     :param near: int64, shape (at required n, n_neighbors): nearest transitions, -1 for none
-    :param cache: ComplianceCache, in which they are measured
+    :param cache: ComplianceCache as a plain tuple, in which they are measured
     :param first: see ``CandidateArrays``
     :param draws: a random number for each of ``rows``; or nothing, shape (0,): the best is chosen (see ``choose_one``)
     :param choice: int64: candidates, -1 for none, updated
     :return: how many changed
     """
+    cache = ComplianceCache(*cache)
     n_changed = 0
     last = np.int64(-1)
     best = np.int64(-1)
@@ -210,20 +203,12 @@ def choose(rows, actions, near, cache, first, draws, choice):
 
 
 @compiled
-def choose_plain(rows, actions, near, cache, first, draws, choice):
-    """:func:`choose` for callers from Python, with plain tuples."""
-    return choose(rows, actions, near, ComplianceCache(*cache), first, draws, choice)
-
-
-@compiled
-def select_plain(query, recorded, limits, cache, first, draws, found):
+def select(query, recorded, limits, cache, first, draws, found):
     """
     Choose candidates for exact states and actions (lines 17-20), if all that are needed have been measured.
 
     :param query: see :func:`find_nearest`; ``recorded`` and ``limits``: the same
-    :param cache: ComplianceCache as a plain tuple
-    :param first: see ``CandidateArrays``
-    :param draws: a random number for each action; or nothing, shape (0,): the best is chosen (see ``choose_one``)
+    :param draws: a random number for each action; or nothing; the rest as in :func:`choose`
     :param found: (nearest transitions, scratch for their distances, first candidate, one past the last: none if equal); see
         :func:`find_nearest` for the first two; the others int64, shape (at least n,)
     :return: whether all nearest transitions have been measured; otherwise nothing is chosen

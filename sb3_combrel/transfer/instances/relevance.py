@@ -1,7 +1,6 @@
 """Relevance: which source instances are to be transferred first (Eqs. 4 and 7, and one of this package)."""
 
-from collections.abc import Iterator
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -18,51 +17,18 @@ def renew_relevance(
     n_used: int,
     bandwidths: CandidateBandwidths,
     periodic: np.ndarray,
-    mu: float,
     values: np.ndarray,
+    mu: float | None,
 ) -> None:
     """
-    Compute the relevance of all source instances, through every candidate, to recorded target transitions (Eq. 7).
+    Compute the relevance of all source instances, through every candidate, to recorded target transitions.
 
-    :param candidates: the candidates of every target action
-    :param transitions: the target transitions, of which the first ``n_used`` count
-    :param bandwidths: of Eq. 2
+    :param n_used: so many of the transitions count, the first ones
     :param periodic: which state variables of the target are periodic, bool, shape (n_variables,)
-    :param mu: fraction of the weight of Eq. 4
     :param values: receives the relevances, shape (n_candidates, most instances of an action)
-    """
-    weight = np.empty(n_used)
-    for c, problem in enumerate(_problems(candidates, transitions, n_used, bandwidths, periodic)):
-        _relevance.call(*problem, mu, weight, values[c])
-
-
-def renew_near_relevance(
-    candidates: Candidates,
-    transitions: RecordedTransitions,
-    n_used: int,
-    bandwidths: CandidateBandwidths,
-    periodic: np.ndarray,
-    values: np.ndarray,
-) -> None:
-    """
-    Compute the relevance that does not favour distant instances, of all source instances through every candidate.
-
-    Parameters: see :func:`renew_relevance`.
+    :param mu: fraction of the weight of Eq. 4; None: the relevance that does not favour distant instances
     """
     weight, evidence = np.empty(n_used), np.empty(values.shape[1])
-    for c, problem in enumerate(_problems(candidates, transitions, n_used, bandwidths, periodic)):
-        _near_relevance.call(*problem, weight, evidence, values[c])
-
-
-def _problems(
-    candidates: Candidates,
-    transitions: RecordedTransitions,
-    n_used: int,
-    bandwidths: CandidateBandwidths,
-    periodic: np.ndarray,
-) -> Iterator[tuple[Any, ...]]:
-    """What compiled code is told of each candidate: target, source, action, mapping, bandwidths."""
-    of_all, starts = bandwidths
     of_actions = {}
     for a in range(len(candidates.arrays.first) - 1):
         rows = np.flatnonzero(transitions.actions[:n_used] == a)
@@ -70,19 +36,21 @@ def _problems(
     for c, origin in enumerate(candidates.origins):
         row = candidates.arrays.row[c]
         mapping = candidates.table.variable[row], candidates.table.sign[row], periodic
-        of_row = of_all._replace(start=float(starts[row]))
-        yield of_actions[origin.target_action], candidates.instances, candidates.arrays.action[c], mapping, of_row
+        of_row = bandwidths.of_all._replace(start=float(bandwidths.starts[row]))
+        target, source_action = of_actions[origin.target_action], candidates.arrays.action[c]
+        if mu is None:
+            _near_relevance.call(target, candidates.instances, source_action, mapping, of_row, weight, evidence, values[c])
+        else:
+            _relevance.call(target, candidates.instances, source_action, mapping, of_row, mu, weight, values[c])
+
+
+renew_near_relevance = partial(renew_relevance, mu=None)
 
 
 @compiled
 def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
     """
-    Compute the relevance of the source instances of one action, through one state mapping, to target transitions.
-
-    rho_j = exp(-((lambda_j - 1) / d_j)^2). lambda_j is the compliance of instance j with the target's transitions:
-    weights normalized over these, so a perfectly compliant instance has 1. d_j is the mean distance to the nearest
-    transitions, as many as weigh less than the fraction ``mu`` of all together, but at least one (Eq. 4). Without
-    transitions everything is relevant.
+    Compute ``equations.source_relevances``, through one state mapping.
 
     :param target: (states, effects, rewards) of the transitions with one target action: unit coordinates, shape (n,
         n_target_variables); next states minus states, same shape; raw, shape (n,)
@@ -107,31 +75,25 @@ def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
 @compiled
 def near_relevance(target, source, action, mapping, bandwidths, weight, evidence, values):
     """
-    Compute the relevance that does not favour distant instances (``equations.near_relevances``).
-
-    Parameters: see :func:`relevance`, and
+    Compute the relevance that does not favour distant instances (``equations.near_relevances``), as :func:`relevance`.
 
     :param evidence: float64 scratch, at least as many as ``source.size[action]``
     """
     n = source.size[action]
     total = 0.0
-    borne_out = 0.0
+    complied = 0.0
     for j in range(n):
         evidence[j], values[j] = _compliance(j, target, source, action, mapping, bandwidths, weight)
         total += evidence[j]
-        borne_out += evidence[j] * values[j]
-    mean = borne_out / total if total > 0.0 else 1.0
+        complied += evidence[j] * values[j]
+    mean = complied / total if total > 0.0 else 1.0
     for j in range(n):
         values[j] = (evidence[j] * values[j] + mean) / (evidence[j] + 1.0)
 
 
 @inner
 def _compliance(j, target, source, action, mapping, bandwidths, weight):
-    """
-    Return the evidence on instance ``j``, which is the sum of the weights of all transitions, and its compliance with them.
-
-    :param weight: receives the weights
-    """
+    """Return the evidence on instance ``j``, the sum of all transitions' weights, and its compliance; fill ``weight``."""
     states, effects, rewards = target
     index, sign, periodic = mapping
     n, d = states.shape
@@ -163,10 +125,9 @@ def _compliance(j, target, source, action, mapping, bandwidths, weight):
 @inner
 def _mean_distance(weight, total, mu, bandwidth):
     """
-    Return d_j of Eq. 4: mean distance of the heaviest transitions whose sum stays below ``mu`` of the weight.
+    Return d_j of Eq. 4: mean distance of the heaviest transitions whose sum stays below ``mu`` of the weight, at least one.
 
-    Where the first alone does not stay below, it is the only one. The weights are used up; distances are read back from
-    them. A sum that reaches ``mu`` but for rounding does not stay below.
+    The weights are used up; distances are read back from them. A sum that reaches ``mu`` but for rounding does not stay below.
     """
     limit = mu * total * (1.0 - 1e-12)
     n = len(weight)

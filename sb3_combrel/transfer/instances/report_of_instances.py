@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 
-from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
-from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
+import numpy as np
 
-_COMPLIANCES = ("compliance", "next_best_compliance", "no_change_compliance")
+from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
+from sb3_combrel.transfer.instances.selectors import Confidence
+from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 
 
 def report_of_instances(method: str, transfer: InstanceTransfer, statistics: Mapping[str, float]) -> TransferReport:
@@ -19,44 +19,38 @@ def report_of_instances(method: str, transfer: InstanceTransfer, statistics: Map
     :param transfer: after one step at least
     :param statistics: the method's figures of the log, by name
     """
-    outcomes, errors = transfer.check.outcomes, transfer.errors
-    totals = errors.of_actions.sum(axis=0)
     return TransferReport(
         method=method,
         use="instances",
         sources=describe_sources(transfer.sources),
         n_steps=transfer.n_observed,
         n_rested=transfer.check.n_compared,
-        mappings=_mappings(transfer),
-        error=errors.error(),
-        n_compared=int(totals[0]),
-        n_worse=int(totals[3]),
-        contradictions=errors.contradictions(),
-        ends=(outcomes.confirmed, outcomes.contradicted),
-        rewards=(outcomes.rewards_right, outcomes.rewards_wrong),
+        mappings=tuple(_mapping(transfer, a) for a in range(transfer.task.n_actions)),
+        error=transfer.errors.error(),
         statistics=statistics,
+        **transfer.errors.report_fields(transfer.check.evidence),
     )
 
 
-def _mappings(transfer: InstanceTransfer) -> tuple[MappingReport, ...]:
-    """Report, for each target action, the mapping whose instances were used most."""
-    found = []
-    uses = transfer.uses()
-    parts_of = {candidate: transfer.candidates.parts(candidate) for candidate in uses}
-    compared, error = transfer.errors.of_actions[:, 0], transfer.errors.errors()
-    for a, name in enumerate(transfer.task.action_names):
-        of_action = Counter({each: uses[each] for each, parts in parts_of.items() if parts.target_action == a})
-        figures = dict(error=float(error[a]), n_compared=int(compared[a]))
-        sure = transfer.selector.confidence(a)
-        if sure is not None:
-            figures |= dict(zip(_COMPLIANCES, sure[:3], strict=True))
-        if not of_action:
-            nothing = "nothing was transferred" if not compared[a] else "many mappings at once"
-            found.append(MappingReport(name, nothing, n_mappings=0, **figures))  # type: ignore[arg-type]
-            continue
-        ((best, n),) = of_action.most_common(1)
-        parts = parts_of[best]
-        words = f"{parts.source_action} with {parts.state_mapping}"
-        share = n / of_action.total()
-        found.append(MappingReport(name, words, share=share, n_mappings=len(of_action), **figures))  # type: ignore[arg-type]
-    return tuple(found)
+def _mapping(transfer: InstanceTransfer, action: int) -> MappingReport:
+    """Report the mapping of a target action whose instances were used most."""
+    parts_of = {each: transfer.candidates.parts(each) for each in transfer.uses()}
+    of_action = {each: n for each, n in transfer.uses().items() if parts_of[each].target_action == action}
+    compared = int(transfer.errors.of_actions[action, 0])
+    words, share = "many mappings at once" if compared else "nothing was transferred", np.nan
+    if of_action:
+        best = max(of_action, key=lambda each: of_action[each])
+        words = f"{parts_of[best].source_action} with {parts_of[best].state_mapping}"
+        share = of_action[best] / sum(of_action.values())
+    sure = transfer.selector.confidence(action) or Confidence(np.nan, np.nan, np.nan)
+    return MappingReport(
+        target_action=transfer.task.action_names[action],
+        mapping=words,
+        share=share,
+        n_mappings=len(of_action),
+        compliance=sure.chosen,
+        next_best_compliance=sure.next_best,
+        no_change_compliance=sure.no_change,
+        error=float(transfer.errors.errors()[action]),
+        n_compared=compared,
+    )

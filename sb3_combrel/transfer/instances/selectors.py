@@ -15,14 +15,7 @@ Ranges = tuple[np.ndarray, np.ndarray]
 
 
 class SelectorParts(NamedTuple):
-    """
-    What every selector is made from.
-
-    :param candidates: the candidates of every target action
-    :param task: the target task
-    :param transitions: the recorded target transitions
-    :param rng: random number generator
-    """
+    """What every selector is made from: candidates of every target action, and the recorded target transitions."""
 
     candidates: Candidates
     task: TargetTask
@@ -45,14 +38,7 @@ class Confidence(NamedTuple):
 
 
 class Selector(ABC):
-    """
-    Selects, for states and actions, the range of candidates whose instances are translated.
-
-    :param candidates: the candidates of every target action
-    :param task: the target task
-    :param transitions: the recorded target transitions
-    :param rng: random number generator
-    """
+    """Selects, for states and actions, the range of candidates whose instances are translated."""
 
     #: Whether :meth:`choices` ever names a candidate.
     makes_choices: ClassVar[bool] = False
@@ -61,21 +47,15 @@ class Selector(ABC):
     #: Whether a range is of one candidate at most.
     selects_one: ClassVar[bool] = True
 
-    def __init__(self, candidates: Candidates, task: TargetTask, transitions: RecordedTransitions, rng: np.random.Generator):
-        self.candidates = candidates
-        self.task = task
-        self.transitions = transitions
-        self.rng = rng
-        self.first = candidates.arrays.first
+    def __init__(self, parts: SelectorParts):
+        self.candidates, self.task, self.transitions, self.rng = parts
+        self.first = self.candidates.arrays.first
 
     @abstractmethod
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         """
-        Select candidates for states and actions, without leaving a trace.
+        Select candidates for states and actions, without leaving a trace; parameters as of ``Transfer.transferred``.
 
-        :param states: unit coordinates of the target, shape (n, n_variables)
-        :param actions: target actions, int64, shape (n,)
-        :param own_weight: weight of the target's own instances there, shape (n,)
         :return: first candidate, and one past the last (equal: none), int64, shape (n,)
         """
 
@@ -98,11 +78,7 @@ class Selector(ABC):
         return self.transitions.n
 
     def end_episode(self) -> bool:
-        """
-        Take in the end of an episode.
-
-        :return: whether transitions recorded before are used from now on
-        """
+        """Take in the end of an episode; return whether transitions recorded before are used from now on."""
         return False
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
@@ -110,20 +86,11 @@ class Selector(ABC):
         return False
 
     def choices(self) -> np.ndarray:
-        """
-        Return the candidate selected for each state-action pair of the sample.
-
-        :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
-        """
+        """Return the candidate of each pair of the sample, int64, shape (n_actions * n_points,); -1: not a single one."""
         return np.full(self.task.n_actions * len(self.task.sample_states), -1, dtype=np.int64)
 
     def confidence(self, action: int) -> Confidence | None:
-        """
-        Compare the choices for a target action with the next best and with the no-change baseline.
-
-        :param action: target action
-        :return: None where nothing is chosen by compliance
-        """
+        """Compare the choices for a target action with others; None where nothing is chosen by compliance."""
         return None
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -147,20 +114,12 @@ class FixedSelector(Selector):
 
     makes_choices = True
 
-    def __init__(
-        self,
-        candidates: Candidates,
-        task: TargetTask,
-        transitions: RecordedTransitions,
-        rng: np.random.Generator,
-        fixed: np.ndarray,
-    ):
-        super().__init__(candidates, task, transitions, rng)
+    def __init__(self, parts: SelectorParts, fixed: np.ndarray):
+        super().__init__(parts)
         self.fixed = fixed
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        chosen = self.fixed[actions]
-        return chosen, chosen + 1
+        return self.fixed[actions], self.fixed[actions] + 1
 
     def choices(self) -> np.ndarray:
         return np.repeat(self.fixed, len(self.task.sample_states))
@@ -173,8 +132,8 @@ class RandomSelector(Selector):
     So a prediction that is asked for twice is the same, and draws no random numbers.
     """
 
-    def __init__(self, candidates: Candidates, task: TargetTask, transitions: RecordedTransitions, rng: np.random.Generator):
-        super().__init__(candidates, task, transitions, rng)
+    def __init__(self, parts: SelectorParts):
+        super().__init__(parts)
         self.before_transition()
 
     def before_transition(self) -> None:
@@ -184,8 +143,7 @@ class RandomSelector(Selector):
         return self.rng.integers(self.first[actions], self.first[actions + 1])
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        chosen = self._drawn[actions]
-        return chosen, chosen + 1
+        return self._drawn[actions], self._drawn[actions] + 1
 
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         chosen = self._draw(actions)

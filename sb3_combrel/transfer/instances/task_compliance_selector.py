@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
-from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths
-from sb3_combrel.transfer.instances.compliance import ComplianceScratch, transition_compliance_plain
-from sb3_combrel.transfer.instances.selectors import PooledSelector
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-
-_transition_compliance = EntryPoint(transition_compliance_plain)
+from sb3_combrel.transfer.instances.compliance import ComplianceTable
+from sb3_combrel.transfer.instances.selectors import PooledSelector, SelectorParts
 
 
 class TaskComplianceSelector(PooledSelector):
     """
     Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
-
-    Parameters: see :class:`~sb3_combrel.transfer.instances.selectors.Selector`, and
 
     :param bandwidths: of compliance
     :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
@@ -29,34 +21,20 @@ class TaskComplianceSelector(PooledSelector):
 
     needs_transitions = True
 
-    def __init__(
-        self,
-        candidates: Candidates,
-        task: TargetTask,
-        transitions: RecordedTransitions,
-        rng: np.random.Generator,
-        bandwidths: Bandwidths,
-        starts: np.ndarray,
-        max_transitions: int,
-    ):
-        super().__init__(candidates, task, transitions, rng)
+    def __init__(self, parts: SelectorParts, bandwidths: Bandwidths, starts: np.ndarray, max_transitions: int):
+        super().__init__(parts)
         self.max_transitions = max_transitions
-        n_rows, n_source_actions = len(candidates.table.variable), len(candidates.instances.size)
+        self._table = ComplianceTable(self.candidates, bandwidths, starts, periodic=self.task.periodic)
+        n_rows, n_source_actions = self._table.values.shape
         #: Compliances of transitions added up, by state mapping, target action and source action, of all sources.
-        self.sums = np.zeros((n_rows, task.n_actions, n_source_actions))
-        self._table = np.empty((n_rows, n_source_actions))
-        scratch = ComplianceScratch.for_mappings(candidates.table, candidates.instances, starts, periodic=task.periodic)
-        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
-        source, mappings = tuple(candidates.instances), tuple(candidates.table)
-        self._measuring = source, mappings, tuple(bandwidths), tuple(scratch), self._table
+        self.sums = np.zeros((n_rows, self.task.n_actions, n_source_actions))
 
     def takes_transitions(self) -> bool:
         return self.transitions.n < self.max_transitions
 
     def add_transition(self, i: int) -> None:
-        seen = self.transitions
-        _transition_compliance.call(seen.states[i], seen.effects[i], float(seen.rewards[i]), *self._measuring)
-        self.sums[:, int(seen.actions[i])] += self._table
+        self._table.measure(self.transitions, i)
+        self.sums[:, int(self.transitions.actions[i])] += self._table.values
 
     def task_compliance(self, source: int, mapping: InterTaskMapping) -> float:
         """

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, part
-from sb3_combrel.common.instances import BLOCK
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
+from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.selectors import Ranges
-from sb3_combrel.transfer.instances.translation_arrays import (
-    CandidateMappings,
-    SourceArrays,
-    TranslationArrays,
-    TranslationRules,
-    TranslationScratch,
-    as_arrays,
-)
 
 # Instances of a state and action by distance, at most; by relevance room is made for as many as it takes.
 MAX_TRANSFERRED = 32
@@ -31,8 +23,101 @@ _INSTANCE, _CANDIDATE = 0, 1
 _RANK, _WEIGHT = 0, 1
 
 
+class CandidateMappings(NamedTuple):
+    """What each candidate is: ``row`` and ``action`` of ``CandidateArrays``, ``variable`` and ``sign`` of ``MappingTable``."""
+
+    row: np.ndarray
+    action: np.ndarray
+    variable: np.ndarray
+    sign: np.ndarray
+
+
+class TranslationRules(NamedTuple):
+    """
+    When and how instances are translated: see ``equations.TransferRules`` for the first four, and
+
+    :param transfer_terminals: whether an instance that ended a source episode ends the target's
+    :param by_relevance: whether instances come in the order of their relevance, not of their distance
+    :param times_weight: of their relevance times their weight
+    """
+
+    threshold: float
+    breadth: float
+    min_weight: float
+    min_fraction: float
+    transfer_terminals: bool
+    by_relevance: bool
+    times_weight: bool = False
+
+
+class TranslationScratch(NamedTuple):
+    """
+    Work space: the instances selected at one state, best first, with room for one more than are ever needed.
+
+    :param number: int64, shape (room, 2): instance and candidate
+    :param value: float64, shape (room, 2): what it is ranked by, and its weight
+    :param variable: int64, shape (n_variables,): source variables that a candidate compares with
+    :param at: float64, same shape: where the state lies along each; ``periodic``: bool, whether it wraps there
+    :param gap: float64, shape (n_blocks,): squared distances of the blocks' boxes
+    :param full: bool, shape (1,): an instance that was needed did not fit
+    :param enters: float64, shape (1,): an instance of no higher rank than this is not needed
+    """
+
+    number: np.ndarray
+    value: np.ndarray
+    variable: np.ndarray
+    at: np.ndarray
+    periodic: np.ndarray
+    gap: np.ndarray
+    full: np.ndarray
+    enters: np.ndarray
+
+    @classmethod
+    def empty(cls, max_instances: int, n_variables: int, n_blocks: int) -> TranslationScratch:
+        """Make work space for ``max_instances`` a state."""
+        return cls(
+            number=np.empty((max_instances + 1, 2), dtype=np.int64),
+            value=np.empty((max_instances + 1, 2)),
+            variable=np.empty(n_variables, dtype=np.int64),
+            at=np.empty(n_variables),
+            periodic=np.zeros(n_variables, dtype=np.bool_),
+            gap=np.empty(n_blocks),
+            full=np.zeros(1, dtype=np.bool_),
+            enters=np.zeros(1),
+        )
+
+
+class TranslationArrays(NamedTuple):
+    """
+    All that the translator's loops read, and their work space.
+
+    :param source: the source instances
+    :param relevance: float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
+    :param periodic: bool, shape (n_target_variables,): translated instances lie in the target's space, which wraps along these
+    """
+
+    source: Instances
+    mappings: CandidateMappings
+    rules: TranslationRules
+    relevance: np.ndarray
+    scratch: TranslationScratch
+    periodic: np.ndarray
+
+    def plain(self) -> tuple[Any, ...]:
+        """The same as plain tuples (see ``common.compiled``)."""
+        structs = tuple(self.source), tuple(self.mappings), tuple(self.rules)
+        return *structs, self.relevance, tuple(self.scratch), self.periodic
+
+
+@inlined
+def as_arrays(plain):
+    """:class:`TranslationArrays` from plain tuples."""
+    source, mappings, rules = Instances(*plain[0]), CandidateMappings(*plain[1]), TranslationRules(*plain[2])
+    return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]), plain[5])
+
+
 @part
-def consider(j, candidate, weight, rank, own, kept, rules, scratch):
+def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
     """
     Add an instance to the list of the selected, the highest rank first, and cut what is not needed any more.
 
@@ -40,7 +125,6 @@ def consider(j, candidate, weight, rank, own, kept, rules, scratch):
     ``min_fraction`` of their weight. These sums only grow, so what is cut once would be cut for ever.
 
     :param kept: how many are in the list
-    :param scratch: TranslationScratch that holds it
     :return: how many are now, and the least weight with which a further instance could enter (by weight)
     """
     number, value = scratch.number, scratch.value
@@ -58,7 +142,7 @@ def consider(j, candidate, weight, rank, own, kept, rules, scratch):
     value[k, _WEIGHT] = weight
     total = own
     for k in range(min(kept + 1, room)):
-        if not rules.times_weight and value[k, _WEIGHT] < rules.min_fraction * total:
+        if not rules.by_relevance and value[k, _WEIGHT] < rules.min_fraction * total:
             # Heavier than the last of the list, one need not have that fraction of the last's weight as well.
             enters = rules.min_fraction * total
             return k, min(enters, value[k - 1, _WEIGHT]) if k > 0 else enters
@@ -72,13 +156,12 @@ def consider(j, candidate, weight, rank, own, kept, rules, scratch):
 
 
 @part
-def gather(state, own, candidate, arrays, kept):
+def add_near_instances(state, own, candidate, arrays, kept):
     """
     Add the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` to the selected.
 
     :param own: weight of the target's own instances at ``state``
-    :param arrays: TranslationArrays, whose scratch holds the selected
-    :param kept: how many there are
+    :param kept: how many are selected
     :return: how many are now
     """
     source, rules, scratch = arrays.source, arrays.rules, arrays.scratch
@@ -99,15 +182,18 @@ def gather(state, own, candidate, arrays, kept):
             n_mapped += 1
     size = source.size[action]
     low, high = source.block_low[action], source.block_high[action]
-    nearest_block = measure_blocks(low, high, size, n_mapped, scratch)
+    nearest_block = measure_mapped_gaps(low, high, size, n_mapped, scratch)
     nearest = far
-    # The instances in the nearest block exclude most other blocks.
-    for turn in range(-1, (size + BLOCK - 1) // BLOCK):
+    # The instances in the nearest block exclude most other blocks. By relevance alone they do not: there, of equally relevant
+    # ones the first comes first.
+    by_relevance_alone = rules.by_relevance and not rules.times_weight
+    first_turn = 0 if by_relevance_alone else -1
+    for turn in range(first_turn, (size + BLOCK - 1) // BLOCK):
         block = nearest_block if turn < 0 else turn
-        if turn == nearest_block or scratch.gap[block] > nearest:
+        if scratch.gap[block] > nearest or (turn == nearest_block and first_turn < 0):
             continue
         for j in range(block * BLOCK, min(size, (block + 1) * BLOCK)):
-            if rules.times_weight and arrays.relevance[candidate, j] <= scratch.enters[0]:
+            if rules.by_relevance and arrays.relevance[candidate, j] <= scratch.enters[0]:
                 continue
             apart = 0.0
             for m in range(n_mapped):
@@ -115,63 +201,20 @@ def gather(state, own, candidate, arrays, kept):
                 apart += along * along
             if apart <= nearest:
                 weight = np.exp(apart * scale)
-                rank = weight * arrays.relevance[candidate, j] if rules.times_weight else weight
-                kept, enters = consider(j, candidate, weight, rank, own, kept, rules, scratch)
+                rank = 1.0 if by_relevance_alone else weight
+                if rules.by_relevance:
+                    rank *= arrays.relevance[candidate, j]
+                kept, enters = insert_selected(j, candidate, weight, rank, own, kept, rules, scratch)
                 if rules.times_weight:
                     # No relevance exceeds 1: what is lighter than the least rank that is needed has a lower one.
                     enters = scratch.enters[0]
-                if enters > rules.min_weight:
+                if enters > rules.min_weight and not by_relevance_alone:
                     nearest = np.log(enters) / scale * (1 + 1e-12)
     return kept
 
 
 @part
-def take_most_relevant(state, own, first, last, arrays):
-    """
-    Select the translated instances of some candidates in the order of their relevance, which is known before the state is.
-
-    So only as many are looked at as it takes to reach the threshold.
-
-    :param own: weight of the target's own instances at ``state``
-    :param first: the first candidate; ``last``: one past the last. All that ``arrays.order`` has together
-    :param arrays: TranslationArrays, whose scratch receives the selected
-    :return: how many they are
-    """
-    source, mappings, rules, scratch = arrays.source, arrays.mappings, arrays.rules, arrays.scratch
-    most = arrays.relevance.shape[1]
-    scale = -1.0 / (rules.breadth * rules.breadth)
-    far = np.log(rules.min_weight) / scale
-    total = own
-    kept = 0
-    for place in range(first * most, last * most):
-        pair = arrays.order[place]
-        if pair < 0 or total >= rules.threshold:
-            break
-        candidate = pair // most
-        j = pair - candidate * most
-        row, action = mappings.row[candidate], mappings.action[candidate]
-        apart = 0.0
-        for v in range(len(state)):
-            k = mappings.variable[row, v]
-            if k >= 0:
-                at = 1.0 - state[v] if mappings.sign[row, v] < 0.0 else state[v]
-                along = difference(at, source.state[action, j, k], arrays.periodic[v])
-                apart += along * along
-        if apart > far:
-            continue
-        if kept == len(scratch.value) - 1:
-            scratch.full[0] = True
-            break
-        scratch.number[kept, _INSTANCE] = j
-        scratch.number[kept, _CANDIDATE] = candidate
-        scratch.value[kept, _WEIGHT] = np.exp(apart * scale)
-        total += scratch.value[kept, _WEIGHT]
-        kept += 1
-    return kept
-
-
-@part
-def measure_blocks(low, high, size, n_mapped, scratch):
+def measure_mapped_gaps(low, high, size, n_mapped, scratch):
     """Write to ``scratch.gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
     variable, at, gap = scratch.variable, scratch.at, scratch.gap
     nearest_block = 0
@@ -216,7 +259,7 @@ def write_row(s, own, kept, arrays, transferred):
             transferred.effect[s, n, v] = mappings.sign[row, v] * source.effect[action, j, k] if k >= 0 else 0.0
 
 
-@part
+@compiled
 def translate(states, own, ranges, arrays, transferred):
     """
     Translate instances for states and actions (see ``Transfer.transferred``).
@@ -224,61 +267,33 @@ def translate(states, own, ranges, arrays, transferred):
     :param states: unit coordinates, shape (n, n_variables)
     :param own: weight of the target's own instances there, shape (n,)
     :param ranges: (first candidate whose instances may be used, one past the last: none if equal), shape (n,) each
-    :param arrays: TranslationArrays
-    :param transferred: receives the instances, at least n rows
+    :param arrays: ``TranslationArrays.plain``
+    :param transferred: TransferredInstances as a plain tuple, receives the instances, at least n rows
     """
+    arrays, transferred = as_arrays(arrays), TransferredInstances(*transferred)
     first, last = ranges
     for s in range(len(own)):
         transferred.length[s] = 0
         if own[s] >= arrays.rules.threshold:
             continue
         kept = np.int64(0)
-        if arrays.rules.by_relevance and not arrays.rules.times_weight:
-            kept = take_most_relevant(states[s], own[s], first[s], last[s], arrays)
-        else:
-            arrays.scratch.enters[0] = -np.inf
-            for candidate in range(first[s], last[s]):
-                kept = gather(states[s], own[s], candidate, arrays, kept)
+        arrays.scratch.enters[0] = -np.inf
+        for candidate in range(first[s], last[s]):
+            kept = add_near_instances(states[s], own[s], candidate, arrays, kept)
         write_row(s, own[s], kept, arrays, transferred)
 
 
-@compiled
-def translate_plain(states, own, ranges, arrays, transferred):
-    """:func:`translate` for callers from Python, with plain tuples."""
-    translate(states, own, ranges, as_arrays(arrays), TransferredInstances(*transferred))
-
-
-_translate = EntryPoint(translate_plain)
-
-
-def most_relevant_first(relevance: np.ndarray, sizes: np.ndarray, pools: np.ndarray) -> np.ndarray:
-    """
-    Sort the instances of pools of candidates by relevance; of those that are equally relevant the first comes first.
-
-    :param relevance: shape (n_candidates, most instances of an action)
-    :param sizes: how many instances each candidate has, int64, shape (n_candidates,)
-    :param pools: the first candidate of each pool, and ``n_candidates``, int64
-    :return: see ``TranslationArrays.order``
-    """
-    most = relevance.shape[1]
-    missing = np.arange(most) >= sizes[:, None]
-    rank = np.where(missing, np.inf, -relevance).ravel()
-    order = np.empty(rank.shape, dtype=np.int64)
-    for first, last in itertools.pairwise((pools * most).tolist()):
-        order[first:last] = first + np.argsort(rank[first:last], kind="stable")
-    order[missing.ravel()[order]] = -1
-    return order
+_translate = EntryPoint(translate)
 
 
 class Translator:
     """
-    Translates instances of selected candidates, with the arrays that this takes.
+    Translates instances of selected candidates.
 
     :param candidates: the candidates of every target action
     :param task: the target task
     :param breadth: kernel breadth of transferred instances, unit coordinates
     :param transfer_terminals: see ``TranslationRules``; ``by_relevance`` and ``times_weight``: the same
-    :param pooled: whether instances of all candidates of a target action come from one pool, and not those of one candidate
     """
 
     def __init__(
@@ -290,7 +305,6 @@ class Translator:
         transfer_terminals: bool,
         by_relevance: bool,
         times_weight: bool = False,
-        pooled: bool = False,
     ):
         largest = int(candidates.instances.size.max())
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
@@ -298,7 +312,7 @@ class Translator:
         self._n_variables = task.n_variables
         self._set_arrays(
             TranslationArrays(
-                source=SourceArrays.of_instances(candidates.instances),
+                source=candidates.instances,
                 mappings=CandidateMappings(candidates.arrays.row, candidates.arrays.action, *candidates.table),
                 rules=TranslationRules(
                     threshold=float(task.exploration_threshold),
@@ -310,25 +324,20 @@ class Translator:
                     times_weight=times_weight,
                 ),
                 relevance=np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0)),
-                order=np.empty(len(candidates) * largest if by_relevance and not times_weight else 0, dtype=np.int64),
                 scratch=self._make_scratch(),
                 periodic=np.array(task.periodic),
             )
         )
         self._make_room(task.n_actions)
-        self._pools = candidates.arrays.first if pooled else np.arange(len(candidates) + 1)
-        self.order_by_relevance()
-
-    # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
 
     def _set_arrays(self, arrays: TranslationArrays) -> None:
+        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
         self._arrays, self._plain_arrays = arrays, arrays.plain()
 
     def _make_scratch(self) -> TranslationScratch:
         return TranslationScratch.empty(self._max_instances, self._n_variables, self._n_blocks)
 
     def _make_room(self, n: int) -> None:
-        """Make room for the instances of ``n`` states."""
         self._room = n
         self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
         self._plain_transferred = tuple(self._transferred)
@@ -340,14 +349,8 @@ class Translator:
 
     @property
     def relevance(self) -> np.ndarray:
-        """Relevance of each candidate's instances, shape (n_candidates, most instances of an action); (1, 0) if not used."""
+        """See ``TranslationArrays``; to be written to."""
         return self._arrays.relevance
-
-    def order_by_relevance(self) -> None:
-        """Take in that :attr:`relevance` has changed. Of those that are equally relevant the first comes first."""
-        if len(self._arrays.order):
-            sizes = self._arrays.source.size[self._arrays.mappings.action]
-            self._arrays.order[:] = most_relevant_first(self.relevance, sizes, self._pools)
 
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""
@@ -355,11 +358,8 @@ class Translator:
 
     def __call__(self, states: np.ndarray, own_weight: np.ndarray, ranges: Ranges) -> TransferredInstances:
         """
-        Translate instances for states and actions (see ``Transfer.transferred``).
+        Translate instances for states and actions, see :func:`translate`.
 
-        :param states: unit coordinates, shape (n, n_variables)
-        :param own_weight: shape (n,)
-        :param ranges: (first candidate whose instances may be used, one past the last), int64, shape (n,) each
         :return: instances, in arrays that the next call uses again
         """
         if len(own_weight) > self._room:

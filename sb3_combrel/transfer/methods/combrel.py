@@ -17,12 +17,10 @@ from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_BREADTH_DECAY,
-    RENAMED_ARGUMENTS,
     MappingTransfer,
 )
 from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
-from sb3_combrel.transfer.renamed import accept_renamed
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 #: Arguments of COMBREL that have a meaning for transferred instances only.
@@ -132,7 +130,6 @@ class COMBREL(MappingTransfer):
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
-    @accept_renamed(RENAMED_ARGUMENTS)
     def __init__(
         self,
         source: SourceLike,
@@ -251,7 +248,7 @@ class COMBREL(MappingTransfer):
             min_evidence=self.min_evidence,
             min_compliance=self.min_compliance,
         )
-        self._compliance_selector = ComplianceSelector(*parts, options)
+        self._compliance_selector = ComplianceSelector(parts, options)
         return self._compliance_selector
 
     def chosen_compliance(self, pairs: np.ndarray) -> np.ndarray:

@@ -8,13 +8,10 @@ import numpy as np
 
 from sb3_combrel.mappings.action_mappings import ActionMappings, AllActionMappings
 from sb3_combrel.mappings.mapping_set import MappingSet
-from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import Candidates
-from sb3_combrel.transfer.instances.selectors import Ranges, Selector
+from sb3_combrel.transfer.instances.selectors import Ranges, Selector, SelectorParts
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_choice import Choice
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # Action mappings that are restricted as a whole are compared one by one.
 MAX_ACTION_MAPPINGS = 100_000
@@ -108,18 +105,9 @@ class LeastErrorSelector(Selector):
     makes_choices = True
     needs_transitions = True
 
-    def __init__(
-        self,
-        candidates: Candidates,
-        task: TargetTask,
-        transitions: RecordedTransitions,
-        rng: np.random.Generator,
-        copies: Copies,
-        n_transitions: int,
-    ):
-        super().__init__(candidates, task, transitions, rng)
-        self.copies = copies
-        self.n_transitions = n_transitions
+    def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
+        super().__init__(parts)
+        task, self.copies, self.n_transitions = self.task, copies, n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
         #: The mapping that was chosen, None before.
         self.choice: Choice | None = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Sequence
@@ -37,23 +36,15 @@ from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-from sb3_combrel.transfer.renamed import warn_of_name
 from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
-from sb3_combrel.transfer.source_use import SourceUse
 
+#: What a method does with its source once bound, as ``use`` says.
+SourceUse = InstanceTransfer | SourcePrior
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8
 #: The relevance that does not favour distant instances, ``equations.near_relevances``.
 NEAR = "near"
-
-#: Arguments of TIMBREL and COMBREL by their former names.
-RENAMED_ARGUMENTS = {
-    "fading": "breadth_decay",
-    "believe_terminal": "transfer_terminals",
-    "voting_radius": "neighbor_radius",
-}
-_RENAMED_ATTRIBUTES = {**RENAMED_ARGUMENTS, "target": "task", "way": "candidate"}
 
 
 class MappingTransfer(Transfer):
@@ -77,8 +68,6 @@ class MappingTransfer(Transfer):
     :param use: "instances" or "prior": translated instances, or the source's own model seen through the mappings
     :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
     """
-
-    renamed_arguments = RENAMED_ARGUMENTS
 
     #: Whether relevance, where it is asked for, is the order in which instances are added.
     ranks_by_relevance: ClassVar[bool] = True
@@ -129,11 +118,8 @@ class MappingTransfer(Transfer):
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not there otherwise.
-        if name not in _RENAMED_ATTRIBUTES:
-            self._check_bound(name)
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        warn_of_name(name, _RENAMED_ATTRIBUTES[name])
-        return getattr(self, _RENAMED_ATTRIBUTES[name])
+        self._check_bound(name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
@@ -162,7 +148,7 @@ class MappingTransfer(Transfer):
         selector = self._make_selector(parts, bandwidths)
         return InstanceTransfer(
             selector,
-            self._make_translator(self.candidates, task, float(self.breadth), pooled=not selector.selects_one),
+            self._make_translator(self.candidates, task, float(self.breadth)),
             breadth_decay=self.breadth_decay,
             measure_relevance=self._relevance_to(parts.transitions, bandwidths),
         )
@@ -179,9 +165,7 @@ class MappingTransfer(Transfer):
         """Return whether whole mappings are the candidates."""
         return False
 
-    def _make_translator(
-        self, candidates: Candidates, task: TargetTask, breadth: float, *, pooled: bool = False
-    ) -> Translator:
+    def _make_translator(self, candidates: Candidates, task: TargetTask, breadth: float) -> Translator:
         """Make the translator of the instances of some candidates."""
         by_relevance = bool(self.relevance) and self.ranks_by_relevance
         return Translator(
@@ -191,7 +175,6 @@ class MappingTransfer(Transfer):
             transfer_terminals=self.transfer_terminals,
             by_relevance=by_relevance,
             times_weight=by_relevance and self.relevance == NEAR,
-            pooled=pooled,
         )
 
     @abstractmethod
@@ -347,12 +330,3 @@ def check_relevance(value: object) -> None:
     """
     if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value == NEAR):
         raise ValueError(f'relevance must be True, False or "{NEAR}", got {value!r}')
-
-
-def __getattr__(name: str) -> Any:
-    former = {"VirtualSourceTransfer": MappingTransfer, "Way": Candidate}
-    if name not in former:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    message = f"{name} was renamed to {former[name].__name__}; the former name goes with the next version"
-    warnings.warn(message, DeprecationWarning, stacklevel=2)
-    return former[name]

@@ -111,7 +111,7 @@ class MASTER(MappingTransfer):
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> LeastErrorSelector:
         check_action_mappings(parts.candidates.sets)
         copies = copies_of(parts.candidates, parts.task, float(self.source_breadth))
-        self._least_error = LeastErrorSelector(*parts, copies, self.n_random_steps)
+        self._least_error = LeastErrorSelector(parts, copies, self.n_random_steps)
         return self._least_error
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:

@@ -124,7 +124,7 @@ class SampleTransfer(MappingTransfer):
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> TaskComplianceSelector:
         check_action_mappings(parts.candidates.sets)
-        self._tasks = TaskComplianceSelector(*parts, *bandwidths, self.max_transitions)
+        self._tasks = TaskComplianceSelector(parts, *bandwidths, self.max_transitions)
         return self._tasks
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:

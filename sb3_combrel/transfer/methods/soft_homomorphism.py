@@ -158,7 +158,7 @@ class SoftHomomorphism(Transfer):
         if self._logits is None:
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, reward, end, weight = self._mixture.predict(states, actions)
-        return self._claims.applied(effect, reward, end, weight, actions)
+        return self._claims.restrict(effect, reward, end, weight, actions)
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         effect = differences(next_state, state, self._periodic)
@@ -168,7 +168,7 @@ class SoftHomomorphism(Transfer):
         if self._logits is not None:
             [expected], [mean_reward], [end], [weight] = self._mixture.predict(state[None], np.array([action]))
             self._squares += ((expected - effect) ** 2).sum(), effect @ effect
-            self._claims.outcomes.note(float(weight), float(end), float(mean_reward), reward, terminated)
+            self._claims.evidence.note(float(weight), float(end), float(mean_reward), reward, terminated)
         if self._fit_due <= self._n_observed <= self.max_transitions:
             self._fit_due = RENEWAL_GROWTH * self._n_observed
             self._fit()
@@ -178,7 +178,7 @@ class SoftHomomorphism(Transfer):
         if truncated and self._n_observed <= self.max_transitions:
             self._transitions.note_time_limit()
         if self._logits is not None:
-            self._claims.outcomes.end_episode(truncated)
+            self._claims.evidence.end_episode(truncated)
             self._version += self._claims.have_changed()
 
     def _fit(self) -> None:
@@ -294,7 +294,7 @@ class SoftHomomorphism(Transfer):
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
             "transfer/prior_trust": float(self._claims.trust.mean()),
-            "transfer/prior_doubted": float(self._claims.outcomes.doubted),
+            "transfer/prior_doubted": float(self._claims.evidence.doubted),
             "transfer/mapping_probability": certainty,
             "transfer/steps_to_find_mapping": self._steps_to_find,
             "transfer/fits": self._n_fits,

@@ -17,12 +17,10 @@ from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelect
 from sb3_combrel.transfer.methods.mapping_transfer import (
     DEFAULT_BREADTH,
     DEFAULT_BREADTH_DECAY,
-    RENAMED_ARGUMENTS,
     MappingTransfer,
 )
 from sb3_combrel.transfer.prior.prior_sets import make_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
-from sb3_combrel.transfer.renamed import accept_renamed
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 
@@ -78,7 +76,6 @@ class TIMBREL(MappingTransfer):
     :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
     """
 
-    @accept_renamed(RENAMED_ARGUMENTS)
     def __init__(
         self,
         source: SourceLike,
@@ -124,14 +121,14 @@ class TIMBREL(MappingTransfer):
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
         if isinstance(self.mapping, str):
-            return PooledSelector(*parts) if self.mapping == "pool" else RandomSelector(*parts)
+            return PooledSelector(parts) if self.mapping == "pool" else RandomSelector(parts)
         n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
         n_actions = parts.task.n_actions
         if n_given not in (1, n_actions):
             raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {n_given}")
         given = parts.candidates.sets[0]
         fixed = [parts.candidates.find(a, given[a if n_given > 1 else 0]) for a in range(n_actions)]
-        return FixedSelector(*parts, fixed=np.array(fixed, dtype=np.int64))
+        return FixedSelector(parts, fixed=np.array(fixed, dtype=np.int64))
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         return make_prior(

@@ -14,15 +14,15 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
-from sb3_combrel.transfer.prior.copy_predictions import CopyTable, UsePredictions, Uses, join_many_plain, predict_pairs_plain
-from sb3_combrel.transfer.prior.copy_sums import LEAST_EFFECT, CopyScratch, CopySums, follow_plain, measure_plain
+from sb3_combrel.transfer.prior.copy_predictions import CopyTable, UsePredictions, Uses, join_many, predict_pairs
+from sb3_combrel.transfer.prior.copy_sums import LEAST_EFFECT, CopyScratch, CopySums, add_transition, add_used
 from sb3_combrel.transfer.source_model import SourceModel
 
 # From so many pairs on the different states of each copy are predicted once.
 MANY = 256
 
-_measure, _follow = EntryPoint(measure_plain), EntryPoint(follow_plain)
-_predict_pairs, _join_many = EntryPoint(predict_pairs_plain), EntryPoint(join_many_plain)
+_add_transition, _add_used = EntryPoint(add_transition), EntryPoint(add_used)
+_predict_pairs, _join_many = EntryPoint(predict_pairs), EntryPoint(join_many)
 
 Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -31,10 +31,9 @@ class Copies:
     """
     Copies of sources in the target: each makes some target variables variables of a source.
 
-    A copy that leaves out source variables is predicted by a local linear model of the others: their effects are fitted to
-    them alone, over all that the instances have in those that are left out. Where an end depends on these, its probability is
-    an average over them, and small everywhere; so it is in parts of the largest that the model predicts of the instances which
-    have ended an episode.
+    A copy that leaves out source variables is predicted by a local linear model of the others alone. Where an end depends on
+    those left out, its probability is an average over them, and small everywhere; so it is in parts of the largest that the
+    model predicts of the instances which have ended an episode.
 
     :param sources: instances of each source task
     :param source: number of each copy's source, int64, shape (n_copies,)
@@ -98,21 +97,16 @@ class Copies:
         Add a target transition to the sums.
 
         :param state: unit coordinates, shape (n_target_variables,); ``effect``: next state minus state
-        :param whole: whether compliance is over all target variables; those that a copy does not have stay. Otherwise over
+        :param whole: whether compliance is over all target variables, of which those that a copy does not have stay; or over
             its own
         """
         rules = whole, self.threshold
-        _measure.call(self.model.plain, self._plain_table, rules, (state, action, effect), tuple(sums), self._scratch)
+        _add_transition.call(self.model.plain, self._plain_table, rules, (state, action, effect), tuple(sums), self._scratch)
 
-    def follow(self, uses: Uses, action: int, effect: np.ndarray, predicted: Predicted, sums: CopySums) -> None:
-        """
-        Add a target transition to the sums, for what makes up its action alone.
-
-        :param effect: next state minus state, shape (n_target_variables,)
-        :param predicted: what :meth:`predict` says of it
-        """
-        founded = min(1.0, float(predicted[3][0]) / self.threshold)
-        _follow.call(self._plain_table, tuple(uses), (action, effect, predicted[0][0], founded), tuple(sums))
+    def measure_used(self, uses: Uses, action: int, effect: np.ndarray, predicted: Predicted, sums: CopySums) -> None:
+        """Add a target transition to the sums, for what makes up its action alone; ``predicted``: by :meth:`predict`."""
+        covered = min(1.0, float(predicted[3][0]) / self.threshold)
+        _add_used.call(self._plain_table, tuple(uses), (action, effect, predicted[0][0], covered), tuple(sums))
 
     def uses(self, copies: np.ndarray, actions: np.ndarray) -> Uses:
         """
@@ -131,7 +125,7 @@ class Copies:
         return Uses(pairs[:, 0].copy(), pairs[:, 1].copy(), of_action, np.asarray(complete))
 
     def work_space(self, uses: Uses) -> UsePredictions:
-        """Make the work space of :meth:`predict`."""
+        """Make what :meth:`predict` works in."""
         n = len(uses.copy)
         # The last row is for a state as a copy has it.
         return UsePredictions(np.zeros(n, dtype=np.bool_), np.empty((n + 1, self.model.n_variables)), np.empty((n + 1, 3)))
@@ -144,8 +138,8 @@ class Copies:
         :param found: from :meth:`work_space`
         :param states: unit coordinates of the target, float64, shape (n, n_target_variables)
         :param actions: target actions, int64, shape (n,)
-        :return: effects, shape (n, n_target_variables): 0 for variables in no copy; rewards, the mean of all copies';
-            probabilities of termination, their product; and weights, the least of theirs, 0 for actions that are not complete
+        :return: effects, shape (n, n_target_variables), 0 for variables in no copy; mean rewards; products of probabilities of
+            termination; and the least weights of all copies, 0 for actions that are not complete
         """
         n, d = states.shape
         predicted = np.empty((n, d)), np.empty(n), np.empty(n), np.empty(n)
@@ -177,13 +171,7 @@ class Copies:
         return rows, np.concatenate(effects), np.concatenate(outcomes)
 
     def as_copy(self, copy: int, states: np.ndarray) -> np.ndarray:
-        """
-        Return target states as a copy has them.
-
-        :param copy: its number
-        :param states: unit coordinates of the target, shape (n, n_target_variables)
-        :return: unit coordinates of the source, shape (n, most source variables); 0 for those that the copy does not have
-        """
+        """Return target states as a copy has them, shape (n, most source variables); 0 for variables that it does not have."""
         at = np.zeros((len(states), self.model.n_variables))
         for v in np.flatnonzero(self.table.variable[copy] >= 0):
             k = self.table.variable[copy, v]
@@ -192,13 +180,7 @@ class Copies:
         return at
 
     def mapping(self, copy: int, task: TargetTask, action: tuple[int, ...]) -> InterTaskMapping:
-        """
-        Return a copy as an inter-task mapping, with names.
-
-        :param copy: its number
-        :param task: the target task
-        :param action: source action of each target action
-        """
+        """Return a copy as an inter-task mapping, with names; ``action``: source action of each target action."""
         source = self.sources[self.source[copy]]
         state = tuple(None if k < 0 else k for k in self.state[copy].tolist())
         sign = tuple(int(s) for s in np.where(self.sign[copy] < 0, -1, 1))
@@ -207,11 +189,10 @@ class Copies:
 
     def _end_scale(self, number: int, used: tuple[int, ...], first: int) -> float:
         """
-        One over the largest probability of termination at the instances of a source that have ended an episode.
+        One over the largest probability of termination at the instances of a source that have ended an episode, or 1.
 
-        :param number: of the source; ``used``: those of its variables that a copy has
+        :param used: those of the source's variables that a copy has; 1 for all of them
         :param first: the model's number of the source's first action
-        :return: 1 for all variables of a source, or if no instance has ended an episode
         """
         source = self.sources[number]
         ended = np.flatnonzero(source.terminated)
@@ -223,15 +204,9 @@ class Copies:
         return 1.0 / largest if largest > 0.0 else 1.0
 
     def _typical_effects(self, by_action: bool) -> np.ndarray:
-        """How much each source moves what a copy makes of it.
+        """How much each source moves what a copy makes of it, see :func:`_typical_effects_of`.
 
-        Over all actions, the noise of those that leave a variable alone may be typical of it. But what the action does that
-        moves it most is typical only of a target that moves as much: one that hardly moves would seem to be explained by any
-        action that moves nothing.
-
-        :param by_action: of the action for which it is most; or of all actions together
-        :return: median size of the effects (or their mean, if most are 0) on the source variable of each target variable, unit
-            coordinates, shape (n_copies, n_target_variables); 0 for variables that are not in the copy
+        :return: shape (n_copies, n_target_variables); 0 for variables that are not in the copy
         """
         typical = [_typical_effects_of(source, by_action) for source in self.sources]
         found = np.zeros(self.state.shape)
@@ -254,12 +229,7 @@ def _typical_effects_of(source: SourceInstances, by_action: bool) -> np.ndarray:
 
 
 def distinct_rows(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Find the different rows of an array, column by column: quicker than sorting rows.
-
-    :param values: float64, shape (n, n_columns)
-    :return: the number of one row of each kind, and the kind of each row, int64, shape (n,)
-    """
+    """Return the number of one row of each kind, and the kind of each row; quicker than sorting rows as ``np.unique`` does."""
     kind = np.zeros(len(values), dtype=np.int64)
     for column in values.T:
         different, inverse = np.unique(column, return_inverse=True)
@@ -271,11 +241,7 @@ def distinct_rows(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen_through(sources: Sequence[SourceInstances], parts: Sequence[tuple[int, tuple[int, ...]]]) -> Instances:
-    """
-    Instances of (source, variables) after (source, variables), their actions numbered on.
-
-    All other variables are 0, so that they make no difference.
-    """
+    """Instances of (source, variables) after (source, variables), their actions numbered on; other variables are 0."""
     chosen = []
     for number, used in parts:
         instances = sources[number]

@@ -7,10 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined
-from sb3_combrel.common.instances import Instances
-from sb3_combrel.models.fit_arrays import Kernel
-from sb3_combrel.models.linear_prediction import NearestLists
-from sb3_combrel.transfer.source_model import predict_source
+from sb3_combrel.transfer.source_model import predict_source, source_arrays
 
 
 class CopyTable(NamedTuple):
@@ -19,8 +16,8 @@ class CopyTable(NamedTuple):
     :param variable: int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
     :param sign: float64, same shape: -1 where it is mirrored
     :param share: float64, shape (n_copies, n_source_variables): 1 / number of target variables that a variable of the copy has
-    :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least;
-        ``most``: same shape: what that may grow to where the target itself moves so much
+    :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least, as of
+        all actions; ``most``: that may grow to this, as of the action that moves the variable most, where the target does
     :param end_scale: float64, shape (n_copies,): factor on probabilities of termination, which are 1 at most
     :param first: int64, shape (n_copies,): the model's number of the source's first action; ``n_actions``: same shape
     """
@@ -72,16 +69,13 @@ def see_state(table, copy, state, at):
 
 
 @compiled
-def predict_pairs_plain(source, table, uses, pairs, predicted, found):
-    """Predict target states and actions.
+def predict_pairs(source, table, uses, pairs, predicted, found):
+    """Predict target states and actions, see :func:`join_copies`.
 
-    :param source: SourceArrays; ``table``: CopyTable; plain tuples
-    :param uses: Uses; ``found``: UsePredictions; plain tuples
+    :param source: ``SourceModel.plain``; ``table``: CopyTable; ``uses``: Uses; ``found``: UsePredictions; plain tuples
     :param pairs: (states, actions)
-    :param predicted: receives effects, rewards, probabilities of termination, and weights: the least of all copies'
     """
-    instances, effect_range, kernel, near = source
-    instances, kernel, near = Instances(*instances), Kernel(*kernel), NearestLists(*near)
+    instances, effect_range, kernel, near = source_arrays(source)
     table, uses, found = CopyTable(*table), Uses(*uses), UsePredictions(*found)
     states, actions = pairs
     at = found.effect[len(uses.copy)]
@@ -110,6 +104,7 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
     """Write what all copies predict of pair ``i``.
 
     :param effects: float64, shape (n_uses, n_source_variables): of each use; ``outcomes``: float64, shape (n_uses, 3)
+    :param predicted: receives effects, mean rewards, the product of probabilities of termination, and the least weight
     """
     effect, reward, end, weight = predicted
     effect[i, :] = 0.0
@@ -135,7 +130,7 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
 
 
 @compiled
-def join_many_plain(table, uses, actions, found, predicted):
+def join_many(table, uses, actions, found, predicted):
     """:func:`join_copies` for many pairs.
 
     :param found: for each use and pair, the number of its prediction, int64, shape (n_uses, n); and these predictions,

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined
-from sb3_combrel.common.instances import Instances
-from sb3_combrel.models.fit_arrays import Kernel
-from sb3_combrel.models.linear_prediction import NearestLists
 from sb3_combrel.transfer.prior.copy_predictions import CopyTable, Uses, see_state
-from sb3_combrel.transfer.source_model import predict_source
+from sb3_combrel.transfer.source_model import predict_source, source_arrays
 
 # The smallest scale that compliance is measured by, squared unit coordinates: a variable that never moves.
 SMALLEST_SCALE = 1e-12
@@ -30,9 +27,9 @@ class CopySums(NamedTuple):
     :param stay: float64, same shape: compliances of each variable with "it stays as it is"
     :param compliance: float64, shape (n_copies, n_target_actions, most source actions): compliances of each copy
     :param error: float64, shape (n_copies, n_target_actions, most source actions, n_target_variables): squared errors
-    :param missed: float64, same shape: squared errors in parts of the squared effects, each at most
-        ``LARGEST_MISS``, where the source has data: times how much of the threshold its weight reaches, at most 1
-    :param founded: float64, shape (n_copies, n_target_actions, most source actions): sums of these factors
+    :param unexplained: float64, same shape: squared errors in parts of the squared effects, each at most
+        ``LARGEST_MISS``, times how much of the threshold the weight of the source's data reaches, at most 1
+    :param n_covered: float64, shape (n_copies, n_target_actions, most source actions): sums of these factors
     """
 
     n: np.ndarray
@@ -41,22 +38,23 @@ class CopySums(NamedTuple):
     stay: np.ndarray
     compliance: np.ndarray
     error: np.ndarray
-    missed: np.ndarray
-    founded: np.ndarray
+    unexplained: np.ndarray
+    n_covered: np.ndarray
 
     @classmethod
     def zero(cls, n_copies: int, n_source_actions: int, n_actions: int, n_variables: int) -> CopySums:
         """Sums over no transitions."""
-        return cls(
-            n=np.zeros(n_actions),
-            size=np.zeros((n_actions, n_variables)),
-            effect=np.zeros((n_actions, n_variables)),
-            stay=np.zeros((n_actions, n_variables)),
-            compliance=np.zeros((n_copies, n_actions, n_source_actions)),
-            error=np.zeros((n_copies, n_actions, n_source_actions, n_variables)),
-            missed=np.zeros((n_copies, n_actions, n_source_actions, n_variables)),
-            founded=np.zeros((n_copies, n_actions, n_source_actions)),
-        )
+        of_variables, of_copies = (n_actions, n_variables), (n_copies, n_actions, n_source_actions)
+        of_both = (*of_copies, n_variables)
+        shapes = (n_actions,), of_variables, of_variables, of_variables, of_copies, of_both, of_both, of_copies
+        return cls(*map(np.zeros, shapes))
+
+    def excluding(self, copy: Any, action: Any, used: Any) -> CopySums:
+        """The same, with the worst there can be for some copies, target actions and source actions; any index of each."""
+        compliance, error = self.compliance.copy(), self.error.copy()
+        compliance[copy, action, used] = -np.inf
+        error[copy, action, used] = np.inf
+        return self._replace(compliance=compliance, error=error)
 
 
 class CopyScratch(NamedTuple):
@@ -92,34 +90,30 @@ def add_effect(sums, action, effect):
 
 
 @inlined
-def add_error(table, sums, at, effect, predicted, founded, motion):
+def add_error(table, sums, at, effect, predicted, covered, motion):
     """Add the error of one variable to the sums; its square.
 
-    :param at: (copy, target action, source action, target variable)
-    :param motion: of the variable, see :func:`squared_motion`
+    :param at: (copy, target action, source action, target variable); ``motion``: see :func:`squared_motion`
     """
     copy, action, u, v = at
     error = (effect - predicted) ** 2
     sums.error[copy, action, u, v] += error
     compared = max(effect * effect, min(max(motion, table.least[copy, v]), table.most[copy, v]))
-    sums.missed[copy, action, u, v] += founded * min(LARGEST_MISS, error / max(compared, 1e-300))
+    sums.unexplained[copy, action, u, v] += covered * min(LARGEST_MISS, error / max(compared, 1e-300))
     return error
 
 
 @compiled
-def measure_plain(source, table, rules, transition, sums, scratch):
+def add_transition(source, table, rules, transition, sums, scratch):
     """Add one target transition to the sums: errors and compliances of all copies and source actions.
 
-    The scale of compliance, of each variable, is the square of the mean size of its effects so far. (The mean of their
-    squares would be that of a few large ones, such as those of a car that hits the wall, beside which nothing counts.)
+    The scale of compliance is that of ``equations.running_scales``.
 
-    :param source: SourceArrays; ``table``: CopyTable; ``sums``: CopySums; ``scratch``: CopyScratch; plain tuples
-    :param rules: (whole: compliance is over all target variables, those that a copy does not have stay; else over its own;
-        weight from which on the source has data)
+    :param source: ``SourceModel.plain``; ``table``: CopyTable; ``sums``: CopySums; ``scratch``: CopyScratch; plain tuples
+    :param rules: (whole, see ``Copies.measure``; weight from which on the source has data)
     :param transition: (state, action, effect), unit coordinates
     """
-    instances, effect_range, kernel, near = source
-    instances, kernel, near = Instances(*instances), Kernel(*kernel), NearestLists(*near)
+    instances, effect_range, kernel, near = source_arrays(source)
     table, sums, scratch = CopyTable(*table), CopySums(*sums), CopyScratch(*scratch)
     whole, threshold = rules
     state, action, effect = transition
@@ -135,15 +129,15 @@ def measure_plain(source, table, rules, transition, sums, scratch):
         for u in range(table.n_actions[copy]):
             source_action = table.first[copy] + u
             _, _, weight = predict_source(instances, effect_range, kernel, near, source_action, scratch.at, scratch.effect)
-            founded = min(1.0, weight / threshold)
-            sums.founded[copy, action, u] += founded
+            covered = min(1.0, weight / threshold)
+            sums.n_covered[copy, action, u] += covered
             missed = 0.0
             for v in range(n_variables):
                 k = table.variable[copy, v]
                 if k >= 0:
                     predicted = table.sign[copy, v] * scratch.effect[k]
                     at = copy, action, u, v
-                    error = add_error(table, sums, at, effect[v], predicted, founded, scratch.motion[v])
+                    error = add_error(table, sums, at, effect[v], predicted, covered, scratch.motion[v])
                     missed += error / scratch.scale[v]
                 elif whole:
                     missed += effect[v] * effect[v] / scratch.scale[v]
@@ -151,21 +145,21 @@ def measure_plain(source, table, rules, transition, sums, scratch):
 
 
 @compiled
-def follow_plain(table, uses, transition, sums):
+def add_used(table, uses, transition, sums):
     """Add one target transition to the sums, with the errors of what makes up its action alone, and no compliances.
 
     :param transition: (action, effect, predicted effect, weight of the prediction in parts of the threshold, at most 1)
     """
     table, uses, sums = CopyTable(*table), Uses(*uses), CopySums(*sums)
-    action, effect, predicted, founded = transition
+    action, effect, predicted, covered = transition
     add_effect(sums, action, effect)
     for c in range(uses.of_action.shape[1]):
         use = uses.of_action[action, c]
         if use >= 0:
             copy = uses.copy[use]
             u = uses.action[use] - table.first[copy]
-            sums.founded[copy, action, u] += founded
+            sums.n_covered[copy, action, u] += covered
             for v in range(len(effect)):
                 if table.variable[copy, v] >= 0:
                     motion = squared_motion(sums, v)
-                    add_error(table, sums, (copy, action, u, v), effect[v], predicted[v], founded, motion)
+                    add_error(table, sums, (copy, action, u, v), effect[v], predicted[v], covered, motion)

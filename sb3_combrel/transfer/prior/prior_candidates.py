@@ -12,7 +12,7 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidate, MappedVariables
 from sb3_combrel.transfer.prior.copies import Copies
-from sb3_combrel.transfer.prior.prior_choice import Choice, moved
+from sb3_combrel.transfer.prior.prior_choice import Choice
 
 # Of a choice, for one target action: the copies that it moves, and the source actions by which it does.
 Moves = Sequence[tuple[int, int]]
@@ -74,7 +74,7 @@ class PriorCandidates:
         return found
 
     def describe(self, candidate: int) -> str:
-        """Return target action, source action and pairs of variables of a candidate as text."""
+        """Return a candidate as text."""
         parts = self.parts(candidate)
         return f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
 
@@ -85,14 +85,14 @@ class PriorCandidates:
     def describe_choice(self, choice: Choice | None) -> str:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
         names = self.task.action_names
-        moves = [[] if choice is None else moved(choice, a) for a in range(self.task.n_actions)]
+        moves = [[] if choice is None else choice.moves(a) for a in range(self.task.n_actions)]
         return "; ".join(
             f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True)
         )
 
     def describe_action(self, choice: Choice, action: int) -> str:
         """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
-        return self._describe_moves(moved(choice, action), describe_copy)
+        return self._describe_moves(choice.moves(action), describe_copy)
 
     def _describe_moves(self, moves: Moves, variables_of: Callable[[InterTaskMapping], str]) -> str:
         words = (f"{self._action_name(copy, used)} on {variables_of(self.mapping(copy))}" for copy, used in moves)

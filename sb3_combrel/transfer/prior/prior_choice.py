@@ -12,8 +12,7 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 
 # A mean compliance below this counts as this: one that is nothing must not outweigh all others.
 SMALLEST_COMPLIANCE = 1e-9
-# By this factor, for each of its variables, a copy must comply better than "they stay": each copy can choose among source
-# actions, and so complies a little better with noise.
+# By this factor, for each of its variables, a copy must comply better than "they stay": some source action fits any noise.
 MIN_GAIN = 1.05
 # Divisions are searched subset by subset of the target's variables.
 MAX_FACTORED_VARIABLES = 12
@@ -33,14 +32,13 @@ class Choice(NamedTuple):
         """Whether another choice is the same."""
         return other is not None and all(np.array_equal(one, two) for one, two in zip(self, other, strict=True))
 
+    def moves(self, action: int) -> list[tuple[int, int]]:
+        """Return the copies that a target action moves, and the source actions by which it does."""
+        pairs = zip(self.copies[action].tolist(), self.actions[action].tolist(), strict=True)
+        return [(copy, used) for copy, used in pairs if copy >= 0 and used >= 0]
+
 
 Chooser = Callable[[CopySums], Choice]
-
-
-def moved(choice: Choice, action: int) -> list[tuple[int, int]]:
-    """Return the copies that a target action moves, and the source actions by which it does."""
-    pairs = zip(choice.copies[action].tolist(), choice.actions[action].tolist(), strict=True)
-    return [(copy, used) for copy, used in pairs if copy >= 0 and used >= 0]
 
 
 def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -79,9 +77,7 @@ def choose_factored(copies: Copies, sums: CopySums) -> Choice:
     """
     Choose the division of the target's variables into copies and variables that stay, and each copy's source actions.
 
-    The division is the one for which the product of all mean compliances is highest: of its copies, each with its best
-    source action for each target action and over ``MIN_GAIN`` for each of its variables, and of "it stays" for the variables
-    in none. The mean of each target action counts as often as there are transitions with it.
+    The division is that of the highest ``equations.division_score``.
     """
     action, mean = best_actions(copies, sums)
     scores = np.log(np.maximum(mean, SMALLEST_COMPLIANCE)) @ sums.n
@@ -97,8 +93,7 @@ def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) ->
     """
     Find the disjoint copies whose scores, with those of the variables in none, add up to most.
 
-    By dynamic programming over the subsets of the variables that are divided already, of which only those matter that hold
-    all variables before some first one that they do not.
+    By dynamic programming over the subsets of the variables that are divided already.
 
     :param members: bool, shape (n_copies, n_variables): the variables of each copy
     :param scores: shape (n_copies,); ``stays``: shape (n_variables,): of each variable in no copy
@@ -128,11 +123,7 @@ def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) ->
 
 
 def draw_mapping(copies: Copies, allowed: np.ndarray, rng: np.random.Generator) -> Choice:
-    """
-    Draw for each target action one of the pairs of state mapping and source action that are allowed, for the whole run.
-
-    :param allowed: see :func:`best_actions`
-    """
+    """Draw for each target action one of the pairs of state mapping and source action that are ``allowed``."""
     drawn = [rng.choice(np.argwhere(allowed[:, a])) for a in range(allowed.shape[1])]
     chosen = np.array(drawn, dtype=np.int64)
     return Choice(chosen[:, :1].copy(), chosen[:, 1:].copy())
@@ -140,10 +131,10 @@ def draw_mapping(copies: Copies, allowed: np.ndarray, rng: np.random.Generator) 
 
 def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> Choice:
     """
-    Draw a factored mapping for the whole run: a control that differs from what is chosen in nothing but the choice.
+    Draw a factored mapping for the whole run, as a control.
 
-    All divisions of as many target variables as possible into as few copies as possible are equally likely: the kind that
-    a person would try. So are all source actions, each copy's and each target action's on its own.
+    All divisions of as many target variables as possible into as few copies as possible are equally likely, and so are all
+    source actions, each copy's and each target action's on its own.
     """
     members = copies.state >= 0
     ways = _count_divisions(members)

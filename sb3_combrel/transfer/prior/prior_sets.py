@@ -13,7 +13,7 @@ from sb3_combrel.mappings.named_sets import InterTaskMapping, resolve
 from sb3_combrel.mappings.state_mappings import copies_of_source, with_mirrored
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike, load_sources
+from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike, load_sources, sizes
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.prior_choice import (
     MAX_FACTORED_VARIABLES,
@@ -51,13 +51,9 @@ def make_prior(
     """
     Make the prior of a target task.
 
-    :param source: instances, a path to them, or a list of several
-    :param mappings: mappings from the target to the source, factored or not
     :param breadth: kernel breadth of the source's model, in unit coordinates of the source
     :param given: ``mappings`` is one mapping, or one for each target action, and is used as it is
     :param drawn: one of ``mappings`` is drawn with this generator; None: it is chosen by compliance
-    :param max_transitions: by which is chosen, at most
-    :param transfer_terminals: whether the source's ends are used
     :raises ValueError: if source or mappings do not fit the target
     """
     sources = load_sources(source)
@@ -120,7 +116,7 @@ def _given_factored(
         if set(mapping) != {"copies"}:
             raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
         mapping = FactoredMapping(**mapping)
-    mapping.check(**_sizes(sources[0], task))
+    mapping.check(**sizes(sources[0], task))
     actions = np.array([copy.action for copy in mapping.copies], dtype=np.int64).T
     numbers = np.tile(np.arange(len(mapping.copies)), (task.n_actions, 1))
     return _of_mappings(mapping.copies, sources, task, breadth), Choice(numbers, actions.copy())
@@ -128,7 +124,7 @@ def _given_factored(
 
 def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
     """One mapping, or one for each target action, of the first source."""
-    given = resolve(mappings, **_sizes(sources[0], task))
+    given = resolve(mappings, **sizes(sources[0], task))
     if len(given) not in (1, task.n_actions):
         raise ValueError(
             f"mapping must be one mapping or one for each of the {task.n_actions} target actions, got {len(given)}"
@@ -151,11 +147,7 @@ def _of_mappings(
 
 
 def copies_of(candidates: Candidates, task: TargetTask, breadth: float) -> Copies:
-    """
-    Return all state mappings of a set, for each source, in the order of the candidates' mapping table.
-
-    :param breadth: kernel breadth of the source's model, in unit coordinates of the source
-    """
+    """Return all state mappings of a set, for each source, in the order of the candidates' mapping table."""
     number = np.repeat(np.arange(len(candidates.sets)), [each.n_state_mappings for each in candidates.sets])
     table = candidates.table
     return Copies(candidates.sources, number, table.variable, table.sign, breadth, task.exploration_threshold)
@@ -169,12 +161,3 @@ def _allowed(candidates: Candidates, copies: Copies) -> np.ndarray:
     for number, origin in enumerate(candidates.origins):
         allowed[arrays.row[number], origin.target_action, origin.source_action] = True
     return allowed
-
-
-def _sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:
-    return {
-        "n_source_variables": source.n_variables,
-        "n_target_variables": task.n_variables,
-        "n_source_actions": source.n_actions,
-        "n_target_actions": task.n_actions,
-    }

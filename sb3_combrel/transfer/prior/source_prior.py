@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
-from sb3_combrel.common.transferred import PriorPredictions
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.borne_out import TRANSITIONS_BEFORE_WARNING, warn_of_error
-from sb3_combrel.transfer.placed_errors import PlacedErrors
+from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, warn_of_error
 from sb3_combrel.transfer.prior.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
-from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, moved
+from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.value_bound import ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
-from sb3_combrel.transfer.source_use import SourceUse
+from sb3_combrel.transfer.region_errors import RegionErrors
 
 # A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
 SMALLEST_MOVE = 0.005
-# So many transitions are compared with what all copies predict; later ones one in so many, which suffices to notice a change.
+# So many transitions are compared with what all copies predict; of later ones one in so many.
 ALL_MEASURED, MEASURED_LATER = 500, 5
 
 
-class SourcePrior(SourceUse):
+class SourcePrior:
     """
     What a source predicts of the target, through a mapping that is given or chosen by compliance.
 
-    What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.prior.claims.Claims`. The
-    weight of the source's data is the least of all copies'. What is explained is said in :meth:`explained`.
+    Methods of the same name mean what they do of :class:`~sb3_combrel.transfer.base.Transfer` and of
+    :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`. No instances are transferred.
+
+    What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.prior.claims.Claims`.
 
     :param copies: the copies that can be chosen
     :param task: the target task
@@ -36,11 +40,10 @@ class SourcePrior(SourceUse):
     :param whole: see :meth:`Copies.measure`
     :param max_transitions: target transitions by which is chosen, at most; what is chosen then is checked on
     :param transfer_terminals: whether the source's ends are used at all
-    :param first_renewal: target transitions after which is chosen first; all of them are compared with what all copies
-        predict. Equal to ``max_transitions``, it is chosen once
+    :param first_renewal: target transitions after which is chosen first; equal to ``max_transitions``, it is chosen once
     """
 
-    candidates: PriorCandidates
+    makes_choices = True
 
     def __init__(
         self,
@@ -59,15 +62,20 @@ class SourcePrior(SourceUse):
         self.candidates = PriorCandidates(copies, task)
         self._value_bound = ValueBound(copies, task, min_weight=float(task.exploration_threshold) / CLAIMED_WEIGHT)
         self.whole = whole
-        self._choose = None if isinstance(choose, Choice) else choose
-        self.max_transitions = 0 if self._choose is None else max_transitions
+        #: Chooses from sums over the target's transitions; None if the choice is given or drawn.
+        self.choose = None if isinstance(choose, Choice) else choose
+        self.max_transitions = 0 if self.choose is None else max_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
         self.n_switches = 0
+        #: Transitions of the target that were observed.
+        self.n_observed = 0
+        #: Grows whenever what :meth:`predict` returns may have changed.
+        self.version = 0
         rewards = np.concatenate([source.rewards for source in copies.sources])
         #: What it claims to know.
         self.claims = Claims(rewards, task, transfer_terminals)
         #: Errors of the mapping in use, where the source has data.
-        self.errors = PlacedErrors(task)
+        self.errors = RegionErrors(task)
         #: Transitions whose outcome the source claimed to know.
         self.n_claimed = 0
         self.transitions = RecordedEpisodes(task.n_variables)
@@ -79,27 +87,22 @@ class SourcePrior(SourceUse):
         if isinstance(choose, Choice):
             self._set_choice(choose)
 
-    @property
-    def chooses(self) -> bool:
-        """Whether it is chosen by compliance, and not given or drawn."""
-        return self._choose is not None
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        return TransferredInstances.empty(len(actions), self.task.n_variables)
 
-    def choose(self, sums: CopySums) -> Choice:
-        """Choose from sums over the target's transitions; only where :attr:`chooses` is true."""
-        assert self._choose is not None
-        return self._choose(sums)
+    transferred_to_sample = transferred
+
+    def changed(self, known: np.ndarray) -> bool:
+        return False
+
+    def note_use(self, transferred: TransferredInstances) -> None:
+        pass
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        """
-        Predict pairs of the target.
-
-        :param states: unit coordinates, shape (n, n_variables)
-        :param actions: int64, shape (n,)
-        """
         if self.choice is None:
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, reward, end, coverage = self._raw(np.ascontiguousarray(states, dtype=np.float64), actions)
-        return self.claims.applied(effect, reward, end, coverage, actions)
+        return self.claims.restrict(effect, reward, end, coverage, actions)
 
     def _raw(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
         """Predictions and coverage. Those of many pairs at once are stored: what is claimed of them changes more often."""
@@ -117,25 +120,26 @@ class SourcePrior(SourceUse):
         return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
-        """
-        Take in a transition of the target.
-
-        :param state: unit coordinates; ``effect``: next state minus state
-        :param reward: raw
-        """
+        """Take in a transition of the target; ``effect``: next state minus state, unit coordinates, shape (n_variables,)."""
         self.n_observed += 1
         recorded = self.n_observed <= self.max_transitions
         if recorded:
             self.transitions.add(state, action, reward, effect, terminated)
-            if self.n_observed <= self._all_measured or self.n_observed % MEASURED_LATER == 0:
+            if self._is_measured(self.n_observed):
                 self.copies.measure(state, action, effect, self.sums, self.whole)
         if self.choice is not None:
             self._check(state, action, reward, effect, terminated, recorded)
         if self.n_observed >= self._renewal_due:
             self._renewal_due = RENEWAL_GROWTH * self.n_observed
             self._renew(recorded)
-            self._warn()
+            if not self._warned and self.n_observed >= TRANSITIONS_BEFORE_WARNING and self.error() > 1.0:
+                self._warned = True
+                warn_of_error(self.sources, self.n_observed, self.error())
         self.version += self.claims.have_changed()
+
+    def _is_measured(self, number: Any) -> Any:
+        """Whether recorded transitions with these numbers, from 1 on, are compared with what all copies predict."""
+        return (number <= self._all_measured) | (number % MEASURED_LATER == 0)
 
     def _check(
         self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool, recorded: bool
@@ -146,10 +150,10 @@ class SourcePrior(SourceUse):
         predicted_effect, r, end, weight = predicted
         self.n_claimed += bool(self.claims.weight(end, weight, actions)[0] > 0.0)
         self._compare(state, action, effect, predicted_effect[0], float(weight[0]))
-        self.claims.outcomes.note(float(weight[0]), float(end[0]), float(r[0]), reward, terminated)
+        self.claims.evidence.note(float(weight[0]), float(end[0]), float(r[0]), reward, terminated)
         self.candidates.note_use(action, self._moved(action))
         if not recorded:
-            self.copies.follow(self._used, action, effect, predicted, self.sums)
+            self.copies.measure_used(self._used, action, effect, predicted, self.sums)
 
     def _compare(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray, weight: float) -> None:
         if weight >= self.copies.threshold:
@@ -167,25 +171,23 @@ class SourcePrior(SourceUse):
         return self._value_bound.through(self.choice)
 
     def end_episode(self, truncated: bool) -> None:
-        """Take in the end of an episode; ``truncated``: by its time limit."""
         if self.n_observed == 0:
             return
         if truncated and self.n_observed <= self.max_transitions:
             self.transitions.note_time_limit()
         if self.choice is not None:
-            self.claims.outcomes.end_episode(truncated)
+            self.claims.evidence.end_episode(truncated)
         self.version += self.claims.have_changed()
 
     def _renew(self, choose: bool) -> None:
-        """Renew choice and trust."""
-        if choose and self._choose is not None:
-            choice = self._choose(self.sums)
+        if choose and self.choose is not None:
+            choice = self.choose(self.sums)
             if not choice.same(self.choice):
                 self.n_switches += self.choice is not None
                 self._set_choice(choice)
                 self._replay()
                 self.version += 1
-        self.version += self.claims.renew(*self._missed(), self._in_copies())
+        self.version += self.claims.renew(*self._unexplained(), self._in_copies())
 
     def _set_choice(self, choice: Choice) -> None:
         self.choice = choice
@@ -206,68 +208,57 @@ class SourcePrior(SourceUse):
         """
         Return which part of the effects is explained, for each target action, of the variable of which least is.
 
-        Of a transition and variable, 1 less squared error over squared effect, within bounds: so a few large effects, such as
-        those of a car that hits the wall, count no more than others. Of a variable in a copy, over the transitions where the
-        source has data; of one that stays, over all: how much it moves, in parts of what the action that moves it most does.
+        Of a transition and variable, 1 less squared error over squared effect, within bounds: so a few large effects count no
+        more than others. Of a variable in a copy, over the transitions where the source has data; of one that stays, over all:
+        how much it moves, in parts of what the action that moves it most does.
 
         :return: shape (n_target_actions,), see :func:`~sb3_combrel.transfer.prior.claims.part_explained`
         """
-        return part_explained(*self._missed())
+        return part_explained(*self._unexplained())
 
-    def _missed(self) -> tuple[np.ndarray, np.ndarray]:
+    def _unexplained(self) -> tuple[np.ndarray, np.ndarray]:
         """What is not explained of the effects of each target action and variable, and over how many transitions."""
-        founded = np.repeat(self.sums.n[:, None], self.task.n_variables, axis=1)
-        mean = self.sums.effect / np.maximum(founded, 1.0)
-        missed = founded * np.sqrt(mean / np.maximum(mean.max(axis=0), SMALLEST_MOVE**2))
-        for a in range(self.task.n_actions):
-            for copy, used in self._moved(a):
-                has = self.copies.state[copy] >= 0
-                missed[a, has] = self.sums.missed[copy, a, used, has]
-                founded[a, has] = self.sums.founded[copy, a, used]
-        return missed, founded
+        n_covered = np.repeat(self.sums.n[:, None], self.task.n_variables, axis=1)
+        mean = self.sums.effect / np.maximum(n_covered, 1.0)
+        unexplained = n_covered * np.sqrt(mean / np.maximum(mean.max(axis=0), SMALLEST_MOVE**2))
+        for a, copy, used, has in self._moves():
+            unexplained[a, has] = self.sums.unexplained[copy, a, used, has]
+            n_covered[a, has] = self.sums.n_covered[copy, a, used]
+        return unexplained, n_covered
 
     def _in_copies(self) -> np.ndarray:
         """Which variables each target action's copies have, bool, shape (n_target_actions, n_variables)."""
         found = np.zeros((self.task.n_actions, self.task.n_variables), dtype=np.bool_)
-        for a in range(self.task.n_actions):
-            for copy, _ in self._moved(a):
-                found[a] |= self.copies.state[copy] >= 0
+        for a, _, _, has in self._moves():
+            found[a] |= has
         return found
 
     def _moved(self, action: int) -> list[tuple[int, int]]:
         """The copies that a target action moves, and the source actions by which it does."""
-        return [] if self.choice is None else moved(self.choice, action)
+        return [] if self.choice is None else self.choice.moves(action)
 
-    def error(self) -> float:
-        """
-        Return the mean squared error of the predicted effects on the target's own transitions, over that of "no change".
-
-        Of the mapping in use, on all transitions so far; NaN before the first that moves.
-        """
-        baseline = float(self.sums.effect.sum())
-        errors = self.sums.effect.copy()
+    def _moves(self) -> Iterator[tuple[int, int, int, np.ndarray]]:
+        """Of each target action: each copy that it moves, by which source action, and which variables the copy has."""
         for a in range(self.task.n_actions):
             for copy, used in self._moved(a):
-                has = self.copies.state[copy] >= 0
-                errors[a, has] = self.sums.error[copy, a, used, has]
+                yield a, copy, used, self.copies.state[copy] >= 0
+
+    def error(self) -> float:
+        """Return the mean squared error of the mapping in use over that of "no change", on all steps; NaN if none moved."""
+        baseline = float(self.sums.effect.sum())
+        errors = self.sums.effect.copy()
+        for a, copy, used, has in self._moves():
+            errors[a, has] = self.sums.error[copy, a, used, has]
         return float(errors.sum()) / baseline if baseline > 0.0 else np.nan
 
-    def _warn(self) -> None:
-        """Warn once if the source predicts worse than "no change"."""
-        if self._warned or self.n_observed < TRANSITIONS_BEFORE_WARNING or not self.error() > 1.0:
-            return
-        self._warned = True
-        warn_of_error(self.copies.sources, self.n_observed, self.error())
-
     def statistics(self) -> dict[str, float]:
-        """Figures for the logger, by name."""
         return {
             "transfer/prediction_error": self.error(),
             "transfer/prior_trust": float(self.claims.trust.mean()),
-            "transfer/prior_doubted": float(self.claims.outcomes.doubted),
+            "transfer/prior_doubted": float(self.claims.evidence.doubted),
             "transfer/values_bounded": float(self.value_bound() is not None),
-            "transfer/ends_confirmed": self.claims.outcomes.confirmed,
-            "transfer/ends_contradicted": self.claims.outcomes.contradicted,
+            "transfer/ends_confirmed": self.claims.evidence.confirmed,
+            "transfer/ends_contradicted": self.claims.evidence.contradicted,
             "transfer/prior_copies": 0 if self.choice is None else int((self.choice.copies >= 0).sum(axis=1).max(initial=0)),
             "transfer/switches": self.n_switches,
             "transfer/target_transitions": self.n_observed,
@@ -275,8 +266,7 @@ class SourcePrior(SourceUse):
 
     def measured_sums(self) -> CopySums:
         """The sums, with numbers of transitions of those that compliances have been added up of: later ones have none."""
-        number = np.arange(1, self.transitions.n + 1)
-        measured = (number <= ALL_MEASURED) | (number % MEASURED_LATER == 0)
+        measured = self._is_measured(np.arange(1, self.transitions.n + 1))
         actions = self.transitions.actions[: self.transitions.n][measured]
         return self.sums._replace(n=np.bincount(actions, minlength=self.task.n_actions).astype(np.float64))
 
@@ -284,7 +274,7 @@ class SourcePrior(SourceUse):
         """Mean compliance of what each target action is made of, shape (n_target_actions,); NaN where nothing is chosen."""
         found, sums = np.full(self.task.n_actions, np.nan), self.measured_sums()
         for a in range(self.task.n_actions):
-            if self._choose is None or sums.n[a] == 0.0:
+            if self.choose is None or sums.n[a] == 0.0:
                 continue
             means = [sums.compliance[copy, a, used] / sums.n[a] for copy, used in self._moved(a)]
             found[a] = np.prod(means) if means else np.nan
@@ -293,10 +283,6 @@ class SourcePrior(SourceUse):
     def describe(self) -> str:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
         return self.candidates.describe_choice(self.choice)
-
-    @property
-    def makes_choices(self) -> bool:
-        return True
 
     def choices_by_action(self) -> np.ndarray:
         """The candidate in use for each target action, int64, shape (n_target_actions,), -1 for none."""
@@ -313,13 +299,12 @@ class SourcePrior(SourceUse):
         return self.candidates.uses()
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """What was learned, float64 arrays."""
-        chosen = np.full((3, self.task.n_actions, self.task.n_variables), -1.0)
+        chosen, n_slots = np.full((3, self.task.n_actions, self.task.n_variables), -1.0), 0
         if self.choice is not None:
-            chosen[0] = 0.0
+            chosen[0], n_slots = 0.0, self.choice.copies.shape[1]
             for row, array in zip(chosen[1:], self.choice, strict=True):
                 row[:, : array.shape[1]] = array
-        figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, self._n_slots()
+        figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, n_slots
         return {
             "transitions": self.transitions.rows(),
             "prior_choice": chosen.ravel(),
@@ -330,11 +315,7 @@ class SourcePrior(SourceUse):
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
 
-    def _n_slots(self) -> int:
-        return 0 if self.choice is None else self.choice.copies.shape[1]
-
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Take over what :meth:`get_state` returned; for a new object."""
         d, n_actions = self.task.n_variables, self.task.n_actions
         self.transitions.restore(state["transitions"], n_actions)
         for name, array in self.sums._asdict().items():

@@ -12,7 +12,6 @@ from sb3_combrel.transfer.prior.prior_choice import Choice
 from sb3_combrel.transfer.source_mdp import MAX_STEPS, planning_tolerance, source_mdp
 from sb3_combrel.transfer.source_model import SourceModel
 
-# Values fall from the upper bound towards the source's with every sweep, and are upper bounds wherever that is ended.
 MAX_SWEEPS = 300
 
 
@@ -20,16 +19,13 @@ class ValueBound:
     """
     Bounds the values of the target's states by those of the source's states that they are taken for.
 
-    With them as the value of what is unknown, instead of ``max_value`` everywhere, the agent does not explore what could not
-    be better than what it knows, even if it were as good as the source allows: R-Max with an admissible potential (Asmuth,
-    Littman & Zinkov, "Potential-based shaping in model-based reinforcement learning", AAAI 2008), which here comes from
-    another task through a mapping, as in Mann & Choe, "Directed exploration in reinforcement learning with transferred
-    knowledge", EWRL 2012.
+    R-Max with an admissible potential (Asmuth, Littman & Zinkov, "Potential-based shaping in model-based reinforcement
+    learning", AAAI 2008), which comes from another task through a mapping, as in Mann & Choe, "Directed exploration in
+    reinforcement learning with transferred knowledge", EWRL 2012.
 
-    The source's values are those of Fitted R-Max's planning with the source's local linear model: where the source has too
-    few data, a pair is worth ``max_value``. A target of one copy of the source can do at most what the source can, with any
-    of the source's actions. One of several copies ends when all of them have ended: if every step costs the same, it can be
-    worth no more than any of its copies, and the least of their values bounds it. Otherwise nothing is said of several.
+    The source's values are those of Fitted R-Max's planning with its local linear model: where it has too few data, a pair is
+    worth ``max_value``. A target of several copies ends when all of them have ended: if every step costs the same, the least
+    of their values bounds it. Otherwise nothing is said of several.
 
     :param copies: the copies that can be chosen
     :param task: the target task
@@ -81,7 +77,7 @@ class ValueBound:
         return self._of_copy[copy]
 
     def _plan(self, number: int) -> Planner:
-        """Plan in a source, from above."""
+        """Plan in a source, from above: values are upper bounds after any number of sweeps."""
         source, breadth = self._copies.sources[number], self._copies.breadth
         model = SourceModel(stacked_instances([source]), breadth)
         mdp = source_mdp(source, model, self._task.gamma, breadth, self._min_weight)

@@ -9,15 +9,16 @@ import numpy as np
 
 from sb3_combrel.sources.source_instances import SourceInstances
 
-# A transition is predicted to end the episode above the first, and not to end it below the second: between them, at the
+# Above the first probability a transition is predicted to end the episode, below the second not to: between them, at the
 # border of where episodes end, a kernel average decides nothing.
 ENDS, GOES_ON = 0.5, 0.1
 # So many steps in a row where an end is predicted, and none comes, contradict it once.
 STEPS_OF_A_VISIT = 10
 # So many episodes that ran into their time limit, and never an end where one is predicted.
 EPISODES_IN_VAIN = 3
+# Rewards from which on wrong ones count.
 MIN_REWARDS = 10
-# So many visits to where an end is predicted, and none has come yet. One or two may be a car that comes near and falls back.
+# So many visits to where an end is predicted, and none has come yet: one or two may be near misses.
 MIN_ABSENT = 3
 # What is counted, in the order in which it is saved.
 COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "in_vain", "steps_of_visit")
@@ -40,32 +41,25 @@ def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> N
     )
 
 
-class Outcomes:
+class OutcomeEvidence:
     """
     Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
 
-    *Ends.* An episode that ends where that is predicted confirms it. It is contradicted by an episode that ends where none is
-    predicted, and by each visit to where one is predicted that leaves without an end or stays for long. Visits are counted,
-    not steps: the border of where episodes end is blurred in a kernel average.
+    *Ends.* An episode that ends where that is predicted confirms it. An episode that ends where none is predicted contradicts
+    it, and so does each visit to where one is predicted that leaves without an end or stays for long. Visits are counted, not
+    steps: the border of where episodes end is blurred in a kernel average.
 
     *Rewards.* Each transition confirms or contradicts the predicted reward, by whether it is off by more than half a standard
     deviation of the source's rewards plus a tenth of their mean size.
 
-    Both are :attr:`doubted` while ends that were not predicted outnumber those that were by two, or wrong rewards right ones,
-    and while no predicted end has come but ``MIN_ABSENT`` have failed to. After the first that came, others that do not come
-    say that the target ends in fewer states than the source, and no more: ends are not :attr:`ends_believed` while these
-    outnumber those that came.
-
-    Ends that were never confirmed nor contradicted are believed by half: a transition that may end is worth a visit, which
-    settles it, so what the source says of it is not taken for known; that others do not end is. That alone could go on for
-    ever, where the source is wrong about what leads to an end. So if ``EPISODES_IN_VAIN`` episodes have run into their time
-    limit, never an end was confirmed, and all rewards were alike, so that nothing but an end tells good states from bad ones,
-    they are doubted.
+    Both are :attr:`doubted` while ends that were not predicted outnumber those that were by two, or wrong rewards right ones;
+    while no predicted end has come but ``MIN_ABSENT`` have failed to; and after ``EPISODES_IN_VAIN`` episodes that ran into
+    their time limit without a confirmed end, if all rewards were alike, so that nothing but an end tells states apart.
+    Predicted ends are :attr:`ends_believed` once they have come, unless those that did not outnumber them.
 
     :param rewards: of the source's instances, shape (n,)
     :param threshold: weight from which on the source has data
-    :param no_end: weight from which on it says that there is no end; None: the same. Where data are few, ends, which are
-        averaged with a narrower kernel, may be those of another place
+    :param no_end: weight from which on it says that there is no end; None: the same
     """
 
     def __init__(self, rewards: np.ndarray, threshold: float, no_end: float | None = None):
@@ -96,8 +90,8 @@ class Outcomes:
         :param reward: raw
         """
         self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
-        founded = weight >= self.threshold
-        if founded:
+        has_data = weight >= self.threshold
+        if has_data:
             if abs(reward - predicted_reward) > self.tolerance:
                 self.rewards_wrong += 1
             else:
@@ -108,7 +102,7 @@ class Outcomes:
             elif weight >= self.no_end:
                 self.unpredicted += 1
             self.steps_of_visit = 0
-        elif (founded and end > ENDS) or (self.steps_of_visit and end >= GOES_ON):
+        elif (has_data and end > ENDS) or (self.steps_of_visit and end >= GOES_ON):
             self.steps_of_visit += 1
             self.absent += self.steps_of_visit % STEPS_OF_A_VISIT == 0
         else:
@@ -138,13 +132,12 @@ class Outcomes:
     def doubted(self) -> bool:
         """Whether the source's ends and rewards are not to be used."""
         low, high = self.reward_range
-        nothing_found = self.confirmed == 0 and self.in_vain >= EPISODES_IN_VAIN and not high - low > 1e-9
         rewards = self.rewards_right + self.rewards_wrong
         return (
             self.unpredicted > self.confirmed + 1
             or (self.confirmed == 0 and self.absent >= MIN_ABSENT)
             or (rewards >= MIN_REWARDS and self.rewards_wrong > self.rewards_right)
-            or nothing_found
+            or (self.confirmed == 0 and self.in_vain >= EPISODES_IN_VAIN and not high - low > 1e-9)
         )
 
     def get_state(self) -> np.ndarray:

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.outcome_evidence import OutcomeEvidence
 from sb3_combrel.transfer.report import Contradiction
 
 # Each state variable's range is divided into so many parts.
 N_PARTS = 4
 # A part with fewer transitions says nothing.
-MIN_TRANSITIONS = 10
+MIN_IN_PART = 10
 MAX_CONTRADICTIONS = 8
 # Effects are squared unit coordinates; less than this is no movement.
 NO_MOVEMENT = 1e-18
-AT_ONCE = 256
 _N, _ERROR, _EFFECT, _WORSE = range(4)
 
 
-class PlacedErrors:
+class RegionErrors:
     """
     Sums of squared prediction errors and squared effects, by target action and by part of each state variable's range.
 
@@ -27,8 +29,10 @@ class PlacedErrors:
 
     def __init__(self, task: TargetTask):
         self.task = task
-        self._waiting: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
-        self._sums = np.zeros((task.n_actions, task.n_variables, N_PARTS, 4))
+        #: Number of transitions, squared errors, squared effects, and number of those whose error is the larger one; shape
+        #: (n_actions, n_variables, N_PARTS, 4).
+        self.sums = np.zeros((task.n_actions, task.n_variables, N_PARTS, 4))
+        self._variables = np.arange(task.n_variables)
 
     def note(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray) -> None:
         """
@@ -36,35 +40,13 @@ class PlacedErrors:
 
         :param state: unit coordinates; ``effect``: next state minus state; ``predicted``: what was predicted of it
         """
-        # Many at once take a tenth of the time.
-        self._waiting.append((state.copy(), action, effect, predicted))
-        if len(self._waiting) >= AT_ONCE:
-            self._add_waiting()
-
-    def _add_waiting(self) -> None:
-        states, actions, effects, predicted = (np.array(column) for column in zip(*self._waiting, strict=True))
-        self._waiting.clear()
-        parts = np.clip((states * N_PARTS).astype(np.int64), 0, N_PARTS - 1)
-        # Column by column, and one transition after the other: sums do not depend on how many are added at once.
-        error, moved = (sum(column**2 for column in each.T) for each in (effects - predicted, effects))
-        rows = np.column_stack([np.ones(len(actions)), error, moved, error > moved])
-        for v, part in enumerate(parts.T):
-            np.add.at(self._sums[:, v], (actions, part), rows)
-
-    @property
-    def sums(self) -> np.ndarray:
-        """
-        Of each target action, variable and part: number of transitions, squared errors, squared effects, and number of those
-        whose error is the larger one; shape (n_actions, n_variables, N_PARTS, 4).
-        """
-        if self._waiting:
-            self._add_waiting()
-        return self._sums
+        part = np.clip((state * N_PARTS).astype(np.int64), 0, N_PARTS - 1)
+        error, moved = (float((each * each).sum()) for each in (effect - predicted, effect))
+        self.sums[action, self._variables, part] += 1.0, error, moved, error > moved
 
     def forget(self) -> None:
         """Forget all transitions."""
-        self._waiting.clear()
-        self._sums[:] = 0.0
+        self.sums[:] = 0.0
 
     @property
     def of_actions(self) -> np.ndarray:
@@ -86,9 +68,20 @@ class PlacedErrors:
     def contradictions(self) -> tuple[Contradiction, ...]:
         """Return the parts in which predictions are worse than "no change", the largest excess of squared error first."""
         excess = self.sums[..., _ERROR] - self.sums[..., _EFFECT]
-        worse = (self.sums[..., _N] >= MIN_TRANSITIONS) & (excess > NO_MOVEMENT)
+        worse = (self.sums[..., _N] >= MIN_IN_PART) & (excess > NO_MOVEMENT)
         order = sorted(map(tuple, np.argwhere(worse).tolist()), key=lambda cell: -excess[cell])
         return tuple(self._contradiction(*cell) for cell in order[:MAX_CONTRADICTIONS])
+
+    def report_fields(self, evidence: OutcomeEvidence) -> dict[str, Any]:
+        """Return the fields of a report that say how the target's transitions compare with what was predicted of them."""
+        totals = self.of_actions.sum(axis=0)
+        return dict(
+            n_compared=int(totals[_N]),
+            n_worse=int(totals[_WORSE]),
+            contradictions=self.contradictions(),
+            ends=(evidence.confirmed, evidence.contradicted),
+            rewards=(evidence.rewards_right, evidence.rewards_wrong),
+        )
 
     def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
         n, error, effect, _ = self.sums[action, variable, part].tolist()
