@@ -1,0 +1,156 @@
+"""Numbers in the documentation are those of the CSV file that a mark before the table or paragraph names.
+
+``<!-- table: results/paper/table6.md, 1 -->``: a table that ``make results`` has filled in; cells are those of the CSV file.
+
+``<!-- numbers: FILE | ROWS`` with lines ``ROWS | FIGURE; FIGURE ...`` up to ``-->``: each FIGURE, computed from the rows of FILE
+(relative to the page) that both queries of pandas select, is a number of the paragraph that follows. Before a table there is
+one such line, in which ``{heading}`` is the cell of the table's row, and its figures are the last cells of each row. Figures:
+
+- ``count``; ``value COLUMN``, the cell as it is
+- ``mean COLUMN``, ``median``, ``min``, ``max``, ``sum``: COLUMN may be an expression of columns; ``mean:.1f`` for other digits
+- ``error COLUMN``: mean ± standard error; ``interval COLUMN``: mean ± half the width of its 95% interval, by Student's t
+- ``saved COLUMN | than ROWS``: in parts of the mean of other rows; ``welch``, ``mann-whitney``, ``permutation``: p-values;
+  nothing where the other rows are the same
+
+Docstrings have them in a comment of reStructuredText: ``.. numbers: ...`` up to an empty line.
+"""
+
+import functools
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers.pages import DOCS, ROOT, name_of, pages
+from scipy import stats
+
+from sb3_combrel.experiments.statistics import TESTS, p_value_of_difference
+
+WITH_FIGURES = [ROOT / "README.md", *(DOCS / name for name in ("results.md", "benchmark.md", "results/learner.md"))]
+#: Tables that need no mark, by their first heading.
+UNMARKED = {
+    "| command | what it does | on two cores": "times and sizes of the machine",
+    "| method | steps in 12 episodes |": "of `make demo`, whose CSV files are not kept",
+}
+MARK = re.compile(r"<!-- (table|numbers): (.*?) ?-->\n+((?:<!-- .*?-->\n+)*)", re.DOTALL)
+IN_DOCSTRING = re.compile(r"^ *\.\. (numbers): (.*?)\n\s*\n()", re.DOTALL | re.MULTILINE)
+
+
+def marks():
+    """Page, kind, content of each mark, and the table or paragraph that follows it."""
+    found = []
+    for page in [*pages(), *(ROOT / "sb3_combrel").rglob("*.py")]:
+        text = page.read_text()
+        pattern = MARK if page.suffix == ".md" else IN_DOCSTRING
+        position = 0
+        while match := pattern.search(text, position):
+            position = match.end(2)
+            below = text[match.end() :].partition("\n\n")[0].partition("\n<!-- end")[0]
+            found.append(pytest.param(page, match[1], match[2], below, id=f"{name_of(page)}-{match[2][:60]}"))
+    return found
+
+
+def cells_of(table):
+    """Headings and rows of a Markdown table."""
+    rows = [[cell.strip() for cell in line.strip()[1:-1].split("|")] for line in table.splitlines() if "|" in line]
+    return rows[0], rows[2:]
+
+
+@functools.cache
+def read(file):
+    """The CSV file with numbers as numbers, and as it is written."""
+    data = pd.read_csv(file)
+    if "steps_of_episodes" in data:
+        data["first_episode"] = data.steps_of_episodes.str.split().str[0].astype(float)
+    return data, pd.read_csv(file, dtype=str, keep_default_na=False)
+
+
+def figure_of(file, base, rows, figure):
+    """What a figure should read."""
+    data, as_written = read(file)
+    data = data.query(base) if base else data
+    own = data.query(rows)
+    assert len(own), f"{file.name} has no rows {rows}"
+    what, _, other = figure.partition("| than ")
+    name, _, column = what.strip().partition(" ")
+    name, _, form = name.partition(":")
+    if name == "count":
+        return str(len(own))
+    if name == "value":
+        assert len(own) == 1
+        return as_written.loc[own.index[0], column]
+    if other and data.query(other).equals(own):
+        return ""
+    values = own.eval(column).to_numpy(dtype=float)
+    others = data.query(other).eval(column).to_numpy(dtype=float) if other else None
+    if name == "saved":
+        return f"{1 - values.mean() / others.mean():{form or '.0%'}}"
+    if name in TESTS:
+        p = p_value_of_difference(others, values, name)
+        return f"{p:.2f}" if p >= 0.1 else f"{p:.{2 if p >= 0.001 else 1}g}"
+    form = form or ",.0f"
+    if not np.isfinite(values).all():
+        return f"median {np.median(values):{form}}, {np.isinf(values).sum()} never"
+    if name in ("error", "interval"):
+        wide = 1 if name == "error" else stats.t.ppf(0.975, len(values) - 1)
+        return f"{values.mean():{form}} ± {wide * stats.sem(values):{form}}"
+    return f"{getattr(np, name)(values):{form}}"
+
+
+def figures_of(page, mark, cells=None):
+    """All figures of a mark; cells: of a row of the table that it stands before."""
+    head, *lines = re.sub(r"\n +", " ", mark).splitlines()
+    file, _, base = (part.strip() for part in head.partition("|"))
+    fill = (lambda text: text) if cells is None else (lambda text: re.sub(r"\{([\w -]+)\}", lambda m: cells[m[1]], text))
+    found = []
+    for line in lines:
+        rows, _, figures = (part.strip() for part in line.partition("|"))
+        found += [figure_of(page.parent / file, fill(base), fill(rows), fill(figure.strip())) for figure in figures.split(";")]
+    return found
+
+
+@pytest.mark.parametrize(("page", "kind", "mark", "below"), marks())
+def test_numbers_are_those_of_the_file(page, kind, mark, below):
+    if kind == "table":
+        file, number = mark.rsplit(", ", 1)
+        stem = (page.parent / file).with_suffix("")
+        names = (f"{stem.name}_{number}.csv", f"{stem.name}.csv", f"overview_{number}.csv")
+        [csv] = [stem.with_name(name) for name in names if stem.with_name(name).exists()]
+        headings, rows = cells_of(below)
+        written = read(csv)[1]
+        assert (headings, rows) == (list(written), written.to_numpy().tolist())
+    elif below.startswith("|"):
+        headings, rows = cells_of(below)
+        for cells in rows:
+            expected = figures_of(page, mark, dict(zip(headings, (cell.strip("`*") for cell in cells), strict=True)))
+            assert cells[-len(expected) :] == expected
+    else:
+        text = re.sub(r"\s+", " ", below)
+        for figure in figures_of(page, mark):
+            assert re.search(rf"(?<![\d.,]){re.escape(figure)}(?![\d%]|[.,]\d)", text), (figure, text)
+
+
+def test_the_tables_of_a_pair_are_those_of_its_file():
+    text = (DOCS / "results/benchmark/benchmark.md").read_text()
+    for pair, table in re.findall(r"^### ([\w-]+)$.*?((?:^\|[^\n]*\n)+)", text, flags=re.DOTALL | re.MULTILINE):
+        written = read(DOCS / f"results/benchmark/{pair}.csv")[1]
+        assert cells_of(table) == (list(written), written.to_numpy().tolist()), pair
+
+
+@pytest.mark.parametrize("page", WITH_FIGURES, ids=name_of)
+def test_tables_with_figures_are_marked(page):
+    for above, table in re.findall(r"([^\n]*)\n+((?:^\|.*\n)+)", page.read_text(), flags=re.MULTILINE):
+        if re.search(r"\| [-+*]*\d[\d,.]*%?(?= )", table):
+            assert above.endswith("-->") and "end of" not in above or table.startswith(tuple(UNMARKED)), table
+
+
+def test_a_wrong_number_is_found(tmp_path):
+    (tmp_path / "a.csv").write_text("who,n\nme,1\nme,3\nyou,8\n")
+    page = tmp_path / "page.md"
+    assert figures_of(page, 'a.csv |\nwho == "{who}" | count; error:.1f n; saved n | than who == "you"', {"who": "me"}) == [
+        "2",
+        "2.0 ± 1.0",
+        "75%",
+    ]
+    with pytest.raises(AssertionError):
+        test_numbers_are_those_of_the_file(page, "numbers", 'a.csv |\nwho == "me" | mean n', "There are 2.5 or 12 of them")
