@@ -9,7 +9,7 @@ one such line, in which ``{heading}`` is the cell of the table's row, and its fi
 - ``count``; ``value COLUMN``, the cell as it is
 - ``mean COLUMN``, ``median``, ``min``, ``max``, ``sum``: COLUMN may be an expression of columns; ``mean:.1f`` for other digits
 - ``error COLUMN``: mean ± standard error; ``interval COLUMN``: mean ± half the width of its 95% interval, by Student's t
-- ``saved COLUMN | than ROWS``: in parts of the mean of other rows; ``welch``, ``mann-whitney``, ``permutation``: p-values;
+- ``saved COLUMN | than ROWS``, ``costs``: in parts of the mean of other rows; ``welch``, ``mann-whitney``, ``permutation``: p-values;
   nothing where the other rows are the same
 
 Docstrings have them in a comment of reStructuredText: ``.. numbers: ...`` up to an empty line.
@@ -84,8 +84,9 @@ def figure_of(file, base, rows, figure):
         return ""
     values = own.eval(column).to_numpy(dtype=float)
     others = data.query(other).eval(column).to_numpy(dtype=float) if other else None
-    if name == "saved":
-        return f"{1 - values.mean() / others.mean():{form or '.0%'}}"
+    if name in ("saved", "costs"):
+        more = values.mean() / others.mean() - 1
+        return f"{more if name == 'costs' else -more:{form or '.0%'}}"
     if name in TESTS:
         p = p_value_of_difference(others, values, name)
         return f"{p:.2f}" if p >= 0.1 else f"{p:.{2 if p >= 0.001 else 1}g}"
