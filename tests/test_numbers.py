@@ -2,15 +2,14 @@
 
 ``<!-- table: results/paper/table6.md, 1 -->``: a table that ``make results`` has filled in; cells are those of the CSV file.
 
-``<!-- numbers: FILE | ROWS`` with lines ``ROWS | FIGURE; FIGURE ...`` up to ``-->``: each FIGURE, computed from the rows of FILE
-(relative to the page) that both queries of pandas select, is a number of the paragraph that follows. Before a table there is
-one such line, in which ``{heading}`` is the cell of the table's row, and its figures are the last cells of each row. Figures:
+``<!-- numbers: FILE | ROWS``, lines ``ROWS | FIGURE; FIGURE ...``, ``-->``: each FIGURE, of the rows of FILE (relative to the
+page) that both ROWS, queries of pandas, select, is a number of the paragraph that follows. Before a table ``{heading}`` is a
+cell of the table's row, and all figures are the last cells of each row. A FIGURE is one of
 
-- ``count``; ``value COLUMN``, the cell as it is
+- ``count``; ``value COLUMN``, the cell as it is written
 - ``mean COLUMN``, ``median``, ``min``, ``max``, ``sum``: COLUMN may be an expression of columns; ``mean:.1f`` for other digits
 - ``error COLUMN``: mean ± standard error; ``interval COLUMN``: mean ± half the width of its 95% interval, by Student's t
-- ``saved COLUMN | than ROWS``, ``costs``: in parts of the mean of other rows; ``welch``, ``mann-whitney``, ``permutation``: p-values;
-  nothing where the other rows are the same
+- ``saved COLUMN | than ROWS``, ``costs``: in parts of the mean of other rows; ``welch``, ``mann-whitney``, ``permutation``: p
 
 Docstrings have them in a comment of reStructuredText: ``.. numbers: ...`` up to an empty line.
 """
@@ -60,30 +59,33 @@ def cells_of(table):
 @functools.cache
 def read(file):
     """The CSV file with numbers as numbers, and as it is written."""
-    data = pd.read_csv(file)
+    data, as_written = pd.read_csv(file), pd.read_csv(file, dtype=str, keep_default_na=False)
     if "steps_of_episodes" in data:
         data["first_episode"] = data.steps_of_episodes.str.split().str[0].astype(float)
-    return data, pd.read_csv(file, dtype=str, keep_default_na=False)
+    return data.drop(columns=["settings", "steps_of_episodes"], errors="ignore"), as_written
 
 
-def figure_of(file, base, rows, figure):
+@functools.cache
+def rows_of(file, *queries):
+    """The rows of a file that all queries select, if they are not empty."""
+    rows = functools.reduce(lambda data, query: data.query(query) if query else data, queries, read(file)[0])
+    assert len(rows), f"{file.name} has no rows {queries}"
+    return rows
+
+
+def figure_of(file, base, query, figure):
     """What a figure should read."""
-    data, as_written = read(file)
-    data = data.query(base) if base else data
-    own = data.query(rows)
-    assert len(own), f"{file.name} has no rows {rows}"
-    what, _, other = figure.partition("| than ")
+    what, _, than = figure.partition("| than ")
     name, _, column = what.strip().partition(" ")
     name, _, form = name.partition(":")
+    rows = rows_of(file, base, query)
     if name == "count":
-        return str(len(own))
+        return str(len(rows))
     if name == "value":
-        assert len(own) == 1
-        return as_written.loc[own.index[0], column]
-    if other and data.query(other).equals(own):
+        return read(file)[1].loc[rows.index, column].item()
+    if than and rows_of(file, base, than).index.equals(rows.index):
         return ""
-    values = own.eval(column).to_numpy(dtype=float)
-    others = data.query(other).eval(column).to_numpy(dtype=float) if other else None
+    values, others = (each.eval(column).to_numpy(dtype=float) for each in (rows, rows_of(file, base, than or query)))
     if name in ("saved", "costs"):
         more = values.mean() / others.mean() - 1
         return f"{more if name == 'costs' else -more:{form or '.0%'}}"
@@ -94,21 +96,16 @@ def figure_of(file, base, rows, figure):
     if not np.isfinite(values).all():
         return f"median {np.median(values):{form}}, {np.isinf(values).sum()} never"
     if name in ("error", "interval"):
-        wide = 1 if name == "error" else stats.t.ppf(0.975, len(values) - 1)
-        return f"{values.mean():{form}} ± {wide * stats.sem(values):{form}}"
+        half = stats.sem(values) * (1 if name == "error" else stats.t.ppf(0.975, len(values) - 1))
+        return f"{values.mean():{form}} ± {half:{form}}"
     return f"{getattr(np, name)(values):{form}}"
 
 
 def figures_of(page, mark, cells=None):
-    """All figures of a mark; cells: of a row of the table that it stands before."""
-    head, *lines = re.sub(r"\n +", " ", mark).splitlines()
-    file, _, base = (part.strip() for part in head.partition("|"))
-    fill = (lambda text: text) if cells is None else (lambda text: re.sub(r"\{([\w -]+)\}", lambda m: cells[m[1]], text))
-    found = []
-    for line in lines:
-        rows, _, figures = (part.strip() for part in line.partition("|"))
-        found += [figure_of(page.parent / file, fill(base), fill(rows), fill(figure.strip())) for figure in figures.split(";")]
-    return found
+    """All figures of a mark; cells: by heading, of a row of the table that it stands before."""
+    mark = re.sub(r"\{([\w -]+)\}", lambda found: cells[found[1]], re.sub(r"\n +", " ", mark))
+    (file, base), *lines = ([part.strip() for part in line.split("|", 1)] for line in mark.splitlines())
+    return [figure_of(page.parent / file, base, rows, each.strip()) for rows, all_ in lines for each in all_.split(";")]
 
 
 @pytest.mark.parametrize(("page", "kind", "mark", "below"), marks())
@@ -143,16 +140,12 @@ def test_the_tables_of_a_pair_are_those_of_its_file():
 def test_tables_with_figures_are_marked(page):
     for above, table in re.findall(r"([^\n]*)\n+((?:^\|.*\n)+)", page.read_text(), flags=re.MULTILINE):
         if re.search(r"\| [-+*]*\d[\d,.]*%?(?= )", table):
-            assert above.endswith("-->") and "end of" not in above or table.startswith(tuple(UNMARKED)), table
+            assert (above.endswith("-->") and "end of" not in above) or table.startswith(tuple(UNMARKED)), table
 
 
 def test_a_wrong_number_is_found(tmp_path):
     (tmp_path / "a.csv").write_text("who,n\nme,1\nme,3\nyou,8\n")
-    page = tmp_path / "page.md"
-    assert figures_of(page, 'a.csv |\nwho == "{who}" | count; error:.1f n; saved n | than who == "you"', {"who": "me"}) == [
-        "2",
-        "2.0 ± 1.0",
-        "75%",
-    ]
+    page, mark = tmp_path / "page.md", 'a.csv |\nwho == "{who}" | count; error:.1f n; saved n | than who == "you"'
+    assert figures_of(page, mark, {"who": "me"}) == ["2", "2.0 ± 1.0", "75%"]
     with pytest.raises(AssertionError):
         test_numbers_are_those_of_the_file(page, "numbers", 'a.csv |\nwho == "me" | mean n', "There are 2.5 or 12 of them")
