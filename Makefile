@@ -4,7 +4,7 @@
 # make build   wheel and source distribution in dist/   make smoke   install the wheel into an empty environment, and try it
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
 # make reproduce   the figures and tables of the COMBREL paper, with controls, in reproduction/; REPRODUCE_ARGS="fig2 --runs 2"
-# make results   takes what was reproduced, and the results of the benchmark, into README.md and docs/
+# make results   takes what was reproduced, and the results of the benchmark, into docs/
 # make benchmark   methods of transfer on pairs of tasks, in benchmark/; BENCHMARK_ARGS="--pairs icub --seeds 3"
 # make icub    of these Figure 5, the arm of the iCub with and without transfer from its torso, in setting "explore"
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
@@ -67,7 +67,7 @@ tutorials: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up
 	$(BIN)/python -m sb3_combrel.experiments.tutorials
 
-# Takes what was reproduced, and the results of the benchmark, into README.md and docs/.
+# Takes what was reproduced, and the results of the benchmark, into docs/.
 results:
 	$(BIN)/python -m sb3_combrel.experiments.paper.page
 	$(BIN)/python -m sb3_combrel.experiments.benchmark.page

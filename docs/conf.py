@@ -22,6 +22,7 @@ root_doc = "docs/index"
 include_patterns = [
     "docs/*.md",
     "docs/results/*.md",
+    "docs/results/benchmark/benchmark.md",
     "tutorials/*.md",
     "README.md",
     "CONTRIBUTING.md",

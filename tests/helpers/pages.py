@@ -10,9 +10,8 @@ DOCS = ROOT / "docs"
 
 def pages():
     """The Markdown files of the repository, without what is built or belongs to somebody else."""
-    top = [path for path in ROOT.iterdir() if path.suffix == ".md"]
     below = [path for folder in ("docs", "tutorials", "envs", "sb3_combrel") for path in (ROOT / folder).rglob("*.md")]
-    return sorted(path for path in top + below if "_build" not in path.parts and "output" not in path.parts)
+    return sorted(path for path in [*ROOT.glob("*.md"), *below] if not {"_build", "output"} & set(path.parts))
 
 
 def name_of(page):
@@ -26,18 +25,15 @@ def blocks(text, language):
 
 def commands(text):
     """The commands of the shell in a page, each as a list of words, without comments."""
-    return [
-        shlex.split(line, comments=True)
-        for block in blocks(text, "(?:bash|sh)")
-        for line in block.replace("\\\n", " ").splitlines()
-        if shlex.split(line, comments=True)
-    ]
+    lines = [line for block in blocks(text, "(?:bash|sh)") for line in block.replace("\\\n", " ").splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
 
 
 def prose(text):
-    """The text without its code: blocks, code in a line, comments."""
+    """The text without its code blocks and comments, and without what cells of tutorials have printed."""
+    text = re.sub(r"^<!-- output -->$.*?^<!-- end of output -->$", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"^(```+).*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
-    return re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    return re.sub(r"^<!--.*?-->", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
 def links(text):

@@ -227,7 +227,7 @@ def _section(pair: Pair, table: Table) -> str:
     over = "episodes" if pair.n_steps is None else "environment steps"
     threshold = "" if pair.threshold is None else f" Threshold: a return of {pair.threshold:g}."
     text = f"{pair.description} Budget: {pair.budget}. Performance: mean return of an episode over {over}.{threshold}"
-    return f"### {pair.name}\n\n{text}\n\n![{pair.name}]({pair.name}.png)\n\n{table.as_markdown()}"
+    return f"## {pair.name}\n\n{text}\n\n![{pair.name}]({pair.name}.png)\n\n{table.as_markdown()}"
 
 
 def _page(
@@ -236,6 +236,7 @@ def _page(
     """The results as Markdown, with the command."""
     few = len(seeds) < FEWEST_RUNS
     parts = [
+        "# The benchmark, pair by pair",
         f"Made by `{shlex.join(command)}`, seeds {seeds[0]} to {seeds[-1]}.",
         *([f"**{few_runs(len(seeds))}**"] if few else []),
         *(table.as_markdown() for table in overview),

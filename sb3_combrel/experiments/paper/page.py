@@ -13,7 +13,7 @@ from sb3_combrel.experiments.paper.reproduce import OUTPUT
 #: What is copied of a setting's folder. Runs, sources and SVG figures stay where they are.
 COPIED = ("*.md", "*.csv", "fig*.png", "diagnosis.png", "baselines.png")
 DOCS = Path("docs/results")
-PAGES = (Path("README.md"), Path("docs/results.md"))
+PAGES = (Path("docs/results.md"),)
 
 
 def copy_results(output: Path, docs: Path) -> list[Path]:
