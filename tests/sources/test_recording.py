@@ -92,7 +92,6 @@ class TestRecord:
         [
             ((None, "Pendulum-v1"), "action space must be Discrete"),
             ((None, "FrozenLake-v1"), "must be a one-dimensional Box"),
-            ((None, "MountainCar-v0", 0), "n_instances must be a whole number .*, got 0"),
             (("ppo", "MountainCar-v0"), "model must be an SB3 model or policy, .* got 'ppo'"),
         ],
     )
