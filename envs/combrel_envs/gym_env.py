@@ -7,55 +7,33 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
-from combrel_envs import icub_tasks
-from combrel_envs.mountain_car_dynamics import MAX_EPISODE_STEPS
+from combrel_envs import icub_tasks, mountain_car_dynamics
+from combrel_envs.checks import check_choice
 
 if TYPE_CHECKING:
     from dm_control import mujoco
     from dm_control.rl import control
 
-# Gymnasium's checker of every single call costs more than the dynamics of Mountain Car; the tests run `check_env` instead.
-_SPECS: tuple[dict[str, Any], ...] = (
-    {
-        "id": "combrel/MountainCar2D-v0",
-        "entry_point": "combrel_envs.mountain_car_gym:MountainCar2DEnv",
-        "max_episode_steps": MAX_EPISODE_STEPS,
-        "disable_env_checker": True,
-    },
-    {
-        "id": "combrel/MountainCar4D-v0",
-        "entry_point": "combrel_envs.mountain_car_gym:MountainCar4DEnv",
-        "max_episode_steps": MAX_EPISODE_STEPS,
-        "disable_env_checker": True,
-    },
-    {
-        "id": "combrel/MountainCar6D-v0",
-        "entry_point": "combrel_envs.mountain_car_gym:MountainCar6DEnv",
-        "max_episode_steps": MAX_EPISODE_STEPS,
-        "disable_env_checker": True,
-    },
-    *(
-        {
-            "id": f"combrel/ICub{part}Strike{variant}-v0",
-            "entry_point": f"combrel_envs.icub_gym:ICub{part}StrikeEnv",
-            "max_episode_steps": icub_tasks.MAX_EPISODE_STEPS,
-            "disable_env_checker": True,
-            "kwargs": kwargs,
-        }
-        for part in ("Torso", "Arm")
-        for variant, kwargs in (
-            ("", {}),
-            ("Noisy", {"motor_noise": icub_tasks.NOISY_MOTORS, "encoder_noise": icub_tasks.NOISY_ENCODERS}),
-        )
-    ),
-)
-
 
 def register_envs() -> None:
     """Register the environments with Gymnasium; a second call changes nothing."""
-    for spec in _SPECS:
-        if spec["id"] not in gymnasium.registry:
-            gymnasium.register(**spec)
+    for name in ("MountainCar2D", "MountainCar4D", "MountainCar6D"):
+        _register(name, f"mountain_car_gym:{name}Env", mountain_car_dynamics.MAX_EPISODE_STEPS, {})
+    for name in ("ICubTorsoStrike", "ICubArmStrike"):
+        _register(name, f"icub_gym:{name}Env", icub_tasks.MAX_EPISODE_STEPS, {})
+        _register(f"{name}Noisy", f"icub_gym:{name}Env", icub_tasks.MAX_EPISODE_STEPS, icub_tasks.NOISE)
+
+
+def _register(name: str, entry_point: str, max_episode_steps: int, kwargs: dict[str, Any]) -> None:
+    if f"combrel/{name}-v0" not in gymnasium.registry:
+        gymnasium.register(
+            f"combrel/{name}-v0",
+            f"combrel_envs.{entry_point}",
+            max_episode_steps=max_episode_steps,
+            # A check of every single call costs more than the dynamics of Mountain Car; the tests run `check_env` instead.
+            disable_env_checker=True,
+            kwargs=dict(kwargs),
+        )
 
 
 class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
@@ -83,8 +61,8 @@ class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
         for name, value in (("width", width), ("height", height)):
             if not (isinstance(value, int | np.integer) and value > 0):
                 raise ValueError(f"{name} must be a positive number of pixels, got {value!r}")
-        if camera is not None and camera not in self.cameras:
-            raise ValueError(f"camera must be one of {', '.join(map(repr, self.cameras))}, got {camera!r}")
+        if camera is not None:
+            check_choice("camera", camera, self.cameras)
         self.render_mode = render_mode
         self._width, self._height = width, height
         self._camera: str | int = camera or (self.cameras[0] if self.cameras else -1)
@@ -116,15 +94,12 @@ class DmControlEnv(RenderedEnv):
 
     The observations, in the order of the environment's specification, become one flat float32 vector. The episode terminates
     when the task gives a discount of 0 and is truncated at the environment's time limit; a task that ends on the very last
-    step is terminated. ``info["is_success"]`` is True if the task was solved.
+    step is terminated. ``info["is_success"]`` is True if it terminated.
 
     :param environment: the environment; its actions must be discrete
     :param low: least value of each entry of the observation; None takes the specification's
     :param high: greatest value of each entry of the observation; None takes the specification's
-    :param render_mode: ``"rgb_array"`` or None
-    :param width: width of a frame in pixels
-    :param height: height of a frame in pixels
-    :param camera: name of one of ``cameras``; the first of them if None
+    :param picture: ``render_mode``, ``width``, ``height`` and ``camera``, see :class:`RenderedEnv`
     :raises ValueError: when the actions aren't discrete or an argument isn't one of these
     """
 
@@ -133,12 +108,9 @@ class DmControlEnv(RenderedEnv):
         environment: "control.Environment",
         low: np.ndarray | None = None,
         high: np.ndarray | None = None,
-        render_mode: str | None = None,
-        width: int = 640,
-        height: int = 480,
-        camera: str | None = None,
+        **picture: Any,
     ) -> None:
-        super().__init__(render_mode, width, height, camera)
+        super().__init__(**picture)
         self._environment = environment
         self._running = self._closed = False
         observations = environment.observation_spec().values()
@@ -184,9 +156,8 @@ class DmControlEnv(RenderedEnv):
         self._running = not time_step.last()
         # On the last step of the time limit dm_control doesn't ask the task whether it has ended.
         terminated = bool(time_step.last() and self._environment.task.get_termination(self._environment.physics) == 0.0)
-        info = {"is_success": self._is_success(terminated)}
-        observation = self._flatten(time_step.observation)
-        return observation, float(time_step.reward), terminated, time_step.last() and not terminated, info
+        observation, truncated = self._flatten(time_step.observation), time_step.last() and not terminated
+        return observation, float(time_step.reward), terminated, truncated, {"is_success": terminated}
 
     def close(self) -> None:
         """Free MuJoCo's memory and the OpenGL context; the environment can't be used afterwards."""
@@ -203,10 +174,6 @@ class DmControlEnv(RenderedEnv):
         """Prepare the task for the options of a reset; environments with options override this."""
         if options:
             raise ValueError(f"options of reset must be empty, got {options!r}")
-
-    def _is_success(self, terminated: bool) -> bool:
-        """Decide whether the task is solved; environments that can terminate without success override this."""
-        return terminated
 
     def _flatten(self, observation: Any) -> np.ndarray:
         values = np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)

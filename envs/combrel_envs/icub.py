@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from combrel_envs import icub_tasks, rendering
+from combrel_envs.checks import check_action, check_choice, check_number
 
 rendering.import_dm_control()
 
@@ -25,7 +26,6 @@ from dm_control.utils import containers  # noqa: E402
 from combrel_envs import icub_model  # noqa: E402
 
 _CONTROL_TIMESTEP = 0.1  # (Seconds).
-_DEFAULT_TIME_LIMIT = icub_tasks.MAX_EPISODE_STEPS * _CONTROL_TIMESTEP
 #: Degrees in a radian, MuJoCo's unit.
 _DEGREES = math.degrees(1.0)
 #: How far the hand may overlap the table at the start, in metres: contacts are soft.
@@ -48,22 +48,18 @@ def arm_strike(**kwargs: Any) -> control.Environment:
 @SUITE.add("noisy")
 def torso_strike_noisy(**kwargs: Any) -> control.Environment:
     """Returns `torso_strike` with noisy motors and encoders."""
-    return make_environment("torso_strike", **_noise() | kwargs)
+    return make_environment("torso_strike", **(icub_tasks.NOISE | kwargs))
 
 
 @SUITE.add("noisy")
 def arm_strike_noisy(**kwargs: Any) -> control.Environment:
     """Returns `arm_strike` with noisy motors and encoders."""
-    return make_environment("arm_strike", **_noise() | kwargs)
-
-
-def _noise() -> dict[str, float]:
-    return {"motor_noise": icub_tasks.NOISY_MOTORS, "encoder_noise": icub_tasks.NOISY_ENCODERS}
+    return make_environment("arm_strike", **(icub_tasks.NOISE | kwargs))
 
 
 def make_environment(
     task: str,
-    time_limit: float = _DEFAULT_TIME_LIMIT,
+    time_limit: float = icub_tasks.MAX_EPISODE_STEPS * _CONTROL_TIMESTEP,
     random: np.random.RandomState | int | None = None,
     look: str = "primitives",
     start: Any = None,
@@ -77,26 +73,20 @@ def make_environment(
     Args:
       task: "torso_strike" or "arm_strike".
       time_limit: Seconds until an episode is cut off; a command takes 0.1 s.
-      random: Optional, either a `numpy.random.RandomState` instance, an integer seed, or None to select a seed.
       look: "primitives" or "meshes".
-      start, extent, motor_noise, encoder_noise: See `Strike`.
+      random, start, extent, motor_noise, encoder_noise: See `Strike`.
       environment_kwargs: Arguments of `control.Environment`.
     """
-    icub_tasks.check_look(look)
-    icub_tasks.check_time_limit(time_limit)
+    check_choice("look", look, icub_tasks.LOOKS)
+    check_number("time_limit", time_limit, "a number of seconds above 0", lambda seconds: seconds > 0)
     strike = Strike(icub_tasks.TASKS[task], start, extent, motor_noise, encoder_noise, random)
-    physics = make_physics(icub_tasks.TASKS[task], look)
+    physics = Physics.from_model(wrapper.MjModel(icub_model.make_model(icub_tasks.TASKS[task], look)))
     strike.check_free(physics)
     kwargs = {"legacy_step": False} | (environment_kwargs or {})
     if "n_sub_steps" not in kwargs:
         kwargs.setdefault("control_timestep", _CONTROL_TIMESTEP)
     # 3 * 0.1 is a little more than 0.3: without rounding that would be a fourth step.
     return StrikeEnvironment(physics, strike, time_limit=round(time_limit, 6), **kwargs)
-
-
-def make_physics(strike: icub_tasks.Strike, look: str) -> "Physics":
-    """Returns the `Physics` of a task."""
-    return Physics.from_model(wrapper.MjModel(icub_model.make_model(strike, look)))
 
 
 class Physics(mujoco.Physics):
@@ -127,13 +117,10 @@ class Physics(mujoco.Physics):
         self._angles[:] = self._targets[:] = np.deg2rad(degrees)
 
     def move_joint(self, joint: int, step: float, max_lag: float) -> None:
-        """Moves the target of one joint of the task.
+        """Moves the target of one joint of the task by `step` degrees.
 
-        Args:
-          joint: Its number.
-          step: Degrees by which to move the target.
-          max_lag: Degrees by which a joint may lag behind its target beforehand: the controller of a blocked joint would
-            otherwise exert an ever larger force.
+        Beforehand, targets are brought to within `max_lag` degrees of their joints: the controller of a blocked joint would
+        otherwise exert an ever larger force.
         """
         max_lag /= _DEGREES
         # Single numbers: for a handful of them NumPy takes several times as long.
@@ -192,15 +179,17 @@ class Strike(control.Task):
           extent: Degrees by which a command moves a joint.
           motor_noise: Standard deviation of the extent, as a fraction of it.
           encoder_noise: Standard deviation of an observed angle, in degrees.
-          random: Optional, either a `numpy.random.RandomState` instance, an integer seed for creating a new `RandomState`,
-            or None to select a seed automatically (default).
+          random: A `numpy.random.RandomState` instance, an integer seed for one, or None to select a seed.
         """
         self._strike, self._action_names = strike, strike.action_names
-        self._low, self._high = np.array(strike.low), np.array(strike.high)
+        joints = [icub_tasks.JOINTS[name] for name in strike.state_names]
+        self._low, self._high = np.array([joint.low for joint in joints]), np.array([joint.high for joint in joints])
         self._start = np.array(icub_tasks.check_start(start, strike))
-        self._extent = icub_tasks.check_amount("extent", extent, zero=False)
-        self._motor_noise = icub_tasks.check_amount("motor_noise", motor_noise, zero=True)
-        self._encoder_noise = icub_tasks.check_amount("encoder_noise", encoder_noise, zero=True)
+        self._extent = check_number("extent", extent, "a finite number above 0", lambda degrees: 0 < degrees < math.inf)
+        self._motor_noise, self._encoder_noise = (
+            check_number(name, noise, "a finite number of at least 0", lambda number: 0 <= number < math.inf)
+            for name, noise in (("motor_noise", motor_noise), ("encoder_noise", encoder_noise))
+        )
         self._hit = self._new_hit = False
         # As in dm_control's suite, whose own base class would load all of its domains.
         self._random = random if isinstance(random, np.random.RandomState) else np.random.RandomState(random)
@@ -250,7 +239,7 @@ class Strike(control.Task):
 
     def before_step(self, action: Any, physics: Physics) -> None:
         """Moves the target of one joint by the extent."""
-        number = icub_tasks.check_action(action, self._action_names)
+        number = check_action(action, self._action_names)
         joint, forward = divmod(number, 2)
         step = self._extent * (1.0 + self.random.normal(0.0, self._motor_noise)) if self._motor_noise else self._extent
         physics.move_joint(joint, step if forward else -step, max_lag=self._extent)

@@ -11,17 +11,9 @@ from combrel_envs.gym_env import DmControlEnv
 
 class ICubStrikeEnv(DmControlEnv):
     """
-    Common base class of both tasks; see :class:`ICubTorsoStrikeEnv` and :class:`ICubArmStrikeEnv`.
+    Common base class of both tasks; :class:`ICubTorsoStrikeEnv` says what the arguments are.
 
-    :param look: ``"primitives"`` or ``"meshes"``
-    :param start: angles of the joints, in degrees, at which an episode begins; None for those of the task
-    :param extent: degrees by which a command moves a joint
-    :param motor_noise: standard deviation of the extent, as a fraction of it
-    :param encoder_noise: standard deviation of an observed angle, in degrees
-    :param render_mode: ``"rgb_array"`` or None
-    :param width: width of a frame in pixels
-    :param height: height of a frame in pixels
-    :param camera: name of one of ``cameras``; the first of them if None
+    :param picture: ``render_mode``, ``width``, ``height`` and ``camera``
     :raises ValueError: when an argument isn't possible
     :raises ModuleNotFoundError: when the meshes aren't installed
     """
@@ -37,22 +29,11 @@ class ICubStrikeEnv(DmControlEnv):
         extent: float = icub_tasks.EXTENT,
         motor_noise: float = 0.0,
         encoder_noise: float = 0.0,
-        render_mode: str | None = None,
-        width: int = 640,
-        height: int = 480,
-        camera: str | None = None,
+        **picture: Any,
     ) -> None:
         # The step limit belongs to the `TimeLimit` wrapper, as for every environment of Gymnasium.
-        environment = icub.make_environment(
-            self.task,
-            time_limit=float("inf"),
-            look=look,
-            start=start,
-            extent=extent,
-            motor_noise=motor_noise,
-            encoder_noise=encoder_noise,
-        )
-        super().__init__(environment, render_mode=render_mode, width=width, height=height, camera=camera)
+        environment = icub.make_environment(self.task, float("inf"), None, look, start, extent, motor_noise, encoder_noise)
+        super().__init__(environment, **picture)
         self._start = environment.task.start
 
     def _apply_options(self, options: dict[str, Any]) -> None:
@@ -133,8 +114,8 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
       this. As always with this wrapper, a hit on the very last step is reported as both terminated and truncated; treat it as
       terminated. The class itself, made without `gymnasium.make`, has no limit.
 
-    `info["is_success"]` is True if the ball has been hit. The tests replay a plan of 26
-    actions that hits; random actions hit in about 6 % of the episodes.
+    `info["is_success"]` is True if the ball has been hit. The tests replay a plan of 26 actions that hits; random actions hit
+    in about 6 % of the episodes.
 
     ## Arguments
 
@@ -147,8 +128,7 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
     - `look`: `"primitives"` (the default) or `"meshes"`, the robot's true shape, for which the package `icub-models` is needed
       (`pip install 'sb3-combrel[icub]'`). The dynamics are the same.
     - `render_mode`: `None` or `"rgb_array"`; needs OpenGL (`MUJOCO_GL=egl` without a display).
-    - `width`, `height`: size of the pictures, 640 x 480 by default.
-    - `camera`: `"front"` (the default) or `"top"`.
+    - `width`, `height` of the pictures, 640 x 480 by default; `camera`: `"front"` (the default) or `"top"`.
 
     `reset` takes the option `{"start": [...]}`, which overrides `start` for one episode.
 
@@ -166,17 +146,9 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
     """
     ## Description
 
-    The iCub humanoid sits at a table on which a ball lies. It is blind, and must find the ball with its right hand by moving
-    four joints of the right arm; its torso leans forward and stands still. This is the target task of Section 4.2 in
-    Fachantidis, Partalas, Taylor and Vlahavas, *Transfer learning with probabilistic mapping selection* (Adaptive Behavior,
-    2015); the source task is `combrel/ICubTorsoStrike-v0`. The ball lies at the same place in both.
-
-    ```python
-    import gymnasium
-    import combrel_envs
-
-    env = gymnasium.make("combrel/ICubArmStrike-v0")
-    ```
+    `combrel/ICubArmStrike-v0`: as in `combrel/ICubTorsoStrike-v0` the iCub must strike the ball, but by moving four joints of
+    its right arm; its torso leans forward and stands still. This is the target task of Section 4.2 in Fachantidis, Partalas,
+    Taylor and Vlahavas, *Transfer learning with probabilistic mapping selection* (Adaptive Behavior, 2015).
 
     ## Observation Space
 
@@ -191,68 +163,17 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
 
     ## Action Space
 
-    `Discrete(8)`, named as in the paper's Table 4: joint and direction.
-
-    | Num | Action | Joint            | Degrees |
-    |-----|--------|------------------|---------|
-    | 0   | T1-    | r_shoulder_pitch | -2      |
-    | 1   | T1+    | r_shoulder_pitch | +2      |
-    | 2   | T2-    | r_shoulder_roll  | -2      |
-    | 3   | T2+    | r_shoulder_roll  | +2      |
-    | 4   | T3-    | r_shoulder_yaw   | -2      |
-    | 5   | T3+    | r_shoulder_yaw   | +2      |
-    | 6   | T4-    | r_elbow          | -2      |
-    | 7   | T4+    | r_elbow          | +2      |
-
-    ## Transition Dynamics
-
-    MuJoCo simulates the robot (kinematics, inertias and limits of iCubGazeboV2_5), the table and the ball. An action moves
-    the target angle of one joint by the extent, 2 degrees, but not beyond the joint's limits; position controllers follow
-    the targets for 0.1 s, in which a free joint comes to within about 0.1 degrees of its target. The hand can be blocked by
-    the table: before each action every target is brought to within one extent of its joint. Only the right hand collides.
-
-    The simulation is deterministic: the same actions lead to the same observations, bit by bit. The variant
-    `combrel/ICubArmStrikeNoisy-v0` adds noise: the extent of each action is drawn from N(2, 0.2) degrees, and each encoder
-    reading is off by N(0, 0.2) degrees.
-
-    ## Rewards
-
-    -1 on every step, and +100 on the step that moves the ball: 99 on the last step of a successful episode.
+    `Discrete(8)`: T1-, T1+, T2-, T2+, T3-, T3+, T4-, T4+, as in the paper's Table 4: joint and direction, 2 degrees each.
 
     ## Starting State
 
-    Always the same: at (-40, 40, -10, 60) degrees, the torso bent forward by 15. The ball lies 0.45 m before the waist and
-    0.02 m to the right of it, on a table 0.62 m high.
+    Always the same: at (-40, 40, -10, 60) degrees, the torso bent forward by 15; table and ball as for the torso.
 
-    ## Episode End
+    ## Everything Else
 
-    - Termination: the ball has been moved by more than 2 mm.
-    - Truncation: after 400 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
-      this. As always with this wrapper, a hit on the very last step is reported as both terminated and truncated; treat it as
-      terminated. The class itself, made without `gymnasium.make`, has no limit.
-
-    `info["is_success"]` is True if the ball has been hit. The tests replay a plan of 29
-    actions that hits, and Fitted R-Max finds some of 27; random actions hit in about 2 % of the episodes.
-
-    ## Arguments
-
-    - `start`: four angles in degrees, in the order of the observation: another start. The hand must not touch the ball there,
-      nor be inside the table.
-    - `extent`: degrees by which an action moves a joint, 2 by default.
-    - `motor_noise`: standard deviation of an action's extent, as a fraction of it; 0 by default, 0.1 in the noisy variant.
-    - `encoder_noise`: standard deviation of an encoder reading in degrees; 0 by default, 0.2 in the noisy variant. The seed
-      of `reset` decides both.
-    - `look`: `"primitives"` (the default) or `"meshes"`, the robot's true shape, for which the package `icub-models` is needed
-      (`pip install 'sb3-combrel[icub]'`). The dynamics are the same.
-    - `render_mode`: `None` or `"rgb_array"`; needs OpenGL (`MUJOCO_GL=egl` without a display).
-    - `width`, `height`: size of the pictures, 640 x 480 by default.
-    - `camera`: `"front"` (the default) or `"top"`.
-
-    `reset` takes the option `{"start": [...]}`, which overrides `start` for one episode.
-
-    ## Version History
-
-    - v0: first version.
+    Dynamics, rewards, ends and arguments as in `combrel/ICubTorsoStrike-v0`, but a `start` has four angles; the variant with
+    noise is `combrel/ICubArmStrikeNoisy-v0`. The tests replay a plan of 29 actions that hits, and Fitted R-Max finds some of
+    27; random actions hit in about 2 % of the episodes.
     """
 
     task = "arm_strike"

@@ -13,6 +13,7 @@ import numpy as np
 
 from combrel_envs import mountain_car_dynamics as dynamics
 from combrel_envs import rendering
+from combrel_envs.checks import check_choice
 
 rendering.import_dm_control()
 
@@ -25,66 +26,50 @@ from dm_control.utils import containers  # noqa: E402
 
 from combrel_envs import mountain_car_scene as scene  # noqa: E402
 
-_DEFAULT_TIME_LIMIT = dynamics.MAX_EPISODE_STEPS
 SUITE = containers.TaggedTasks()
 
 
-def get_model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
-    """Returns a tuple containing the model XML string and a dict of assets."""
-    return scene.model_and_assets(n_axes)
+@SUITE.add("benchmarking")
+def climb_2d(**kwargs: Any) -> control.Environment:
+    """Returns the Mountain Car task with state (x, v): climb the right hill; see `make_environment`."""
+    return make_environment(1, **kwargs)
 
 
 @SUITE.add("benchmarking")
-def climb_2d(
-    time_limit: float = _DEFAULT_TIME_LIMIT,
-    random: np.random.RandomState | int | None = None,
-    start: str = "offset",
-    action_noise: float = 0.0,
-    environment_kwargs: dict[str, Any] | None = None,
-) -> control.Environment:
-    """Returns the Mountain Car task with state (x, v): climb the right hill."""
-    return _climb(1, time_limit, random, start, action_noise, environment_kwargs)
-
-
-@SUITE.add("benchmarking")
-def climb_4d(
-    time_limit: float = _DEFAULT_TIME_LIMIT,
-    random: np.random.RandomState | int | None = None,
-    start: str = "offset",
-    action_noise: float = 0.0,
-    environment_kwargs: dict[str, Any] | None = None,
-) -> control.Environment:
+def climb_4d(**kwargs: Any) -> control.Environment:
     """Returns the Mountain Car task with state (x, y, vx, vy): climb the hill in the north-east corner."""
-    return _climb(2, time_limit, random, start, action_noise, environment_kwargs)
+    return make_environment(2, **kwargs)
 
 
 @SUITE.add("benchmarking")
-def climb_6d(
-    time_limit: float = _DEFAULT_TIME_LIMIT,
+def climb_6d(**kwargs: Any) -> control.Environment:
+    """Returns the Mountain Car task with state (x, y, z, vx, vy, vz): reach the upper end of all three axes together."""
+    return make_environment(3, **kwargs)
+
+
+def make_environment(
+    n_axes: int,
+    time_limit: float = dynamics.MAX_EPISODE_STEPS,
     random: np.random.RandomState | int | None = None,
     start: str = "offset",
     action_noise: float = 0.0,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> control.Environment:
-    """Returns the Mountain Car task with state (x, y, z, vx, vy, vz): reach the upper end of all three axes together."""
-    return _climb(3, time_limit, random, start, action_noise, environment_kwargs)
+    """Returns a Mountain Car environment.
 
-
-def _climb(
-    n_axes: int,
-    time_limit: float,
-    random: np.random.RandomState | int | None,
-    start: str,
-    action_noise: float,
-    environment_kwargs: dict[str, Any] | None,
-) -> control.Environment:
+    Args:
+      n_axes: Number of axes along which the car moves: 1 in 2D, 2 in 4D, 3 in 6D.
+      time_limit: Steps until an episode is cut off.
+      random, start, action_noise: See `Climb`.
+      environment_kwargs: Arguments of `control.Environment`.
+    """
     task = Climb(start=start, random=random, action_noise=action_noise)
     return control.Environment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
 
 
 def make_physics(n_axes: int) -> "Physics":
     """Returns the `Physics` of a car on one axis (2D), on two (4D) or on three (6D)."""
-    return Physics.from_xml_string(*get_model_and_assets(n_axes))
+    return Physics.from_xml_string(*scene.model_and_assets(n_axes))
 
 
 class Physics(mujoco.Physics):
@@ -150,11 +135,10 @@ class Climb(base.Task):
         Args:
           start: Where an episode begins: "offset" (at rest at the bottom, moved by a random offset in [-0.005, 0.005], the
             same on every axis), "fixed" (at rest at the bottom) or "random" (anywhere but at the goal, at any velocity).
-          random: Optional, either a `numpy.random.RandomState` instance, an integer seed for creating a new `RandomState`,
-            or None to select a seed automatically (default).
+          random: A `numpy.random.RandomState` instance, an integer seed for one, or None to select a seed.
           action_noise: Probability with which a random action, drawn from all, is executed instead of the one that was chosen.
         """
-        self._start = dynamics.check_start(start)
+        self._start = check_choice("start", start, dynamics.STARTS)
         self._action_noise = dynamics.check_action_noise(action_noise)
         super().__init__(random=random)
 
@@ -165,21 +149,15 @@ class Climb(base.Task):
 
     def action_spec(self, physics: Physics) -> dm_env.specs.DiscreteArray:
         """Returns the spec of the discrete action; `dynamics.ACTION_NAMES` names the actions."""
-        return dm_env.specs.DiscreteArray(len(dynamics.PUSHES[physics.n_axes]), dtype=np.int64, name="action")
+        return dm_env.specs.DiscreteArray(len(dynamics.ACTION_NAMES[physics.n_axes]), dtype=np.int64, name="action")
 
     def before_step(self, action: Any, physics: Physics) -> None:
-        """Sets the control to the push of the engine that the action stands for, or to another by the noise."""
-        push = dynamics.push_of(action, physics.n_axes)
-        if self._action_noise:
-            push = dynamics.noisy_push(push, self._action_noise, self.random.uniform)
-        physics.set_control(push)
+        """Sets the control to what the engine does: what the action stands for, or something else by the noise."""
+        physics.set_control(dynamics.executed_push(action, physics.n_axes, self._action_noise, self.random.uniform))
 
     def get_observation(self, physics: Physics) -> "collections.OrderedDict[str, np.ndarray]":
         """Returns the state: the car's position and velocity."""
-        observation = collections.OrderedDict()
-        observation["position"] = physics.car_position()
-        observation["velocity"] = physics.car_velocity()
-        return observation
+        return collections.OrderedDict(position=physics.car_position(), velocity=physics.car_velocity())
 
     def get_reward(self, physics: Physics) -> float:
         """Returns the reward of a step, -1."""

@@ -7,6 +7,7 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from combrel_envs import mountain_car_dynamics as dynamics
+from combrel_envs.checks import check_choice
 from combrel_envs.gym_env import RenderedEnv
 
 if TYPE_CHECKING:
@@ -15,35 +16,22 @@ if TYPE_CHECKING:
 
 class MountainCarEnv(RenderedEnv):
     """
-    Common base class of the 2D, 4D and 6D car; see :class:`MountainCar2DEnv`, :class:`MountainCar4DEnv` and
-    :class:`MountainCar6DEnv`.
+    Common base class of the three cars; :class:`MountainCar2DEnv` says what the arguments are.
 
-    :param start: where an episode begins: ``"offset"``, ``"fixed"`` or ``"random"``
-    :param render_mode: ``"rgb_array"`` or None
-    :param width: width of a frame in pixels
-    :param height: height of a frame in pixels
-    :param camera: name of one of ``cameras``; the first of them if None
-    :param action_noise: probability with which a random action, drawn from all, is executed instead of the one that was chosen
-    :raises ValueError: when an argument isn't one of these
+    :param picture: ``render_mode``, ``width``, ``height`` and ``camera``
+    :raises ValueError: when an argument isn't possible
     """
 
     n_axes: ClassVar[int]
 
-    def __init__(
-        self,
-        start: str = "offset",
-        render_mode: str | None = None,
-        width: int = 640,
-        height: int = 480,
-        camera: str | None = None,
-        action_noise: float = 0.0,
-    ) -> None:
-        super().__init__(render_mode, width, height, camera)
-        self._start = dynamics.check_start(start)
+    def __init__(self, start: str = "offset", action_noise: float = 0.0, **picture: Any) -> None:
+        super().__init__(**picture)
+        self._start = check_choice("start", start, dynamics.STARTS)
         self._action_noise = dynamics.check_action_noise(action_noise)
         self._state: dynamics.State | None = None
         self._physics: Physics | None = None
-        self._low, self._high = _bounds(self.n_axes)
+        self._low = np.repeat([dynamics.MIN_POSITION, -dynamics.MAX_SPEED], self.n_axes)
+        self._high = np.repeat([dynamics.MAX_POSITION, dynamics.MAX_SPEED], self.n_axes)
         self.observation_space = spaces.Box(self._low.astype(np.float32), self._high.astype(np.float32))
         self.action_space = spaces.Discrete(len(self.action_names))
 
@@ -57,7 +45,7 @@ class MountainCarEnv(RenderedEnv):
         """
         Begin an episode.
 
-        :param seed: seed of this and the following starts; None continues with the present generator
+        :param seed: seed of this and the following episodes; None continues with the present generator
         :param options: ``{"start": ...}`` overrides the environment's start option for this episode,
             ``{"state": [...]}`` begins in exactly that state, in the order of ``state_names``
         :return: the first observation, and an empty dictionary
@@ -65,13 +53,12 @@ class MountainCarEnv(RenderedEnv):
         """
         super().reset(seed=seed)
         options = options or {}
-        unknown = sorted(set(options) - {"start", "state"}, key=str)
-        if unknown or len(options) > 1:
+        if not options.keys() <= {"start", "state"} or len(options) > 1:
             raise ValueError(f"options of reset must be either 'start' or 'state', got {options!r}")
         if "state" in options:
             self._state = self._checked_state(options["state"])
         else:
-            start = dynamics.check_start(options.get("start", self._start))
+            start = check_choice("start", options.get("start", self._start), dynamics.STARTS)
             self._state = dynamics.sample_start(start, self.n_axes, self.np_random.uniform)
         return self._observation(self._state), {}
 
@@ -84,11 +71,8 @@ class MountainCarEnv(RenderedEnv):
             wrapper), and a dictionary with ``is_success``
         :raises ValueError: when there is no such action
         """
-        push = dynamics.push_of(action, self.n_axes)
-        if self._action_noise:
-            push = dynamics.noisy_push(push, self._action_noise, self.np_random.uniform)
-        state = dynamics.step_car(*self._running_state(), push)
-        self._state = state
+        push = dynamics.executed_push(action, self.n_axes, self._action_noise, self.np_random.uniform)
+        self._state = state = dynamics.step_car(*self._running_state(), push)
         terminated = dynamics.at_goal(state[0])
         return self._observation(state), -1.0, terminated, False, {"is_success": terminated}
 
@@ -108,17 +92,16 @@ class MountainCarEnv(RenderedEnv):
         return np.array(state[0] + state[1], dtype=np.float32)
 
     def _checked_state(self, state: Any) -> dynamics.State:
-        names = f"({', '.join(self.state_names)})"
+        names = ", ".join(self.state_names)
         try:
             values = np.asarray(state, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"options['state'] must be numbers {names}, got {state!r}") from error
-        if values.shape != self._low.shape:
-            raise ValueError(f"options['state'] must have the {len(self._low)} entries {names}, got {state!r}")
+            raise ValueError(f"options['state'] must be numbers ({names}), got {state!r}") from error
         # Compared in float32: every observation can be given back as a state, though float32(0.6) is more than 0.6.
-        if not self.observation_space.contains(values.astype(np.float32)):
+        if values.shape != self._low.shape or not self.observation_space.contains(values.astype(np.float32)):
             raise ValueError(
-                f"options['state'] must lie between {self._low.tolist()} and {self._high.tolist()}, got {state!r}"
+                f"options['state'] must be the {len(self._low)} numbers ({names}) between {self._low.tolist()} and "
+                f"{self._high.tolist()}, got {state!r}"
             )
         entries = tuple(np.clip(values, self._low, self._high).tolist())
         return entries[: self.n_axes], entries[self.n_axes :]
@@ -203,8 +186,7 @@ class MountainCar2DEnv(MountainCarEnv):
     - `action_noise`: probability with which a random action, drawn from all, is executed instead of the one that was chosen; 0
       by default. The seed of `reset` decides it.
     - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
-    - `width`, `height`: size of the pictures, 640 x 480 by default.
-    - `camera`: `"side"` (the default) or `"close"`, which follows the car.
+    - `width`, `height` of the pictures, 640 x 480 by default; `camera`: `"side"` (the default) or `"close"`: follows the car.
 
     `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, v]}`, to begin in
     exactly that state.
@@ -224,16 +206,9 @@ class MountainCar4DEnv(MountainCarEnv):
     """
     ## Description
 
-    A car stands at the bottom of a basin with hills along two axes, of height sin(3x) + sin(3y). Its engine is weaker than
-    gravity and pushes along one axis at a time; the goal is the hill in the north-east corner. The two axes move
-    independently, each as in `combrel/MountainCar2D-v0`, but must be at the goal together.
-
-    ```python
-    import gymnasium
-    import combrel_envs
-
-    env = gymnasium.make("combrel/MountainCar4D-v0")
-    ```
+    `combrel/MountainCar4D-v0`: a car stands at the bottom of a basin with hills along two axes, of height sin(3x) + sin(3y).
+    Its engine is weaker than gravity and pushes along one axis at a time; the goal is the hill in the north-east corner. The
+    two axes move independently, each as in `combrel/MountainCar2D-v0`, but must be at the goal together.
 
     ## Observation Space
 
@@ -259,51 +234,12 @@ class MountainCar4DEnv(MountainCarEnv):
     | 3   | South   | 0            | -1           |
     | 4   | North   | 0            | +1           |
 
-    ## Transition Dynamics
+    ## Everything Else
 
-    For x, and in the same way for y; gravity acts on both on every step:
-
-    vx' = vx + 0.001 push - 0.0025 cos(3x), clipped to [-0.07, 0.07]
-
-    x' = x + vx', clipped to [-1.2, 0.6]
-
-    At a wall a velocity that points into the wall becomes 0.
-
-    ## Rewards
-
-    -1 on every step, the last included.
-
-    ## Starting State
-
-    At rest at the bottom of the basin, x = y = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset and
-    is the same for x and y. The argument `start` changes this.
-
-    ## Episode End
-
-    - Termination: x >= 0.5 and y >= 0.5.
-    - Truncation: after 4000 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
-      this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
-      truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
-
-    `info["is_success"]` is True if the car is at the goal after the step. From the bottom the goal can be reached in 146
-    steps, which the tests replay; whether fewer are possible isn't known.
-
-    ## Arguments
-
-    - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
-      goal, any velocities, uniformly).
-    - `action_noise`: probability with which a random action, drawn from all, is executed instead of the one that was chosen; 0
-      by default. The seed of `reset` decides it.
-    - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
-    - `width`, `height`: size of the pictures, 640 x 480 by default.
-    - `camera`: `"perspective"` (the default), `"top"`, or `"close"`, which follows the car.
-
-    `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, y, vx, vy]}`, to begin
-    in exactly that state.
-
-    ## Version History
-
-    - v0: first version.
+    As in `combrel/MountainCar2D-v0`, on every axis; gravity acts on both on every step. The offset of the start is the same
+    for x and y. Termination: x >= 0.5 and y >= 0.5; from the bottom the goal can be reached in 146 steps, which the tests
+    replay; whether fewer are possible isn't known. `camera` is `"perspective"` (the default), `"top"`, or `"close"`, which
+    follows the car; the option of `reset` is `{"state": [x, y, vx, vy]}`.
     """
 
     n_axes = 2
@@ -316,99 +252,28 @@ class MountainCar6DEnv(MountainCarEnv):
     """
     ## Description
 
-    A car stands at the bottom of a basin with hills along three axes, of height sin(3x) + sin(3y) + sin(3z). Its engine is
-    weaker than gravity and pushes along one axis at a time; the goal is the upper end of all three. The axes move
-    independently, each as in `combrel/MountainCar2D-v0`, but must be at the goal together: `combrel/MountainCar4D-v0` with one
-    axis more. Pictures show x and y as in 4D, and z as a second car on a strip in front of it.
-
-    ```python
-    import gymnasium
-    import combrel_envs
-
-    env = gymnasium.make("combrel/MountainCar6D-v0")
-    ```
+    `combrel/MountainCar6D-v0`: `combrel/MountainCar4D-v0` with one axis more, hills of height sin(3x) + sin(3y) + sin(3z); the
+    goal is the upper end of all three axes together. Pictures show x and y as in 4D, and z as a second car on a strip in front
+    of it.
 
     ## Observation Space
 
-    A `Box` of float32 with shape (6,); `env.unwrapped.state` is the same in float64.
-
-    | Num | Observation              | Name | Min   | Max  |
-    |-----|--------------------------|------|-------|------|
-    | 0   | position, west to east   | x    | -1.2  | 0.6  |
-    | 1   | position, south to north | y    | -1.2  | 0.6  |
-    | 2   | position, down to up     | z    | -1.2  | 0.6  |
-    | 3   | velocity along x         | vx   | -0.07 | 0.07 |
-    | 4   | velocity along y         | vy   | -0.07 | 0.07 |
-    | 5   | velocity along z         | vz   | -0.07 | 0.07 |
+    A `Box` of float32 with shape (6,), x, y, z, vx, vy, vz: the positions (west to east, south to north, down to up) from -1.2
+    to 0.6, and the velocities from -0.07 to 0.07. `env.unwrapped.state` is the same in float64.
 
     ## Action Space
 
-    `Discrete(7)`.
+    `Discrete(7)`: Neutral, West, East, South, North, Down, Up; each pushes by -1 or +1 along one axis, or not at all.
 
-    | Num | Action  | Push along x | Push along y | Push along z |
-    |-----|---------|--------------|--------------|--------------|
-    | 0   | Neutral | 0            | 0            | 0            |
-    | 1   | West    | -1           | 0            | 0            |
-    | 2   | East    | +1           | 0            | 0            |
-    | 3   | South   | 0            | -1           | 0            |
-    | 4   | North   | 0            | +1           | 0            |
-    | 5   | Down    | 0            | 0            | -1           |
-    | 6   | Up      | 0            | 0            | +1           |
+    ## Everything Else
 
-    ## Transition Dynamics
-
-    For x, and in the same way for y and z; gravity acts on all three on every step:
-
-    vx' = vx + 0.001 push - 0.0025 cos(3x), clipped to [-0.07, 0.07]
-
-    x' = x + vx', clipped to [-1.2, 0.6]
-
-    At a wall a velocity that points into the wall becomes 0.
-
-    ## Rewards
-
-    -1 on every step, the last included.
-
-    ## Starting State
-
-    At rest at the bottom of the basin, x = y = z = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset
-    and is the same for x, y and z. The argument `start` changes this.
-
-    ## Episode End
-
-    - Termination: x >= 0.5, y >= 0.5 and z >= 0.5.
-    - Truncation: after 4000 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
-      this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
-      truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
-
-    `info["is_success"]` is True if the car is at the goal after the step. From the bottom the goal can be reached in 200
-    steps, which the tests replay; whether fewer are possible isn't known.
-
-    ## Arguments
-
-    - `start`: `"offset"` (the default), `"fixed"` (exactly at the bottom, at rest), or `"random"` (any position that isn't the
-      goal, any velocities, uniformly).
-    - `action_noise`: probability with which a random action, drawn from all, is executed instead of the one that was chosen; 0
-      by default. The seed of `reset` decides it.
-    - `render_mode`: `None` or `"rgb_array"`; MuJoCo draws the pictures and needs OpenGL (`MUJOCO_GL=egl` without a display).
-    - `width`, `height`: size of the pictures, 640 x 480 by default.
-    - `camera`: `"perspective"` (the default), `"top"`, or `"close"`, which follows the car of x and y.
-
-    `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, y, z, vx, vy, vz]}`, to
-    begin in exactly that state.
-
-    ## Version History
-
-    - v0: first version.
+    As in `combrel/MountainCar2D-v0`, on every axis; gravity acts on all three on every step. The offset of the start is the
+    same for all. Termination: x >= 0.5, y >= 0.5 and z >= 0.5; from the bottom the goal can be reached in 200 steps, which the
+    tests replay; whether fewer are possible isn't known. `camera` is `"perspective"` (the default), `"top"`, or `"close"`,
+    which follows the car of x and y; the option of `reset` is `{"state": [x, y, z, vx, vy, vz]}`.
     """
 
     n_axes = 3
     state_names = dynamics.STATE_NAMES[3]
     action_names = dynamics.ACTION_NAMES[3]
     cameras = ("perspective", "top", "close")
-
-
-def _bounds(n_axes: int) -> tuple[np.ndarray, np.ndarray]:
-    low = [dynamics.MIN_POSITION] * n_axes + [-dynamics.MAX_SPEED] * n_axes
-    high = [dynamics.MAX_POSITION] * n_axes + [dynamics.MAX_SPEED] * n_axes
-    return np.array(low), np.array(high)

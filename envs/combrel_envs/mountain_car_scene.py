@@ -29,7 +29,9 @@ HEIGHT_SCALE = {1: 1 / 3, 2: 0.2}
 #: How far the ground extends beyond the walls: half a car.
 MARGIN = 0.1
 LOW, HIGH = dynamics.MIN_POSITION - MARGIN, dynamics.MAX_POSITION + MARGIN
-STRIP_HALF_WIDTH = 0.13
+#: Where the ground ends along y, and the height of the block's underside.
+EXTENT = {1: (-0.13, 0.13), 2: (LOW, HIGH)}
+FLOOR = {n_axes: -n_axes * scale - 0.12 for n_axes, scale in HEIGHT_SCALE.items()}
 WHEELBASE, TRACK = 0.096, 0.062
 _WHEELS = np.array([(a * WHEELBASE / 2, b * TRACK / 2, 0.0) for a in (-1, 1) for b in (-1, 1)])
 
@@ -45,39 +47,20 @@ _LINE = np.array([0.98, 0.98, 0.96])
 
 
 def height(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> np.ndarray:
-    """
-    Compute the height of the ground.
-
-    :param x: position along x
-    :param y: position along y (in 2D across the strip, where the ground is level)
-    :param n_axes: number of axes, 1 or 2
-    :return: height of the ground in the picture, of the shape of ``x`` and ``y`` broadcast together
-    """
+    """Height of the ground in the picture; in 2D y is across the strip, where the ground is level."""
     hills = np.sin(3 * np.asarray(x)) + (np.sin(3 * np.asarray(y)) if n_axes == 2 else 0 * np.asarray(y))
     return HEIGHT_SCALE[n_axes] * hills
 
 
 def gradient(x: np.ndarray | float, y: np.ndarray | float, n_axes: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Compute the slope of the ground.
-
-    :param x: position along x
-    :param y: position along y
-    :param n_axes: number of axes, 1 or 2
-    :return: derivatives of :func:`height` with respect to x and to y
-    """
+    """Derivatives of :func:`height` with respect to x and to y."""
     scale = 3 * HEIGHT_SCALE[n_axes]
     along_y = np.cos(3 * np.asarray(y)) if n_axes == 2 else 0 * np.asarray(y)
     return scale * np.cos(3 * np.asarray(x)), scale * along_y
 
 
 def model_and_assets(n_axes: int) -> tuple[bytes, dict[str, bytes]]:
-    """
-    Build the scene.
-
-    :param n_axes: the task's number of axes, 1, 2 or 3
-    :return: the MJCF model and the files that it includes, as ``Physics.from_xml_string`` takes them
-    """
+    """The MJCF model of a task's scene and the files that it includes, as ``Physics.from_xml_string`` takes them."""
     return (_ASSETS / f"mountain_car_{2 * n_axes}d.xml").read_bytes(), dict(_assets(n_axes))
 
 
@@ -99,14 +82,12 @@ def _assets(n_axes: int) -> dict[str, bytes]:
 
 def car_pose(positions: dynamics.Axes, velocities: dynamics.Axes) -> tuple[np.ndarray, np.ndarray]:
     """
-    Compute the pose in which a car is drawn on its ground: wheels on the ground, roof along the ground's normal.
+    The pose in which a car is drawn on its ground: wheels on the ground, roof along the ground's normal.
 
     In 2D the nose points right, as the car can reverse; in 4D it points in the direction of motion (north-east at rest).
 
-    :param positions: position on each axis of this ground
-    :param velocities: velocity on each axis of this ground
-    :return: position relative to the body that carries the ground, and rotation as a matrix whose columns are the car's nose,
-        left side and roof
+    :param positions: position on each axis of this ground; ``velocities``: the velocities
+    :return: position relative to the body that carries the ground, and a rotation matrix: columns nose, left side and roof
     """
     n_axes = len(positions)
     x, y = (positions[0], 0.0) if n_axes == 1 else positions
@@ -137,18 +118,10 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
-def _extent(n_axes: int) -> tuple[float, float]:
-    return (-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH) if n_axes == 1 else (LOW, HIGH)
-
-
-def _floor(n_axes: int) -> float:
-    return -n_axes * HEIGHT_SCALE[n_axes] - 0.12
-
-
 def _ground_mesh(n_axes: int) -> bytes:
     """The surface on which the car drives, with a texture projected from above."""
     xs = np.linspace(LOW, HIGH, _GROUND_CELLS + 1)
-    ys = np.linspace(*_extent(n_axes), _GROUND_CELLS + 1 if n_axes == 2 else 3)
+    ys = np.linspace(*EXTENT[n_axes], _GROUND_CELLS + 1 if n_axes == 2 else 3)
     x, y = (grid.ravel() for grid in np.meshgrid(xs, ys, indexing="ij"))
     slope_x, slope_y = gradient(x, y, n_axes)
     vertices = np.column_stack([x, y, height(x, y, n_axes)])
@@ -160,10 +133,10 @@ def _ground_mesh(n_axes: int) -> bytes:
 
 def _soil_mesh(n_axes: int) -> bytes:
     """The four sides of the block and its underside; the texture's v is the depth under the surface."""
-    y_low, y_high = _extent(n_axes)
+    y_low, y_high = EXTENT[n_axes]
     corners = np.array([[LOW, y_low], [HIGH, y_low], [HIGH, y_high], [LOW, y_high]])
     parts = [_side(corners[i], corners[(i + 1) % 4], n_axes) for i in range(4)]
-    floor = np.column_stack([corners[[0, 3, 1, 2]], np.full(4, _floor(n_axes))])
+    floor = np.column_stack([corners[[0, 3, 1, 2]], np.full(4, FLOOR[n_axes])])
     parts.append((floor, np.tile([0.0, 0.0, -1.0], (4, 1)), np.zeros((4, 2)), _grid_faces(2, 2)[:, ::-1]))
     starts = np.cumsum([0, *(len(part[0]) for part in parts)])
     faces = np.concatenate([part[3] + start for part, start in zip(parts, starts, strict=False)])
@@ -177,7 +150,7 @@ def _side(start: np.ndarray, end: np.ndarray, n_axes: int) -> tuple[np.ndarray, 
     foot = start + share[:, None] * (end - start)
     top = height(foot[:, 0], foot[:, 1], n_axes)
     levels = np.linspace(0, 1, 9)
-    depth = (top - _floor(n_axes))[:, None] * levels
+    depth = (top - FLOOR[n_axes])[:, None] * levels
     vertices = np.column_stack([np.repeat(foot, len(levels), axis=0), (top[:, None] - depth).ravel()])
     along = (end - start) / np.linalg.norm(end - start)
     normals = np.tile([along[1], -along[0], 0.0], (len(vertices), 1))
@@ -202,7 +175,7 @@ def _obj(vertices: np.ndarray, normals: np.ndarray, uv: np.ndarray, faces: np.nd
 
 def _ground_texture(n_axes: int) -> np.ndarray:
     """Colour by height, contour lines, the walls as pale lines, the goal as a patch; rows from north to south."""
-    y_low, y_high = _extent(n_axes)
+    y_low, y_high = EXTENT[n_axes]
     # Square texels: a texture that is squeezed in one direction gets blurred in the other.
     rows = round(_TEXTURE_SIZE * (y_high - y_low) / (HIGH - LOW))
     x, y = np.linspace(LOW, HIGH, _TEXTURE_SIZE), np.linspace(y_high, y_low, rows)[:, None]

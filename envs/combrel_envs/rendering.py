@@ -32,7 +32,8 @@ def import_dm_control() -> None:
     if "dm_control.mujoco" in sys.modules:
         return
     chosen = os.environ.get("MUJOCO_GL")
-    if chosen is None and _is_headless_linux():
+    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if chosen is None and sys.platform.startswith("linux") and not has_display:
         os.environ["MUJOCO_GL"] = _headless_backend()
     _import_triton()
     try:
@@ -64,10 +65,6 @@ def open_gl(physics: Any) -> None:
         raise RenderingError(_ADVICE.format(gl=os.environ.get("MUJOCO_GL"), reason=_failure)) from _failure
 
 
-def _is_headless_linux() -> bool:
-    return sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
 def _import_triton() -> None:
     """Import triton, where it is installed, before Mesa is loaded.
 
@@ -81,11 +78,9 @@ def _import_triton() -> None:
 
 def _headless_backend() -> str:
     for backend, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
-        try:
+        with contextlib.suppress(OSError):
             ctypes.CDLL(library)
-        except OSError:
-            continue
-        return backend
+            return backend
     return "disable"
 
 

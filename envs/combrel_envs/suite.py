@@ -3,14 +3,10 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from combrel_envs.checks import check_choice
+
 if TYPE_CHECKING:
     from dm_control.rl import control
-
-#: Module of each domain; it is imported, and dm_control with it, when a task of the domain is asked for.
-_DOMAINS = {
-    "mountain_car": "combrel_envs.mountain_car",
-    "icub": "combrel_envs.icub",
-}
 
 
 def load(
@@ -22,19 +18,16 @@ def load(
     """
     Make a dm_control environment.
 
-    :param domain: name of a domain, for instance ``"mountain_car"``
+    :param domain: ``"mountain_car"`` or ``"icub"``
     :param task: name of one of its tasks, for instance ``"climb_4d"``
     :param task_kwargs: arguments of the task, for instance ``random`` (a seed), ``time_limit``, ``start``
     :param environment_kwargs: arguments of ``dm_control.rl.control.Environment``, for instance ``flat_observation``
     :return: the environment
     :raises ValueError: when there is no such domain or task
     """
-    if domain not in _DOMAINS:
-        raise ValueError(f"domain must be one of {', '.join(map(repr, _DOMAINS))}, got {domain!r}")
-    tasks = importlib.import_module(_DOMAINS[domain]).SUITE
-    if task not in tasks:
-        raise ValueError(f"task of {domain!r} must be one of {', '.join(map(repr, tasks))}, got {task!r}")
+    # Imported, and dm_control with it, when a task of the domain is asked for.
+    tasks = importlib.import_module(f"combrel_envs.{check_choice('domain', domain, ('mountain_car', 'icub'))}").SUITE
     kwargs = dict(task_kwargs or {})
     if environment_kwargs is not None:
         kwargs["environment_kwargs"] = environment_kwargs
-    return tasks[task](**kwargs)
+    return tasks[check_choice(f"task of {domain!r}", task, tasks)](**kwargs)

@@ -24,12 +24,7 @@ MAX_BALANCED_ACTIONS = 100
 
 
 class ActionMappings(ABC):
-    """
-    A sequence of action mappings, each a tuple with the source action of every target action.
-
-    :param n_source_actions: number of actions of the source task
-    :param n_target_actions: number of actions of the target task
-    """
+    """A sequence of action mappings, each a tuple with the source action of every target action."""
 
     n_source_actions: int
     n_target_actions: int
@@ -52,8 +47,8 @@ class ActionMappings(ABC):
         """Number of the first of them; ``ValueError`` if there is none."""
 
     def source_actions_for(self, action: int) -> Ints:
-        """The source actions that target action ``action`` is mapped to by some mapping, ascending."""
-        return np.array([b for b in range(self.n_source_actions) if self.count(action, b)], dtype=np.int64)
+        """The source actions that target action ``action`` is mapped to by some mapping, ascending; unless overridden, all."""
+        return np.arange(self.n_source_actions, dtype=np.int64)
 
     def _check_index(self, index: int) -> None:
         if not 0 <= index < self.n_mappings:
@@ -68,12 +63,7 @@ class ActionMappings(ABC):
 
 @dataclass(frozen=True)
 class AllActionMappings(ActionMappings):
-    """
-    All functions from target actions to source actions, in lexicographic order; nothing is stored.
-
-    :param n_source_actions: number of actions of the source task
-    :param n_target_actions: number of actions of the target task
-    """
+    """All functions from target actions to source actions, in lexicographic order; nothing is stored."""
 
     n_source_actions: int
     n_target_actions: int
@@ -102,9 +92,6 @@ class AllActionMappings(ActionMappings):
             raise self._none_maps(action, source_action)
         return source_action * self.n_source_actions ** (self.n_target_actions - 1 - action)
 
-    def source_actions_for(self, action: int) -> Ints:
-        return np.arange(self.n_source_actions, dtype=np.int64)
-
 
 @dataclass(frozen=True)
 class BalancedActionMappings(ActionMappings):
@@ -113,9 +100,6 @@ class BalancedActionMappings(ActionMappings):
 
     For five target and three source actions these are the 90 that use them 2, 2 and 1 times (the paper, Section 5.1;
     all mappings of its Table 2 are of this kind).
-
-    :param n_source_actions: number of actions of the source task
-    :param n_target_actions: number of actions of the target task
     """
 
     n_source_actions: int
@@ -161,9 +145,6 @@ class BalancedActionMappings(ActionMappings):
                     break
                 number += self._completions([*chosen, candidate])
         return number
-
-    def source_actions_for(self, action: int) -> Ints:
-        return np.arange(self.n_source_actions, dtype=np.int64)
 
     def _completions(self, chosen: Sequence[int]) -> int:
         """Number of balanced mappings that begin with ``chosen``."""
@@ -244,15 +225,9 @@ def paper_icub_actions() -> Ints:
     return np.array(mappings, dtype=np.int64)
 
 
-def _sizes(actions: AllActionMappings | BalancedActionMappings) -> tuple[str, dict[str, int]]:
-    sizes = {"n_source_actions": actions.n_source_actions, "n_target_actions": actions.n_target_actions}
-    return type(actions).__name__, sizes
-
-
-register_writer(AllActionMappings, _sizes)
-register_reader("AllActionMappings", AllActionMappings)
-register_writer(BalancedActionMappings, _sizes)
-register_reader("BalancedActionMappings", BalancedActionMappings)
+for _kind in (AllActionMappings, BalancedActionMappings):
+    register_writer(_kind, lambda actions: (type(actions).__name__, dict(vars(actions))))
+    register_reader(_kind.__name__, _kind)
 register_writer(
     ListedActionMappings,
     lambda actions: ("ListedActionMappings", {"mappings": actions.mappings, "n_source_actions": actions.n_source_actions}),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from sb3_combrel.common.serialisation import register_reader, register_writer
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, TaskSizes, as_mapping
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,7 +42,7 @@ class FactoredMapping:
     def __init__(self, copies: Iterable[InterTaskMapping | Mapping[str, Any]]) -> None:
         if isinstance(copies, str | Mapping | InterTaskMapping) or not isinstance(copies, Iterable):
             raise ValueError(f"copies must be a list of inter-task mappings, one a copy of the source, got {copies!r}")
-        mappings = tuple(_copy(each) for each in copies)
+        mappings = tuple(as_mapping(each, "copies") for each in copies)
         if not mappings:
             raise ValueError("copies must hold at least one inter-task mapping, got none")
         # Those that are given by name cannot be compared before both tasks are known: see ``with_names``.
@@ -64,19 +64,10 @@ class FactoredMapping:
         """Number of actions of the target task."""
         return self.copies[0].n_target_actions
 
-    def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
-        """
-        Check every copy against the spaces of the two tasks.
-
-        :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
-        """
+    def check(self, **sizes: Unpack[TaskSizes]) -> None:
+        """Check every copy against the spaces of the two tasks, see :meth:`InterTaskMapping.check`."""
         for each in self.copies:
-            each.check(
-                n_source_variables=n_source_variables,
-                n_target_variables=n_target_variables,
-                n_source_actions=n_source_actions,
-                n_target_actions=n_target_actions,
-            )
+            each.check(**sizes)
 
     def with_names(
         self,
@@ -99,35 +90,29 @@ class FactoredMapping:
 
 
 def describe_copy(copy: InterTaskMapping) -> str:
-    """
-    Name the target variables of a copy, in the order of the source's variables: "(x, vx)"; a mirrored one as "-x".
-
-    :param copy: with names
-    """
+    """The target variables of a copy with names, in the order of the source's variables: "(x, vx)"; a mirrored one as "-x"."""
     assert copy.names is not None
-    order = sorted((k, v) for v, k in enumerate(copy.state) if k is not None)
-    signs = copy.state_sign
-    return f"({', '.join(('-' if signs[v] < 0 else '') + copy.names.target_variables[v] for _, v in order)})"
+    names = [("-" if copy.state_sign[v] < 0 else "") + copy.names.target_variables[v] for v in _in_source_order(copy)]
+    return f"({', '.join(names)})"
 
 
 def describe_both_sides(copy: InterTaskMapping) -> str:
-    """
-    Name the target variables of a copy and, where these have other names, the source variables: "(x, vx) as (x, v)".
-
-    :param copy: with names
-    """
+    """:func:`describe_copy` and, where these have other names, the source variables: "(x, vx) as (x, v)"."""
     assert copy.names is not None
-    order = sorted((k, v) for v, k in enumerate(copy.state) if k is not None)
-    target = [copy.names.target_variables[v] for _, v in order]
-    source = [copy.names.source_variables[k] for k, _ in order]
+    target = [copy.names.target_variables[v] for v in _in_source_order(copy)]
+    source = [copy.names.source_variables[k] for k in sorted(k for k in copy.state if k is not None)]
     return describe_copy(copy) + (f" as ({', '.join(source)})" if source != target else "")
+
+
+def _in_source_order(copy: InterTaskMapping) -> list[int]:
+    """The mapped target variables by their source variables."""
+    return [v for _, v in sorted((k, v) for v, k in enumerate(copy.state) if k is not None)]
 
 
 def describe_actions(target_actions: Sequence[str], moves: Sequence[tuple[str, Sequence[str]]]) -> str:
     """
     Say what each target action does to each copy: "East: Right on (x, vx), Neutral on (y, vy); West: ...".
 
-    :param target_actions: names of the target actions
     :param moves: of each copy its variables as text, and the name of its source action for each target action
     """
     lines = (
@@ -149,16 +134,6 @@ def _disjoint(copies: tuple[InterTaskMapping, ...]) -> tuple[InterTaskMapping, .
     if len(shared):
         raise ValueError(f"copies must have no target variable in common, got variable {shared[0]} in two of {copies!r}")
     return tuple(sorted(copies, key=lambda each: int(each.mapped.argmax())))
-
-
-def _copy(copy: InterTaskMapping | Mapping[str, Any]) -> InterTaskMapping:
-    if isinstance(copy, InterTaskMapping):
-        return copy
-    if isinstance(copy, Mapping) and {"state", "action"} <= set(copy) <= {"state", "action", "sign"}:
-        return InterTaskMapping(**copy)
-    raise ValueError(
-        f"each of the copies must be an InterTaskMapping or a dict of state, action and (optional) sign, got {copy!r}"
-    )
 
 
 register_writer(FactoredMapping, lambda mapping: ("FactoredMapping", {"copies": list(mapping.copies)}))

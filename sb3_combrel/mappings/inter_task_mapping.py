@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import index as as_index
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,15 @@ UNMAPPED = -1
 """Represents None in integer arrays of state mappings."""
 
 _MAX_INDEX = 2**31 - 1
+
+
+class TaskSizes(TypedDict):
+    """Numbers of variables and actions of the two tasks."""
+
+    n_source_variables: int
+    n_target_variables: int
+    n_source_actions: int
+    n_target_actions: int
 
 
 class MappingNames(NamedTuple):
@@ -96,9 +105,6 @@ class InterTaskMapping:
         return any(has_names(entries) for entries in (self.state, self.action, self.sign or ()))
 
     def _check_numbers(self) -> None:
-        """
-        :raises ValueError: if there are names that have not been replaced by numbers yet
-        """
         if self.has_names:
             raise ValueError(
                 f"{self!r} has names, which stand for numbers only when both tasks are known: give it to a transfer method, "
@@ -138,9 +144,7 @@ class InterTaskMapping:
         """
         Express target states in the coordinates of the source task.
 
-        Where several target variables map to one source variable, the source coordinate is their mean, the point with
-        the smallest squared distance to all of them. A source variable that no target variable maps to is NaN: the
-        mapping does not determine it.
+        A source variable that several target variables map to is their mean; one that none maps to is NaN.
 
         :param target_units: unit coordinates, shape (..., n_target_variables)
         :param n_source_variables: number of variables of the source task
@@ -161,14 +165,11 @@ class InterTaskMapping:
 
     def source_to_target(self, source_units: ArrayLike, target_state: ArrayLike) -> Floats:
         """
-        Express source states in the coordinates of the target task.
-
-        Both the start and the outcome of a source instance are translated by this function with the same
-        ``target_state``: unmapped variables are then equal in both, so the instance predicts no change for them.
+        Express source states in the coordinates of the target task; start and outcome with the same ``target_state``.
 
         :param source_units: unit coordinates, shape (..., n_source_variables)
-        :param target_state: unit coordinates of the current target state, which unmapped variables keep;
-            shape (n_target_variables,) or any that broadcasts with the source states
+        :param target_state: unit coordinates of the current target state, which unmapped variables keep; shape
+            (n_target_variables,) or any that broadcasts with the source states
         :return: unit coordinates, shape (..., n_target_variables)
         :raises ValueError: if a shape does not fit
         """
@@ -178,10 +179,9 @@ class InterTaskMapping:
 
     def displacement_to_target(self, source_displacements: ArrayLike) -> Floats:
         """
-        Express changes of the source state (s'_j - s_j of Eq. 2) as changes of the target state.
+        Express changes of the source state (s'_j - s_j of Eq. 2) as changes of the target state, 0 for unmapped variables.
 
         :param source_displacements: differences of unit coordinates, shape (..., n_source_variables)
-        :return: differences of unit coordinates, shape (..., n_target_variables), 0 for unmapped variables
         :raises ValueError: if the shape does not fit
         """
         source = self._source_columns("source_displacements", source_displacements)
@@ -204,10 +204,8 @@ class InterTaskMapping:
         :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
         """
         self._check_numbers()
-        _check_length("state", self.state, n_target_variables, "variables")
-        _check_length("action", self.action, n_target_actions, "actions")
-        _check_range("state", self.state, n_source_variables, "variables")
-        _check_range("action", self.action, n_source_actions, "actions")
+        _check_sizes("state", self.state, n_target_variables, n_source_variables, "variables")
+        _check_sizes("action", self.action, n_target_actions, n_source_actions, "actions")
 
     def with_names(
         self,
@@ -217,12 +215,8 @@ class InterTaskMapping:
         target_actions: Iterable[str],
     ) -> InterTaskMapping:
         """
-        The same mapping with names for ``repr``; entries that were given by name are replaced by their numbers.
+        The same mapping with the two tasks' names for ``repr``; entries that were given by name become their numbers.
 
-        :param source_variables: names of the source task's variables
-        :param target_variables: names of the target task's variables
-        :param source_actions: names of the source task's actions
-        :param target_actions: names of the target task's actions
         :raises ValueError: if there are fewer names than the mapping uses, or it has a name that is none of these
         """
         names = MappingNames(tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions))
@@ -303,9 +297,8 @@ def _signs(sign: Sequence[int] | None, state: tuple[int | None, ...]) -> tuple[i
 
 def _checked_names(names: MappingNames, state: tuple[int | None, ...], action: tuple[int, ...]) -> MappingNames:
     named = MappingNames(*(tuple(str(name) for name in group) for group in names))
-    needed = MappingNames._fields
     used = (max(i for i in state if i is not None) + 1, len(state), max(action) + 1, len(action))
-    for kind, group, min_names in zip(needed, named, used, strict=True):
+    for kind, group, min_names in zip(MappingNames._fields, named, used, strict=True):
         exact = kind.startswith("target")
         if (exact and len(group) != min_names) or len(group) < min_names:
             raise ValueError(f"{kind} must hold {'' if exact else 'at least '}{min_names} names, got {group}")
@@ -319,15 +312,12 @@ def _columns(name: str, values: ArrayLike, n_columns: int) -> Floats:
     return array
 
 
-def _check_length(name: str, entries: Sequence[int | None], n_target: int, kind: str) -> None:
+def _check_sizes(name: str, entries: Sequence[int | None], n_target: int, n_source: int, kind: str) -> None:
     if len(entries) != n_target:
         raise ValueError(
             f"{name} must have {n_target} entries, one for each of the target task's {kind}, "
             f"got {len(entries)}: {name}={tuple(entries)}"
         )
-
-
-def _check_range(name: str, entries: Sequence[int | None], n_source: int, kind: str) -> None:
     largest = max(entry for entry in entries if entry is not None)
     if largest >= n_source:
         raise ValueError(
@@ -337,15 +327,7 @@ def _check_range(name: str, entries: Sequence[int | None], n_source: int, kind: 
 
 
 def index_table(name: str, values: ArrayLike, shape: str) -> Ints:
-    """
-    A table of indices as an array of its own.
-
-    :param name: name of the argument
-    :param values: its value
-    :param shape: the shape that is right, in words
-    :return: int64, two-dimensional, not empty
-    :raises ValueError: if it is not such a table of integers
-    """
+    """A table of indices as an array of its own, two-dimensional and not empty; ``shape`` says in words what is right."""
     try:
         array = np.array(values)
     except (TypeError, ValueError) as error:
@@ -357,12 +339,19 @@ def index_table(name: str, values: ArrayLike, shape: str) -> Ints:
     return array.astype(np.int64)
 
 
-def _read_mapping(state: list[int | None], action: list[int], sign: list[int] | None = None) -> InterTaskMapping:
-    return InterTaskMapping(state, action, sign)  # type: ignore[arg-type]
+def as_mapping(mapping: InterTaskMapping | Mapping[str, Any], what: str) -> InterTaskMapping:
+    """A mapping that may be given as a dict of its arguments, as in a YAML file; ``what`` it is one of, for the message."""
+    if isinstance(mapping, InterTaskMapping):
+        return mapping
+    if isinstance(mapping, Mapping) and {"state", "action"} <= set(mapping) <= {"state", "action", "sign"}:
+        return InterTaskMapping(**mapping)
+    raise ValueError(
+        f"each of the {what} must be an InterTaskMapping or a dict of state, action and (optional) sign, got {mapping!r}"
+    )
 
 
 register_writer(
     InterTaskMapping,
     lambda mapping: ("InterTaskMapping", {"state": mapping.state, "action": mapping.action, "sign": mapping.sign}),
 )
-register_reader("InterTaskMapping", _read_mapping)
+register_reader("InterTaskMapping", InterTaskMapping)

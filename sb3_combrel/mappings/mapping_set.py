@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from operator import index as as_index
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +18,15 @@ from sb3_combrel.mappings.action_mappings import (
     ListedActionMappings,
     paper_icub_actions,
 )
-from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Floats, InterTaskMapping, Ints, MappingNames, index_table
-from sb3_combrel.mappings.mapping_lists import distinct_parts
+from sb3_combrel.mappings.inter_task_mapping import (
+    UNMAPPED,
+    Floats,
+    InterTaskMapping,
+    Ints,
+    MappingNames,
+    TaskSizes,
+    index_table,
+)
 from sb3_combrel.mappings.members import AllPairs, Candidates, ListedPairs
 from sb3_combrel.mappings.state_mappings import TWO_VARIABLES_ON_FOUR, state_mappings_using_sources, with_mirrored
 
@@ -96,10 +103,7 @@ class MappingSet:
         If the source task has more variables than the target task, each target variable gets a source variable of its
         own instead. All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 12 x 243.
 
-        :param n_source_variables: number of variables of the source task
-        :param n_target_variables: number of variables of the target task
-        :param n_source_actions: number of actions of the source task
-        :param n_target_actions: number of actions of the target task
+        :param n_source_variables: number of the source's state variables, and so on
         :param signs: also include every state mapping with any of its mapped variables mirrored
         :raises ValueError: if a number is below 1 or astronomically large, or if there are too many state mappings
         """
@@ -119,10 +123,8 @@ class MappingSet:
         """
         Every target variable is mapped and every source variable is used at least once (as many as there is room for).
 
-        All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 14 x 243. The translated instances
-        lie on diagonals of the target's state space and help less than injective ones.
-
-        Parameters and errors: see :meth:`injective`.
+        All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 14 x 243. The translated instances lie on
+        diagonals of the target's state space. Parameters and errors: see :meth:`injective`.
         """
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=False, allow_none=False)
         return cls._of(rows, AllActionMappings(n_source_actions, n_target_actions), signs)
@@ -141,9 +143,7 @@ class MappingSet:
         Every source variable is used at least once (as many as there is room for), target variables may be unmapped.
 
         It contains the injective and the surjective set. All action mappings are included. From 2 to 4 variables and 3
-        to 5 actions: 50 x 243.
-
-        Parameters and errors: see :meth:`injective`.
+        to 5 actions: 50 x 243. Parameters and errors: see :meth:`injective`.
         """
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=False, allow_none=True)
         return cls._of(rows, AllActionMappings(n_source_actions, n_target_actions), signs)
@@ -161,9 +161,7 @@ class MappingSet:
         """
         The injective state mappings with those action mappings only that use the source actions as equally as possible.
 
-        From 2 to 4 variables and 3 to 5 actions: 12 x 90.
-
-        Parameters and errors: see :meth:`injective`.
+        From 2 to 4 variables and 3 to 5 actions: 12 x 90. Parameters and errors: see :meth:`injective`.
         """
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=True, allow_none=True)
         return cls._of(rows, BalancedActionMappings(n_source_actions, n_target_actions), signs)
@@ -173,10 +171,9 @@ class MappingSet:
         """
         The factors that the paper names for Mountain Car 2D -> 4D (footnote 6): 4! = 24 state, 90 action mappings.
 
-        Each state mapping leaves two of the four target variables unmapped: 24 is the number of permutations of
-        (x, v, None, None); they come in pairs of equal mappings, so 12 differ, those of :meth:`injective`. 90 is the
-        number of action mappings that use the three source actions 2, 2 and 1 times. The product has 2160 members, 1080
-        of which differ. The paper's "1960" (in Table 5's discussion "1195") pairs follow from no such count.
+        Each state mapping is a permutation of (x, v, None, None) and leaves two target variables unmapped; they come in pairs
+        of equal ones, so 12 differ, those of :meth:`injective`. The action mappings use the source actions 2, 2 and 1 times.
+        Of the 2160 members 1080 differ; the paper's "1960" (in Table 5's discussion "1195") follow from no such count.
         """
         return cls(TWO_VARIABLES_ON_FOUR, BalancedActionMappings(n_source_actions=3, n_target_actions=5))
 
@@ -185,11 +182,10 @@ class MappingSet:
         """
         The factors of the iCub experiment (Section 5.2), torso -> arm: 24 state mappings x 48 action mappings = 1152.
 
-        The 24 are the permutations of (joint 1, joint 2, None, None) on the four arm joints, 12 of which differ, as in
-        :meth:`paper_mountain_car`: two arm joints are unmapped. The 48 are the 6 ways to give each source joint two of the
-        four target joints times the 2^3 relative directions: "T1-" always maps to the "+" of its source joint, as in all
-        rows of Table 4 ("S1+"), and each other target joint moves with or against it. Action 2j moves joint j in the
-        negative direction, action 2j + 1 in the positive direction, on both sides. The signs of the state mappings are +1.
+        The state mappings are those of :meth:`paper_mountain_car`, with two arm joints unmapped. The 48 are the 6 ways to give
+        each source joint two of the four target joints times the 2^3 relative directions: "T1-" always maps to the "+" of its
+        source joint, as in all rows of Table 4 ("S1+"), and each other target joint moves with or against it. Action 2j moves
+        joint j in the negative direction, action 2j + 1 in the positive direction, on both sides.
         """
         return cls(TWO_VARIABLES_ON_FOUR, paper_icub_actions())
 
@@ -202,9 +198,25 @@ class MappingSet:
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
         """
         listed = list(mappings)
-        parts = distinct_parts(listed)
-        chosen = cls(parts.state_mappings, parts.action_mappings, parts.signs, pairs=parts.pairs)
-        chosen.names = listed[0].names
+        if not listed:
+            raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
+        first = listed[0]
+        # Dictionaries keep the order of first appearance.
+        states: dict[tuple[tuple[int, ...], tuple[int, ...]], int] = {}
+        actions: dict[tuple[int, ...], int] = {}
+        pairs = []
+        for mapping in listed:
+            if not isinstance(mapping, InterTaskMapping):
+                raise ValueError(f"mappings must be InterTaskMapping objects, got {mapping!r}")
+            if (mapping.n_target_variables, mapping.n_target_actions) != (first.n_target_variables, first.n_target_actions):
+                raise ValueError(
+                    f"mappings must all have the same numbers of target variables and actions, got {first!r} and {mapping!r}"
+                )
+            state = tuple(mapping.state_index.tolist()), tuple(mapping.state_sign.astype(int).tolist())
+            pairs.append((states.setdefault(state, len(states)), actions.setdefault(mapping.action, len(actions))))
+        state_mappings, signs = zip(*states, strict=True)
+        chosen = cls(state_mappings, list(actions), signs, pairs=pairs)
+        chosen.names = first.names
         return chosen
 
     @classmethod
@@ -224,12 +236,11 @@ class MappingSet:
         :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``
         :raises ValueError: for another name; for the other parameters and errors see :meth:`injective`
         """
-        constructors = {"injective": cls.injective, "surjective": cls.surjective, "all": cls.all, "balanced": cls.balanced}
         unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
-        if unsigned not in constructors:
+        if unsigned not in _SETS:
             raise _unknown_set(name)
         numbers = (n_source_variables, n_target_variables, n_source_actions, n_target_actions)
-        return constructors[unsigned](*numbers, signs=signs or unsigned != name)
+        return getattr(cls, unsigned)(*numbers, signs=signs or unsigned != name)
 
     @classmethod
     def _of(cls, state_mappings: Ints, actions: ActionMappings, signs: bool) -> MappingSet:
@@ -278,13 +289,7 @@ class MappingSet:
         return InterTaskMapping(state, self.actions[action_index], sign, names=self.names)
 
     def source_actions_for(self, action: int) -> Ints:
-        """
-        The source actions that a target action is mapped to by some mapping of the set.
-
-        :param action: target action
-        :return: source actions, ascending
-        :raises ValueError: if there is no such target action
-        """
+        """The source actions, ascending, that a target action is mapped to; ``ValueError`` if there is no such action."""
         self._check_action(action)
         return self._members.source_actions_for(action)
 
@@ -295,7 +300,6 @@ class MappingSet:
         All mappings with the same pair translate the same source instances in the same way for this target action, so
         compliance (Eq. 5) need be computed for these pairs only. Of state mappings that are equal only the first is listed.
 
-        :param action: target action
         :return: the pairs, ordered by state mapping and source action
         :raises ValueError: if there is no such target action
         """
@@ -307,8 +311,6 @@ class MappingSet:
         Number of mappings of the set with this state mapping (or an equal one) that map ``action`` to ``source_action``.
 
         :param state_index: row of ``state_mappings``
-        :param action: target action
-        :param source_action: source action
         :raises ValueError: if there is no such target action
         """
         self._check_action(action)
@@ -319,35 +321,27 @@ class MappingSet:
         The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.
 
         :param state_index: row of ``state_mappings``
-        :param action: target action
-        :param source_action: source action
         :return: its number, to be used as ``mapping_set[number]``
         :raises ValueError: if there is none
         """
         self._check_action(action)
         return self._members.find(state_index, action, source_action)
 
-    def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
-        """
-        Check every mapping of the set against the spaces of the two tasks, without building them.
-
-        :raises ValueError: if a length or an index does not fit; the message names what would be right
-        """
+    def check(self, **sizes: Unpack[TaskSizes]) -> None:
+        """Check every mapping against the spaces of the two tasks, see :meth:`InterTaskMapping.check`."""
         source_actions = [self._members.source_actions_for(action) for action in range(self.n_target_actions)]
-        largest = max(int(actions.max()) for actions in source_actions)
-        right_lengths = (n_target_variables, n_target_actions) == (self.state_mappings.shape[1], self.n_target_actions)
-        if right_lengths and self.state_mappings.max() < n_source_variables and largest < n_source_actions:
+        lengths = self.state_mappings.shape[1], self.n_target_actions
+        if (
+            lengths == (sizes["n_target_variables"], sizes["n_target_actions"])
+            and self.state_mappings.max() < sizes["n_source_variables"]
+            and max(int(actions.max()) for actions in source_actions) < sizes["n_source_actions"]
+        ):
             return
         # Members with the largest index of a source variable or action: one of them fails its own check.
         for action in range(self.n_target_actions):
             states, actions = self.candidates(action)
             for worst in (self.state_mappings[states].max(axis=1).argmax(), actions.argmax()):
-                self[self.find(int(states[worst]), action, int(actions[worst]))].check(
-                    n_source_variables=n_source_variables,
-                    n_target_variables=n_target_variables,
-                    n_source_actions=n_source_actions,
-                    n_target_actions=n_target_actions,
-                )
+                self[self.find(int(states[worst]), action, int(actions[worst]))].check(**sizes)
 
     def with_names(
         self,
@@ -359,9 +353,8 @@ class MappingSet:
         """The same set, whose members carry names for ``repr``; see :meth:`InterTaskMapping.with_names`."""
         named = object.__new__(type(self))
         named.__dict__.update(self.__dict__)
-        named.names = MappingNames(
-            tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions)
-        )
+        groups = source_variables, target_variables, source_actions, target_actions
+        named.names = MappingNames(*(tuple(group) for group in groups))
         return named
 
     def __repr__(self) -> str:
@@ -380,9 +373,7 @@ _FACTORED_SETS = ("factored", "signed_factored")
 
 
 def check_set_name(name: str) -> None:
-    """
-    :raises ValueError: if there is no set of that name
-    """
+    """Raise ``ValueError`` if there is no set of that name."""
     if name.removeprefix("signed_") not in _SETS and name not in (*_OTHER_SETS, *_FACTORED_SETS):
         raise _unknown_set(name)
 
@@ -401,16 +392,9 @@ def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:
     return "MappingSet", factors
 
 
-def _read(state_mappings: ArrayLike, signs: ArrayLike, actions: ActionMappings) -> MappingSet:
-    if not isinstance(actions, ActionMappings):
-        raise ValueError(f"actions must be action mappings, got {actions!r}")
-    return MappingSet(state_mappings, actions, signs)
-
-
-def _read_list(mappings: Iterable[dict[str, Any]]) -> MappingSet:
-    return MappingSet.from_list(InterTaskMapping(each["state"], each["action"], each["sign"]) for each in mappings)
-
-
 register_writer(MappingSet, _write)
-register_reader("MappingSet", _read)
-register_reader("ListedMappingSet", _read_list)
+register_reader("MappingSet", lambda state_mappings, signs, actions: MappingSet(state_mappings, actions, signs))
+register_reader(
+    "ListedMappingSet",
+    lambda mappings: MappingSet.from_list(InterTaskMapping(each["state"], each["action"], each["sign"]) for each in mappings),
+)

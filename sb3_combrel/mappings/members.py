@@ -49,7 +49,6 @@ class AllPairs:
             )
 
     def pair(self, number: int) -> tuple[int, int]:
-        """State and action mapping of a member."""
         return divmod(number, self.actions.n_mappings)
 
     def source_actions_for(self, action: int) -> Ints:
@@ -72,8 +71,6 @@ class ListedPairs:
     """
     The given pairs only; the look-ups are those of :class:`MappingSet`.
 
-    :param first_equal: for each state mapping the first row that is equal to it, shape (n_state_mappings,)
-    :param actions: the action mappings
     :param pairs: row of a state mapping and number of an action mapping for each member, shape (n_mappings, 2)
     :raises ValueError: if ``pairs`` is something else
     """
@@ -95,7 +92,6 @@ class ListedPairs:
         self._first_equal = first_equal
 
     def pair(self, number: int) -> tuple[int, int]:
-        """State and action mapping of a member."""
         state_index, action_index = self.pairs[number].tolist()
         return state_index, action_index
 

@@ -12,12 +12,7 @@ Entries = Sequence[int | str | None] | Mapping[Any, Any]
 
 
 def as_entries(argument: str, values: Any) -> tuple[Any, ...]:
-    """
-    Store what a user gave so that it can be compared and hashed: a dict as pairs of key and value.
-
-    :param argument: name of the argument
-    :raises ValueError: if it is neither a sequence nor a dict
-    """
+    """What a user gave so that it can be compared and hashed: a dict as pairs of key and value."""
     if isinstance(values, Mapping):
         return tuple((key, value) for key, value in values.items())
     if isinstance(values, str) or not isinstance(values, Sequence | np.ndarray):
@@ -26,7 +21,7 @@ def as_entries(argument: str, values: Any) -> tuple[Any, ...]:
             f"got {values!r}"
         )
     # Pairs that were written to a file come back as lists.
-    return tuple(tuple(each) if _is_pair(each) else each for each in values)
+    return tuple(tuple(each) if isinstance(each, list | tuple) and len(each) == 2 else each for each in values)
 
 
 def has_names(entries: Sequence[Any]) -> bool:
@@ -71,18 +66,10 @@ def _number(argument: str, entry: Any, names: Sequence[str], task: str) -> Any:
     if list(names).count(entry) != 1:
         raise ValueError(
             f"{argument} must hold names of the {task}'s {_kind(argument)}, {', '.join(names)}, got {entry!r}"
-            + (
-                ", which is the name of several"
-                if entry in names
-                else "; a task that names none has s0, s1, ... and a0, a1, ..."
-            )
+            + (", which is the name of several" if entry in names else "; a task that names none has s0, ... and a0, ...")
         )
     return list(names).index(entry)
 
 
 def _kind(argument: str) -> str:
     return "actions" if argument == "action" else "variables"
-
-
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, list | tuple) and len(value) == 2

@@ -25,8 +25,6 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
     """
     Every state mapping that uses as many different source variables as there is room for.
 
-    :param n_source: number of source variables
-    :param n_target: number of target variables
     :param once: whether a source variable is used at most once
     :param allow_none: whether target variables may be left unmapped
     :return: one mapping a row in lexicographic order (None first), shape (n, n_target), -1 for None
@@ -51,8 +49,6 @@ def copies_of_source(n_source: int, n_target: int) -> Ints:
     """
     Every way to make a copy of the source, or of some of its variables, of different target variables.
 
-    :param n_source: number of source variables
-    :param n_target: number of target variables
     :return: source variable of each target variable, -1 for those that are not in the copy; one copy a row, those with more
         variables first, shape (n, n_target)
     :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` copies

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.sources.transitions import TransitionLog, Transitions, count_actions
+from sb3_combrel.sources.transitions import Transitions, count_actions
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -23,20 +23,28 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     """All transitions of a Minari dataset; see :meth:`SourceInstances.from_minari`."""
     minari = _import_minari()
     data = minari.load_dataset(dataset) if isinstance(dataset, str) else dataset
-    action_space = data.action_space
     scaling = StateScaling.from_space(data.observation_space, bounds)
-    n_actions = count_actions(action_space)
-    log = TransitionLog(giver=f"the dataset {data.id}")
-    for episode in data.iterate_episodes():
-        states = np.asarray(episode.observations)
-        for i, action in enumerate(episode.actions):
-            log.add(
-                states[i], int(action) - int(action_space.start), episode.rewards[i], states[i + 1], episode.terminations[i]
-            )
+    n_actions = count_actions(data.action_space)
+    episodes = list(data.iterate_episodes())
+    actions = np.concatenate([np.asarray(episode.actions) for episode in episodes])
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     env_spec = data.env_spec
     unnamed = {"env": None if env_spec is None else env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
-    return log.transitions(scaling, n_actions, kept.get("names", {}), kept.get("origin", unnamed))
+    names = kept.get("names", {})
+    return Transitions(
+        np.concatenate([episode.observations[:-1] for episode in episodes]),
+        actions - int(data.action_space.start),
+        np.concatenate([episode.rewards for episode in episodes]),
+        np.concatenate([episode.observations[1:] for episode in episodes]),
+        np.concatenate([episode.terminations for episode in episodes]),
+        scaling.low,
+        scaling.high,
+        n_actions,
+        tuple(names.get("state_names", ())),
+        tuple(names.get("action_names", ())),
+        kept.get("origin", unnamed),
+        tuple(names.get("periodic", ())),
+    )
 
 
 def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> MinariDataset:
@@ -76,7 +84,8 @@ def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> Mina
 
 def _import_minari() -> ModuleType:
     try:
-        import h5py  # noqa: F401  Minari's usual file format; without it the error would come from deep inside
+        # Minari's usual file format; without it the error would come from deep inside.
+        import h5py  # noqa: F401
         import minari
     except ImportError as error:
         raise ImportError('Minari datasets need Minari with HDF5: pip install "sb3-combrel[minari]"') from error

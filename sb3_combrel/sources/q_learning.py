@@ -10,17 +10,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_combrel.common.checks import as_count, check_count, check_finite, count_text
+from sb3_combrel.common.checks import check_count, check_finite, count_text
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.sources.tasks import describe_origin, make_env, task_names
 from sb3_combrel.sources.transitions import (
-    MAX_STEPS,
-    WHY_MAX_STEPS,
     TransitionLog,
     Transitions,
+    as_transition_count,
     check_observation,
     check_reward,
     count_actions,
+    describe_origin,
+    make_env,
+    task_names,
 )
 
 Transition = Callable[[NDArray[Any], int, float, NDArray[Any], bool], object]
@@ -40,8 +41,8 @@ class TileCoding:
     """
 
     def __init__(self, n_variables: int, n_tilings: int = 8, n_tiles: int = 8) -> None:
-        for name, number in (("n_tilings", n_tilings), ("n_tiles", n_tiles)):
-            check_count(name, number, max=_MAX_TILES)
+        check_count("n_tilings", n_tilings, max=_MAX_TILES)
+        check_count("n_tiles", n_tiles, max=_MAX_TILES)
         # One more tile along each variable than asked for, as the grids are shifted.
         self.n_features = n_tilings * (n_tiles + 1) ** n_variables
         if self.n_features > _MAX_TILES:
@@ -58,10 +59,9 @@ class TileCoding:
 
     def tiles(self, unit_state: NDArray[np.float64]) -> NDArray[np.int64]:
         """
-        The tiles in which a state lies.
+        The tiles in which a state lies, as feature numbers, one for each grid, shape (n_tilings,).
 
         :param unit_state: unit coordinates, shape (n_variables,); what is outside the cube counts as its border
-        :return: feature numbers, one for each grid, shape (n_tilings,)
         """
         inside = np.minimum(np.maximum(unit_state, 0.0), 1.0) * self.n_tiles
         return self._first + (inside + self._offsets).astype(np.int64) @ self._strides
@@ -100,8 +100,8 @@ class QLearning:
         bounds: Bounds | None = None,
         seed: int | None = None,
     ) -> None:
-        fractions = (("learning_rate", learning_rate), ("gamma", gamma), ("trace_decay", trace_decay), ("epsilon", epsilon))
-        for name, value in fractions:
+        fractions = {"learning_rate": learning_rate, "gamma": gamma, "trace_decay": trace_decay, "epsilon": epsilon}
+        for name, value in fractions.items():
             check_finite(name, value)
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be between 0 and 1, got {value}")
@@ -131,7 +131,7 @@ class QLearning:
         :raises ValueError: if ``total_timesteps`` is not a whole number of at least 1, or if the environment returns an
             observation or a reward that is not finite
         """
-        total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_STEPS)
+        total_timesteps = as_transition_count("total_timesteps", total_timesteps)
         steps, seed = 0, self.seed if not self.episode_lengths else None
         while steps < total_timesteps:
             steps += self._episode(total_timesteps - steps, callback, seed)
@@ -187,10 +187,7 @@ class QLearning:
         Actions in SB3's manner: greedy ones, or with ``deterministic=False`` a random one with probability ``epsilon``.
 
         :param observation: raw units, shape (n_variables,) or (n_states, n_variables)
-        :param state: ignored, the learner is not recurrent
-        :param episode_start: ignored
-        :param deterministic: whether to take greedy actions only
-        :return: the action or actions, and ``state``
+        :return: the action or actions, and ``state``, which is ignored like ``episode_start``
         """
         states = np.asarray(observation)
         actions = np.array([self._argmax(self._values(self._tiles(each))) for each in np.atleast_2d(states)])
@@ -211,26 +208,17 @@ class QLearning:
         return int(best[0] if len(best) == 1 else self._rng.choice(best))
 
 
-def learn_transitions(
-    env: str | gym.Env[Any, Any], seed: int | None, total_timesteps: int, q_learning: dict[str, Any]
+def learn_q_learning(
+    env: str | gym.Env[Any, Any], seed: int | None, total_timesteps: int, learner: dict[str, Any]
 ) -> Transitions:
-    """
-    All transitions of a task while Q-learning learns it.
-
-    :param env: a task, or its id
-    :param seed: seed of the learner and its environment
-    :param total_timesteps: steps of learning
-    :param q_learning: further arguments of :class:`QLearning`
-    :raises ValueError: if an argument is out of range, or if the environment returns something that is not finite
-    """
-    total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
-    learner = QLearning(env, seed=seed, **q_learning)
+    """All transitions while Q-learning learns a task; for the parameters see :meth:`SourceInstances.from_q_learning`."""
+    made = QLearning(env, seed=seed, **learner)
     try:
         log = TransitionLog()
-        learner.learn(total_timesteps, log.add)
-        origin = describe_origin(learner.env, type(learner).__name__, seed)
+        made.learn(total_timesteps, log.add)
+        origin = describe_origin(made.env, type(made).__name__, seed)
         origin |= {"recorded_while_learning": True, "total_timesteps": total_timesteps}
-        return log.transitions(learner.scaling, learner.n_actions, task_names(learner.env), origin)
+        return log.transitions(made.scaling, made.n_actions, task_names(made.env), origin)
     finally:
         if isinstance(env, str):
-            learner.env.close()
+            made.env.close()

@@ -10,44 +10,34 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_combrel.common.checks import as_count
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.sources.tasks import describe_origin, make_env, task_names
 from sb3_combrel.sources.transitions import (
-    MAX_STEPS,
-    WHY_MAX_STEPS,
     TransitionLog,
     Transitions,
+    as_transition_count,
     check_observation,
     count_actions,
+    describe_origin,
+    make_env,
+    task_names,
 )
 
 Behaviour = PolicyPredictor | Callable[[NDArray[Any]], int]
 """What can be recorded: anything with SB3's ``predict``, or a function from one state to an action."""
 
+_fitted_rmax: list[Callable[..., BaseAlgorithm]] = []
+
 
 class TransitionRecorder(BaseCallback):
-    """
-    Callback that records every transition while an SB3 algorithm learns; read them from :meth:`transitions`.
-
-    Under ``VecNormalize`` the original states and rewards are recorded.
-
-    :param max_instances: how many to keep at most, a uniform random sample of all; None for all
-    :param bounds: ``(low, high)`` of the states if the observation space has none
-    :param seed: seed of the sample
-    :param verbose: SB3's verbosity
-    """
+    """See :class:`~sb3_combrel.sources.source_recorder.SourceRecorder`; gives :meth:`transitions`."""
 
     def __init__(
-        self,
-        max_instances: int | None = None,
-        bounds: Bounds | None = None,
-        seed: int | None = None,
-        verbose: int = 0,
+        self, max_instances: int | None = None, bounds: Bounds | None = None, seed: int | None = None, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
         self.bounds = bounds
@@ -61,9 +51,7 @@ class TransitionRecorder(BaseCallback):
         self._n_actions = count_actions(self.training_env.action_space)
         self._names = task_names(self.training_env)
         self._origin = describe_origin(self.training_env, type(self.model).__name__, self.model.seed)
-        normalize = unwrap_vec_normalize(self.training_env)
-        last = self.model._last_obs if normalize is None else normalize.get_original_obs()  # type: ignore[attr-defined]
-        self._states = np.array(last)
+        self._states = _raw_states(self.training_env, self.model._last_obs)  # type: ignore[attr-defined]
 
     def _on_step(self) -> bool:
         missing = {"actions", "new_obs", "rewards", "dones", "infos"} - set(self.locals)
@@ -77,52 +65,77 @@ class TransitionRecorder(BaseCallback):
         return True
 
     def transitions(self) -> Transitions:
-        """
-        What has been recorded so far.
-
-        :raises ValueError: if nothing has been
-        """
+        """What has been recorded so far; ``ValueError`` if nothing has been."""
         if self._states is None:
             raise ValueError("nothing has been recorded yet: pass the recorder to learn(callback=...) first")
         origin = {**self._origin, "recorded_while_learning": True, "n_seen": self.log.n_seen}
         return self.log.transitions(self._scaling, self._n_actions, self._names, origin)
 
 
+def register_fitted_rmax(fitted_rmax: Callable[..., BaseAlgorithm]) -> None:
+    """Hand in the learner, defined above this package, that :func:`learn_fitted_rmax` uses; ``import sb3_combrel`` does."""
+    _fitted_rmax[:] = [fitted_rmax]
+
+
+def learn_fitted_rmax(env: str | gym.Env[Any, Any], seed: int | None, n_episodes: int, learner: dict[str, Any]) -> Transitions:
+    """All transitions while Fitted R-Max learns a task; for the parameters see :meth:`SourceInstances.from_fitted_rmax`."""
+    n_episodes = as_transition_count("n_episodes", n_episodes)
+    if not _fitted_rmax:
+        raise RuntimeError("Fitted R-Max is not registered as a learner of source tasks: import sb3_combrel first")
+    task = make_env(env)
+    try:
+        model: Any = _fitted_rmax[0](task, seed=seed, **learner)
+        recorder = TransitionRecorder(bounds=learner.get("bounds"), seed=seed)
+        # Episodes end the learning, not steps: the task may end them at any length.
+        model.learn(10**9, callback=[recorder, StopTrainingOnMaxEpisodes(n_episodes)])
+        # The learner's, which need not be the environment's.
+        return recorder.transitions()._replace(periodic=model.policy.agent.periodic)
+    finally:
+        if isinstance(env, str):
+            task.close()
+
+
 def record(
     model: Behaviour | None,
     env: str | gym.Env[Any, Any] | VecEnv,
-    n_instances: int = 1000,
-    seed: int | None = None,
-    *,
-    deterministic: bool = False,
-    bounds: Bounds | None = None,
+    n_instances: int,
+    seed: int | None,
+    deterministic: bool,
+    bounds: Bounds | None,
 ) -> Transitions:
     """Let a behaviour act in a task; for the parameters see :meth:`SourceInstances.record`."""
-    n_instances = as_count("n_instances", n_instances, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
-    venv, ours = _vectorised(env)
+    n_instances = as_transition_count("n_instances", n_instances)
+    task = env if isinstance(env, VecEnv) else make_env(env)
+    venv = task if isinstance(task, VecEnv) else DummyVecEnv([lambda: task])
     try:
         scaling = StateScaling.from_space(venv.observation_space, bounds)
         n_actions = count_actions(venv.action_space)
         log = TransitionLog()
         act = _actor(model, venv, seed, deterministic)
-        normalize = unwrap_vec_normalize(venv)
         with _seeded(model, seed):
             if seed is not None:
                 venv.seed(seed)
-            seen = venv.reset()
-            states = np.array(seen if normalize is None else normalize.get_original_obs())
+            seen: Any = venv.reset()
+            states = _raw_states(venv, seen)
             check_observation(states, "at the reset")
             starts = np.ones(venv.num_envs, dtype=bool)
             while len(log) < n_instances:
                 actions = act(seen, states, starts)
                 step = venv.step(actions)
                 states = _log_step(log, venv, states, actions, step, n_instances)
-                seen, _, starts, _ = step  # type: ignore[assignment]
-        origin = describe_origin(venv, _recorder_name(model), seed)
+                seen, _, starts, _ = step
+        recorder = "random actions" if model is None else getattr(model, "__name__", type(model).__name__)
+        origin = describe_origin(venv, recorder, seed)
         return log.transitions(scaling, n_actions, task_names(venv), origin)
     finally:
-        if ours:
+        if isinstance(env, str):
             venv.close()
+
+
+def _raw_states(env: VecEnv, seen: Any) -> NDArray[Any]:
+    """The present states as they are under ``VecNormalize``, if there is one."""
+    normalize = unwrap_vec_normalize(env)
+    return np.array(seen if normalize is None else normalize.get_original_obs())
 
 
 def _log_step(
@@ -134,39 +147,27 @@ def _log_step(
     max_transitions: int | None = None,
 ) -> NDArray[Any]:
     """
-    Add one step of all environments.
+    Add one step of all environments, up to ``max_transitions`` in all, and return the raw states that it led to.
 
-    :param states: raw states in which the step began; ``actions``: what was done there
+    :param states: raw states in which the step began
     :param step: what ``env.step`` returned: states as a model sees them, rewards, dones, infos
-    :param max_transitions: up to so many in all
-    :return: the raw states in which the environments now are
     """
     seen, rewards, dones, infos = step
     normalize = unwrap_vec_normalize(env)
-    following = np.array(seen if normalize is None else normalize.get_original_obs())
+    following = _raw_states(env, seen)
     rewards = rewards if normalize is None else normalize.get_original_reward()
     start = int(env.action_space.start)  # type: ignore[attr-defined]
     for i, (done, info) in enumerate(zip(dones, infos, strict=True)):
         if max_transitions is not None and len(log) >= max_transitions:
             break
-        # After an episode `following` is the first state of the next one.
-        next_state = _last_state(info, normalize) if done else following[i]
+        next_state = following[i]
+        if done:
+            # `following` is already the first state of the next episode.
+            last = info["terminal_observation"]
+            next_state = np.array(last if normalize is None else normalize.unnormalize_obs(last))
         terminated = bool(done) and not info.get("TimeLimit.truncated", False)
         log.add(states[i], int(actions[i]) - start, rewards[i], next_state, terminated)
     return following
-
-
-def _last_state(info: Mapping[str, Any], normalize: VecNormalize | None) -> NDArray[Any]:
-    last = info["terminal_observation"]
-    return np.array(last if normalize is None else normalize.unnormalize_obs(last))
-
-
-def _vectorised(env: str | gym.Env[Any, Any] | VecEnv) -> tuple[VecEnv, bool]:
-    """The environment as a vectorised one, and whether it was made here and must be closed."""
-    if isinstance(env, VecEnv):
-        return env, False
-    made = make_env(env)
-    return DummyVecEnv([lambda: made]), isinstance(env, str)
 
 
 def _actor(
@@ -211,9 +212,3 @@ def _seeded(model: Behaviour | None, seed: int | None) -> Iterator[None]:
             yield
         finally:
             np.random.set_state(numpy_state)
-
-
-def _recorder_name(model: Behaviour | None) -> str:
-    if model is None:
-        return "random actions"
-    return type(model).__name__ if hasattr(model, "predict") else getattr(model, "__name__", type(model).__name__)

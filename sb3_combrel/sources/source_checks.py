@@ -1,4 +1,4 @@
-"""Checks of the fields of source instances; each returns an array of its own."""
+"""Checks of the fields of source instances; each returns an array of its own, or raises ``ValueError``."""
 
 from __future__ import annotations
 
@@ -7,19 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
 
-
-def finite_array(name: str, values: object, shape: tuple[int, ...]) -> Floats:
-    """
-    States or rewards.
-
-    :param name: name of the argument
-    :param values: its value, one row an instance
-    :param shape: the shape that is right
-    :return: float64
-    :raises ValueError: if it has another shape or is not finite
-    """
+def finite_array(name: str, values: object, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """States or rewards: finite numbers of a certain shape, one row an instance."""
     try:
         given = np.asarray(values)
         # NumPy would also convert text, dates and complex numbers.
@@ -37,15 +27,7 @@ def finite_array(name: str, values: object, shape: tuple[int, ...]) -> Floats:
 
 
 def action_array(actions: object, n: int, n_actions: int) -> NDArray[np.int64]:
-    """
-    Actions.
-
-    :param actions: one for each instance
-    :param n: number of instances
-    :param n_actions: number of actions of the task
-    :return: int64, shape (n,)
-    :raises ValueError: unless they are integers from 0 to ``n_actions - 1``
-    """
+    """Actions of ``n`` instances: integers from 0 to ``n_actions - 1``."""
     array = np.array(actions)
     if array.shape != (n,) or not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"actions must be integers of shape ({n},), got {array.dtype} of shape {array.shape}")
@@ -54,15 +36,8 @@ def action_array(actions: object, n: int, n_actions: int) -> NDArray[np.int64]:
     return array.astype(np.int64)
 
 
-def flag_array(terminated: object, n: int) -> NDArray[np.bool_]:
-    """
-    Flags of terminal states.
-
-    :param terminated: one for each instance
-    :param n: number of instances
-    :return: bool, shape (n,)
-    :raises ValueError: if they are something else
-    """
+def terminal_flags(terminated: object, n: int) -> NDArray[np.bool_]:
+    """Whether each of ``n`` instances is terminal: booleans."""
     array = np.array(terminated)
     if array.shape != (n,) or array.dtype != np.bool_:
         raise ValueError(f"terminated must be booleans of shape ({n},), got {array.dtype} of shape {array.shape}")
@@ -70,18 +45,7 @@ def flag_array(terminated: object, n: int) -> NDArray[np.bool_]:
 
 
 def checked_names(name: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
-    """
-    Names of variables or actions.
-
-    :param name: name of the argument
-    :param names: its value; empty for names by number
-    :param n: how many there must be
-    :param letter: first letter of names by number
-    :return: ``n`` names
-    :raises ValueError: if there is another number of them
-    """
-    if len(names) == 0:
-        return tuple(f"{letter}{i}" for i in range(n))
-    if len(names) != n:
+    """Names of ``n`` variables or actions; if none are given, the letter and a number."""
+    if len(names) not in (0, n):
         raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
-    return tuple(str(each) for each in names)
+    return tuple(map(str, names)) if len(names) else tuple(f"{letter}{i}" for i in range(n))

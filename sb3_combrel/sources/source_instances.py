@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import os
 from collections.abc import Mapping
@@ -16,14 +17,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_combrel.common.checks import as_count
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
-from sb3_combrel.common.serialisation import damage_text, register_reader, register_writer
-from sb3_combrel.sources import fitted_rmax_source, minari_datasets, q_learning, recording
-from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, flag_array
-from sb3_combrel.sources.source_file import ARRAY_NAMES, read_source, source_from_bytes, source_to_bytes, write_source
+from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.sources import minari_datasets, q_learning, recording
+from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
-from sb3_combrel.sources.transitions import MAX_STEPS, WHY_MAX_STEPS, Transitions, count_actions
+from sb3_combrel.sources.transitions import Transitions, as_transition_count, count_actions
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -33,6 +34,9 @@ Floats = NDArray[np.float64]
 
 # Each action has a name.
 _MAX_ACTIONS = 1_000_000
+_FORMAT, _VERSION = "sb3_combrel.SourceInstances", 1
+_ROW_ARRAYS = ("states", "actions", "rewards", "next_states", "terminated")
+_ARRAYS = (*_ROW_ARRAYS, "low", "high")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +91,7 @@ class SourceInstances:
             "actions": action_array(self.actions, n, self.n_actions),
             "rewards": finite_array("rewards", self.rewards, (n,)),
             "next_states": finite_array("next_states", self.next_states, (n, d)),
-            "terminated": flag_array(self.terminated, n),
+            "terminated": terminal_flags(self.terminated, n),
             "low": scaling.low,
             "high": scaling.high,
         }
@@ -98,6 +102,7 @@ class SourceInstances:
         object.__setattr__(self, "action_names", checked_names("action_names", self.action_names, self.n_actions, "a"))
         object.__setattr__(self, "periodic", periodic_flags(None if self.periodic == () else self.periodic, d))
         try:
+            # As a file of it would be read.
             object.__setattr__(self, "origin", json.loads(json.dumps(dict(self.origin))))
         except (TypeError, ValueError) as error:
             raise ValueError(f"origin must be a dict that JSON can hold, got {self.origin!r}") from error
@@ -116,8 +121,8 @@ class SourceInstances:
         """
         Let a behaviour act in the source task and record what happens, from a reset on, through as many episodes as needed.
 
-        Where the instances should cover more of the task than one behaviour visits, record more and take a
-        :meth:`subset`, or record with :class:`~sb3_combrel.sources.source_recorder.SourceRecorder` while a model learns.
+        To cover more of the task than one behaviour visits, record more and take a :meth:`subset`, or record with
+        :class:`~sb3_combrel.sources.source_recorder.SourceRecorder` while a model learns.
 
         :param model: an SB3 model or policy (anything with its ``predict``), a function from one state, raw units, shape
             (n_variables,), to an action, or None for random actions
@@ -128,12 +133,10 @@ class SourceInstances:
         :param seed: seed of the environment, the random actions and the model's own randomness; None for none
         :param deterministic: whether an SB3 model takes its deterministic actions
         :param bounds: ``(low, high)`` of the states if the observation space has none
-        :raises ValueError: if the spaces are not a Box of shape (n_variables,) and a Discrete, if the observation space is
-            unbounded and ``bounds`` is not given, if ``n_instances`` is not a whole number of at least 1, or if the
-            environment returns an observation or a reward that is not finite
+        :raises ValueError: if the spaces are not a Box of shape (n_variables,) with bounds and a Discrete, if ``n_instances``
+            is not a whole number of at least 1, or if the environment returns something that is not finite
         """
-        recorded = recording.record(model, env, n_instances, seed, deterministic=deterministic, bounds=bounds)
-        return cls(**recorded._asdict())
+        return cls(*recording.record(model, env, n_instances, seed, deterministic, bounds))
 
     @classmethod
     def from_q_learning(
@@ -156,13 +159,13 @@ class SourceInstances:
         :param method: how to choose the instances, see :meth:`subset`
         :param learner: further arguments of :class:`~sb3_combrel.sources.q_learning.QLearning`
         :raises ValueError: if the spaces do not fit, if ``n_instances`` exceeds ``total_timesteps``, if either is not a
-            whole number, or if the environment returns an observation or a reward that is not finite
+            whole number, or if the environment returns something that is not finite
         """
-        total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
+        total_timesteps = as_transition_count("total_timesteps", total_timesteps)
         n_instances = as_count("n_instances", n_instances, max=total_timesteps, why_max="total_timesteps")
         check_method(method)
-        learned = q_learning.learn_transitions(env, seed, total_timesteps, learner)
-        return cls(**learned._asdict()).subset(n_instances, method, seed)
+        learned = q_learning.learn_q_learning(env, seed, total_timesteps, learner)
+        return cls(*learned).subset(n_instances, method, seed)
 
     @classmethod
     def from_fitted_rmax(
@@ -186,12 +189,12 @@ class SourceInstances:
             those that cover most
         :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, such as ``max_value``
         :raises ValueError: if the spaces do not fit, if a number is not a whole number of at least 1, or if the
-            environment returns an observation or a reward that is not finite
+            environment returns something that is not finite
         """
-        n_instances = as_count("n_instances", n_instances, max=MAX_STEPS, why_max=WHY_MAX_STEPS)
+        n_instances = as_transition_count("n_instances", n_instances)
         check_method(method)
-        learned = fitted_rmax_source.learn_transitions(env, seed, n_episodes, learner)
-        return cls(**learned._asdict()).subset(n_instances, method, seed)
+        learned = recording.learn_fitted_rmax(env, seed, n_episodes, learner)
+        return cls(*learned).subset(n_instances, method, seed)
 
     @classmethod
     def from_minari(
@@ -210,12 +213,11 @@ class SourceInstances:
         :param seed: seed of the sample
         :param bounds: ``(low, high)`` of the states if the dataset's observation space has none
         :raises ImportError: if Minari is missing
-        :raises ValueError: if the dataset's spaces are not a Box of shape (n_variables,) and a Discrete, if it contains
-            something that is not finite, or if ``n_instances`` is not a whole number of at least 1
+        :raises ValueError: as of :meth:`record`
         """
         if n_instances is not None:
             n_instances = as_count("n_instances", n_instances)
-        source = cls(**minari_datasets.read_dataset(dataset, bounds)._asdict())
+        source = cls(*minari_datasets.read_dataset(dataset, bounds))
         return source if n_instances is None else source.subset(n_instances, seed=seed)
 
     def to_minari(self, dataset_id: str, **metadata: Any) -> MinariDataset:
@@ -228,7 +230,8 @@ class SourceInstances:
         :param metadata: arguments of ``minari.create_dataset_from_buffers`` such as ``author``
         :raises ImportError: if Minari is missing
         """
-        return minari_datasets.write_dataset(self._transitions(), dataset_id, **metadata)
+        transitions = Transitions(*(getattr(self, name) for name in Transitions._fields))
+        return minari_datasets.write_dataset(transitions, dataset_id, **metadata)
 
     @property
     def scaling(self) -> StateScaling:
@@ -262,20 +265,20 @@ class SourceInstances:
         n_instances = as_count("n_instances", n_instances)
         check_method(method)
         rng = np.random.default_rng(seed)
-        if method == "random":
+        if n_instances >= len(self):
+            rows = np.arange(len(self))
+        elif method == "random":
             rows = random_rows(self.terminated, n_instances, rng)
         else:
             units, flags = self.scaling.to_unit(self.states), np.array(self.periodic)
             rows = covering_rows(units, self.actions, self.terminated, n_instances, rng, flags)
-        chosen = {"method": method, "seed": seed, "chosen_from": len(self)}
-        return self._with_rows(rows, {**self.origin, "subset": chosen})
+        origin = {**self.origin, "subset": {"method": method, "seed": seed, "chosen_from": len(self)}}
+        return replace(self, **{name: getattr(self, name)[rows] for name in _ROW_ARRAYS}, origin=origin)
 
     def check_spaces(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         """
         Check that the instances come from a task with these spaces.
 
-        :param observation_space: observation space of the task
-        :param action_space: action space of the task
         :raises ValueError: if the numbers of variables or actions differ, or if the bounds of the variables do
         """
         n_actions = count_actions(action_space)
@@ -301,21 +304,9 @@ class SourceInstances:
         :return: the path written to
         :raises OSError: if the file cannot be written
         """
-        return write_source(path, *self._content())
-
-    def to_bytes(self) -> bytes:
-        """The content of the file that :meth:`save` writes."""
-        return source_to_bytes(*self._content())
-
-    def _content(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        header = {
-            "n_actions": self.n_actions,
-            "state_names": self.state_names,
-            "action_names": self.action_names,
-            "origin": self.origin,
-            "periodic": self.periodic,
-        }
-        return {name: getattr(self, name) for name in ARRAY_NAMES}, header
+        target = _with_suffix(path)
+        write_whole(target, self.to_bytes())
+        return target
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SourceInstances:
@@ -324,46 +315,50 @@ class SourceInstances:
 
         :param path: path of the file; the suffix .npz may be left out
         :raises FileNotFoundError: if there is no such file
-        :raises ValueError: if the file is damaged, of another kind or of another version of the format
+        :raises ValueError: if it is another kind of file, or is cut short
         """
-        return read_source(path, cls._of_content)
+        file = Path(path) if Path(path).is_file() else _with_suffix(path)
+        if not file.is_file():
+            raise FileNotFoundError(f"there is no source file {file}; write one with SourceInstances.record(...).save(path)")
+        try:
+            return cls.from_bytes(file.read_bytes())
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}; write it again with SourceInstances.record(...).save(path)") from error
+
+    def to_bytes(self) -> bytes:
+        """The content of the file that :meth:`save` writes."""
+        others = ("n_actions", "state_names", "action_names", "origin", "periodic")
+        header = json.dumps({"format": _FORMAT, "version": _VERSION, **{name: getattr(self, name) for name in others}})
+        content = io.BytesIO()
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        np.savez_compressed(content, allow_pickle=False, header=np.array(header), **arrays)
+        return content.getvalue()
 
     @classmethod
     def from_bytes(cls, content: bytes) -> SourceInstances:
         """
         What :meth:`to_bytes` wrote.
 
-        :raises ValueError: if the bytes are damaged, of another kind or of another version of the format
+        :raises ValueError: if it is something else, or is cut short
         """
         try:
-            return source_from_bytes(content, cls._of_content)
+            # No pickle: a source file may come from anyone.
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                header = json.loads(str(archive["header"]))
+                if (header.pop("format"), header.pop("version")) != (_FORMAT, _VERSION):
+                    raise ValueError("another format")
+                return cls(**{name: archive[name] for name in _ARRAYS}, **header)
         except Exception as error:
-            raise ValueError(f"the source instances are damaged ({damage_text(error)})") from error
-
-    @classmethod
-    def _of_content(cls, arrays: dict[str, NDArray[Any]], header: dict[str, Any]) -> SourceInstances:
-        return cls(
-            **arrays,
-            n_actions=header["n_actions"],
-            state_names=tuple(header["state_names"]),
-            action_names=tuple(header["action_names"]),
-            origin=header["origin"],
-            periodic=tuple(header.get("periodic", ())),
-        )
-
-    def _transitions(self) -> Transitions:
-        return Transitions(*(getattr(self, name) for name in Transitions._fields))
-
-    def _with_rows(self, rows: NDArray[np.int64], origin: Mapping[str, Any]) -> SourceInstances:
-        chosen = {name: getattr(self, name)[rows] for name in ("states", "actions", "rewards", "next_states", "terminated")}
-        return replace(self, **chosen, origin=origin)
+            # Each layer (zip, decompression, npy, JSON, our own checks) has errors of its own kinds.
+            raise ValueError(f"these are not source instances, or they are cut short ({error})") from error
 
 
-def _read(npz: str) -> SourceInstances:
-    return source_from_bytes(base64.b64decode(npz, validate=True), SourceInstances._of_content)
+def _with_suffix(path: str | os.PathLike[str]) -> Path:
+    target = Path(path)
+    return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
 
 
 register_writer(
     SourceInstances, lambda source: ("SourceInstances", {"npz": base64.b64encode(source.to_bytes()).decode("ascii")})
 )
-register_reader("SourceInstances", _read)
+register_reader("SourceInstances", lambda npz: SourceInstances.from_bytes(base64.b64decode(npz, validate=True)))

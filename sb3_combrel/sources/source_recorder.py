@@ -24,4 +24,4 @@ class SourceRecorder(TransitionRecorder):
 
         :raises ValueError: if nothing has been
         """
-        return SourceInstances(**self.transitions()._asdict())
+        return SourceInstances(*self.transitions())

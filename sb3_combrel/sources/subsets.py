@@ -12,24 +12,13 @@ Ints = NDArray[np.int64]
 
 
 def check_method(method: str) -> None:
-    """
-    :raises ValueError: if there is no such method of choosing instances
-    """
+    """Raise ``ValueError`` if there is no such method of choosing instances."""
     if method not in ("random", "covering"):
         raise ValueError(f"method must be 'random' or 'covering', got {method!r}")
 
 
 def random_rows(terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Generator) -> Ints:
-    """
-    A uniform sample without replacement, with at least one terminal instance if there is any.
-
-    :param terminated: which instances are terminal, shape (n,)
-    :param n_rows: size of the sample; all instances if there are no more
-    :param rng: source of randomness
-    :return: row numbers, ascending
-    """
-    if n_rows >= len(terminated):
-        return np.arange(len(terminated))
+    """A uniform sample of ``n_rows`` < n row numbers, ascending, with at least one terminal instance if there is any."""
     return _keep_terminal(rng.choice(len(terminated), n_rows, replace=False), terminated, rng)
 
 
@@ -45,15 +34,12 @@ def covering_rows(
     About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
 
     :param units: where the instances start, unit coordinates, shape (n, n_variables)
-    :param actions: their actions, shape (n,)
-    :param terminated: which of them are terminal, shape (n,)
-    :param n_rows: number of instances to select; all if there are no more
+    :param actions: shape (n,); ``terminated``: bool, same shape
+    :param n_rows: number of instances to select, less than n
     :param rng: picks the first instance of each action
     :param periodic: which state variables are periodic, bool, shape (n_variables,); None for none
     :return: row numbers, ascending
     """
-    if n_rows >= len(actions):
-        return np.arange(len(actions))
     rows_of = [np.flatnonzero(actions == action) for action in np.unique(actions)]
     quotas = _equal_quotas(np.array([len(rows) for rows in rows_of]), n_rows)
     # Selected rows of an action come in the order of selection, so the last one is the least informative.

@@ -1,40 +1,33 @@
-"""Transitions of a task as arrays, before they become source instances, and the log that collects them."""
+"""Transitions of a task as arrays, before they become source instances, the log that collects them, and what the task says."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import metadata
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.checks import as_count
 from sb3_combrel.common.scaling import StateScaling
 
 Floats = NDArray[np.float64]
+AnyEnv = VecEnv | gym.Env[Any, Any]
 
-MAX_STEPS = 10**8
-WHY_MAX_STEPS = "more transitions do not fit into memory"
+_MAX_TRANSITIONS = 10**8
+
+
+def as_transition_count(name: str, value: object) -> int:
+    """A number of transitions, steps or episodes; ``ValueError`` unless it is whole, at least 1 and fits into memory."""
+    return as_count(name, value, max=_MAX_TRANSITIONS, why_max="more transitions do not fit into memory")
 
 
 class Transitions(NamedTuple):
-    """
-    Transitions and the spaces that they come from; the fields are those of :class:`~sb3_combrel.SourceInstances`.
-
-    :param states: where each transition starts, raw units, shape (n, n_variables)
-    :param actions: int64, from 0 on, shape (n,)
-    :param rewards: shape (n,)
-    :param next_states: where it ends, raw units, shape (n, n_variables)
-    :param terminated: bool, shape (n,): whether it reached a terminal state
-    :param low: lower bounds of the states, raw units, shape (n_variables,)
-    :param high: upper bounds of the states, raw units, shape (n_variables,)
-    :param n_actions: number of actions of the task
-    :param state_names: names of the state variables, () if not known
-    :param action_names: names of the actions, () if not known
-    :param origin: where the transitions came from, a dict that JSON can hold
-    :param periodic: which state variables are periodic, () for none
-    """
+    """Transitions and the spaces that they come from; the fields are those of :class:`~sb3_combrel.SourceInstances`."""
 
     states: Floats
     actions: NDArray[np.int64]
@@ -56,14 +49,12 @@ class TransitionLog:
 
     :param max_instances: how many to keep at most (reservoir sampling); None for all
     :param seed: seed of the sample
-    :param giver: where transitions come from, for messages
     :raises ValueError: if ``max_instances`` is not a whole number of at least 1 or None
     """
 
-    def __init__(self, max_instances: int | None = None, seed: int | None = None, giver: str = "the environment") -> None:
+    def __init__(self, max_instances: int | None = None, seed: int | None = None) -> None:
         self.max_instances = None if max_instances is None else as_count("max_instances", max_instances)
         self.n_seen = 0
-        self._giver = giver
         self._rng = np.random.default_rng(seed)
         self._rows: list[tuple[int, NDArray[Any], int, float, NDArray[Any], bool]] = []
 
@@ -72,19 +63,14 @@ class TransitionLog:
 
     def add(self, state: NDArray[Any], action: int, reward: float, next_state: NDArray[Any], terminated: bool) -> None:
         """
-        Add a transition. The arrays are kept, not copied.
+        Add a transition, with its action from 0 on and states in raw units, shape (n_variables,), which are not copied.
 
-        :param state: raw units, shape (n_variables,)
-        :param action: its action, from 0 on
-        :param reward: its reward
-        :param next_state: raw units, shape (n_variables,)
-        :param terminated: whether ``next_state`` is terminal
         :raises ValueError: if a state or the reward is not finite
         """
         when = f"in transition {self.n_seen}"
-        check_observation(state, when, self._giver)
-        check_observation(next_state, when, self._giver)
-        row = (self.n_seen, state, int(action), check_reward(reward, when, self._giver), next_state, bool(terminated))
+        check_observation(state, when)
+        check_observation(next_state, when)
+        row = (self.n_seen, state, int(action), check_reward(reward, when), next_state, bool(terminated))
         self.n_seen += 1
         if self.max_instances is None or len(self._rows) < self.max_instances:
             self._rows.append(row)
@@ -99,11 +85,9 @@ class TransitionLog:
         """
         What is in the log.
 
-        :param scaling: bounds of the states
-        :param n_actions: number of actions of the task
         :param names: ``state_names``, ``action_names`` and ``periodic``, as far as known
         :param origin: where the transitions came from
-        :raises ValueError: if there are no transitions
+        :raises ValueError: if there are none
         """
         if not self._rows:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
@@ -124,45 +108,68 @@ class TransitionLog:
         )
 
 
-def check_observation(observation: Any, when: str, giver: str = "the environment") -> None:
-    """
-    :param observation: one state, shape (n_variables,), or several
-    :param when: when it was returned, for the message
-    :param giver: what returned it, for the message
-    :raises ValueError: if it is not finite
-    """
+def check_observation(observation: Any, when: str) -> None:
+    """Raise ``ValueError`` if an observation of one or more states is not finite, saying when it was returned."""
     try:
         finite = bool(np.isfinite(observation).all())
     except TypeError:
         finite = False
     if not finite:
-        raise ValueError(f"{giver} returned an observation that is not finite, {when}: {observation!r}")
+        raise ValueError(f"the environment returned an observation that is not finite, {when}: {observation!r}")
 
 
-def check_reward(reward: Any, when: str, giver: str = "the environment") -> float:
-    """
-    :param reward: one reward
-    :param when: when it was returned, for the message
-    :param giver: what returned it, for the message
-    :return: the reward as a float
-    :raises ValueError: if it is not a finite number
-    """
+def check_reward(reward: Any, when: str) -> float:
+    """Return a reward as a float; ``ValueError`` if it is not a finite number, saying when it was returned."""
     try:
         number = float(reward)
     except (TypeError, ValueError):
         number = np.nan
     if not np.isfinite(number):
-        raise ValueError(f"{giver} returned a reward that is not a finite number, {when}: {reward!r}")
+        raise ValueError(f"the environment returned a reward that is not a finite number, {when}: {reward!r}")
     return number
 
 
 def count_actions(space: spaces.Space[Any]) -> int:
-    """
-    Number of actions of a discrete action space.
-
-    :param space: the action space
-    :raises ValueError: if it is not a ``Discrete``
-    """
+    """Number of actions of an action space; ``ValueError`` if it is not a ``Discrete``."""
     if not isinstance(space, spaces.Discrete):
         raise ValueError(f"the action space must be Discrete, got {space}")
     return int(space.n)
+
+
+def make_env(env: str | gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """The environment of an id, or the one given; ids of this project's environments need no import of ``combrel_envs``."""
+    if not isinstance(env, str):
+        return env
+    return gym.make(f"combrel_envs:{env}" if env.startswith("combrel/") else env)
+
+
+def task_names(env: AnyEnv) -> dict[str, tuple[Any, ...]]:
+    """``state_names`` and ``action_names`` of a task, and which of its states are ``periodic``, as far as it says so."""
+    given = {name: _attribute(env, name) for name in ("state_names", "action_names")}
+    names = {name: tuple(value) for name, value in given.items() if value is not None}
+    periodic = _attribute(env, "periodic")
+    is_list = isinstance(periodic, Sequence | np.ndarray) and len(periodic) == (env.observation_space.shape or (0,))[0]
+    if is_list and all(isinstance(flag, bool | np.bool_) for flag in periodic):
+        names["periodic"] = tuple(map(bool, periodic))
+    return names
+
+
+def _attribute(env: AnyEnv, name: str) -> Any:
+    """An attribute of an environment or of one of its wrappers, None if there is none."""
+    if isinstance(env, VecEnv):
+        return env.get_attr(name, 0)[0] if env.has_attr(name) else None
+    try:
+        return env.get_wrapper_attr(name)
+    except AttributeError:
+        return None
+
+
+def describe_origin(env: AnyEnv, recorder: str, seed: int | None) -> dict[str, Any]:
+    """Where instances come from: id of the environment, what acted in it (``recorder``), seed and version of this package."""
+    spec = _attribute(env, "spec")
+    return {
+        "env": None if spec is None else spec.id,
+        "recorder": recorder,
+        "seed": seed,
+        "package": f"sb3-combrel {metadata.version('sb3-combrel')}",
+    }

@@ -2,12 +2,10 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from sb3_combrel import FactoredMapping, InterTaskMapping
 from sb3_combrel.common.serialisation import from_plain, to_plain
-from sb3_combrel.mappings.state_mappings import copies_of_source
 
 FIRST = InterTaskMapping([0, None, 1, None], [0, 1, 2, 0, 0])
 SECOND = InterTaskMapping([None, 0, None, 1], [0, 0, 0, 1, 2])
@@ -72,15 +70,3 @@ def test_it_is_checked_against_both_tasks():
     ):
         with pytest.raises(ValueError, match=r"state must|action must"):
             mapping.check(**{**fits, name: wrong})
-
-
-def test_copies_of_a_source_are_all_its_parts_each_once():
-    rows = copies_of_source(2, 4)
-    assert len(rows) == len({tuple(row) for row in rows.tolist()}) == 4 * 3 + 2 * 4
-    used = [sorted(row[row >= 0].tolist()) for row in rows]
-    assert used == [[0, 1]] * 12 + [[0]] * 4 + [[1]] * 4
-    # A source with more variables than the target gives as many as there is room for.
-    assert copies_of_source(3, 1).tolist() == [[0], [1], [2]]
-    with pytest.raises(ValueError, match="more than"):
-        copies_of_source(8, 12)
-    assert np.array_equal(copies_of_source(1, 1), [[0]])

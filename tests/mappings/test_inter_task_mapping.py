@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.mappings import MOUNTAIN_CAR, mappings
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import InterTaskMapping, MappingSet
@@ -12,6 +12,7 @@ units = st.lists(st.floats(-0.5, 1.5), min_size=12, max_size=12)
 
 
 class TestInterTaskMapping:
+    @settings(max_examples=40, deadline=None)
     @given(mappings(), units, st.lists(st.floats(0, 1), min_size=4, max_size=4))
     def test_source_to_target_and_back_is_the_identity_on_used_variables(self, mapping, source, current):
         source = np.array(source).reshape(4, 3)
@@ -20,6 +21,7 @@ class TestInterTaskMapping:
         np.testing.assert_allclose(back[:, used], source[:, used], atol=1e-12)
         assert np.isnan(np.delete(back, used, axis=1)).all()
 
+    @settings(max_examples=40, deadline=None)
     @given(mappings(), units, st.lists(st.floats(0, 1), min_size=4, max_size=4))
     def test_translation_agrees_with_a_loop_over_variables(self, mapping, source, current):
         source = np.array(source).reshape(4, 3)
@@ -29,6 +31,7 @@ class TestInterTaskMapping:
                 expected = current[i] if k is None else source[row, k] if sign == 1 else 1 - source[row, k]
                 assert translated[row, i] == pytest.approx(expected, abs=1e-12)
 
+    @settings(max_examples=40, deadline=None)
     @given(mappings(), units, units, st.lists(st.floats(0, 1), min_size=4, max_size=4))
     def test_the_displacement_is_the_difference_of_translated_states(self, mapping, start, end, current):
         start, end = np.array(start).reshape(4, 3), np.array(end).reshape(4, 3)
@@ -58,6 +61,7 @@ class TestInterTaskMapping:
         assert mapping.state_sign.tolist() == [1.0, 1.0, -1.0, 1.0]
         assert mapping == InterTaskMapping([0, None, np.int64(1), None], [0], np.array([1, 1, -1, 1]))
 
+    @settings(max_examples=40, deadline=None)
     @given(mappings())
     def test_repr_without_names_can_be_evaluated(self, mapping):
         assert eval(repr(mapping)) == mapping

@@ -56,14 +56,14 @@ class TestMappingSet:
         assert len(mapping_set) == len(list(mapping_set)) == mapping_set.n_state_mappings * mapping_set.n_action_mappings
         check_against_members(mapping_set, 2)
 
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=20, deadline=None)
     @given(st.lists(mappings(n_source=2, n_target=2), min_size=1, max_size=8))
     def test_a_list_holds_exactly_its_mappings_in_order(self, listed):
         mapping_set = MappingSet.from_list(listed)
         assert list(mapping_set) == listed
         check_against_members(mapping_set, 3)
 
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=20, deadline=None)
     @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=1, max_size=8))
     def test_pairs_choose_members_of_the_factors(self, pairs):
         # Equal state mappings in two rows, as in the paper's sets.

@@ -3,7 +3,7 @@
 import pickle
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import FactoredMapping, InterTaskMapping, MappingSet
@@ -38,6 +38,7 @@ def test_names_stand_for_numbers_once_both_tasks_are_known(name):
     assert InterTaskMapping(mapping.state, mapping.action, mapping.sign, names=CAR) == BY_NUMBER
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_any_mapping_is_the_same_by_number_by_name_and_as_a_dict(data):
     state = data.draw(st.lists(st.sampled_from([None, 0, 1]), min_size=4, max_size=4).filter(any_mapped))

@@ -66,12 +66,9 @@ class TestResolve:
         [
             ("bijective", "one of injective, .*, signed_injective, .*, paper_icub; .*factored.* got 'bijective'"),
             (3, "mappings must be a name, .* got 3"),
-            ([], "at least one InterTaskMapping"),
             ([3], "each of the mappings must be"),
-            ({"state": [0]}, "each of the mappings must be"),
             ("paper_icub", "action must have 5 entries, .* got 8"),
             (MappingSet.injective(3, 4, 3, 5), "state must hold indices from 0 to 1"),
-            (MappingSet.injective(2, 4, 4, 5), "action must hold indices from 0 to 2"),
             ([InterTaskMapping((0,), (0,)), InterTaskMapping((0, 1), (0,))], "same numbers of target variables"),
         ],
     )

@@ -3,10 +3,12 @@
 import itertools
 from collections import Counter
 
+import numpy as np
 import pytest
 from helpers.mappings import MOUNTAIN_CAR, SMALL_SIZES, choices
 
 from sb3_combrel import InterTaskMapping, MappingSet
+from sb3_combrel.mappings.state_mappings import copies_of_source
 
 
 def is_injective(state, n_source):
@@ -68,7 +70,6 @@ class TestStateMappings:
         with pytest.raises(ValueError, match=r"about 10\^21 state mappings of that kind"):
             MappingSet.surjective(1, 70, 3, 5, signs=True)
 
-    @pytest.mark.parametrize("name", ["injective", "surjective", "all", "balanced"])
     @pytest.mark.parametrize(
         ("numbers", "message"),
         [
@@ -82,6 +83,19 @@ class TestStateMappings:
             (("2", 4), "n_source_variables .*, got '2'"),
         ],
     )
-    def test_impossible_numbers_of_variables_are_refused(self, name, numbers, message):
-        with pytest.raises(ValueError, match=message):
-            MappingSet.from_name(name, *numbers, 3, 5)
+    def test_impossible_numbers_of_variables_are_refused(self, numbers, message):
+        for name in ("injective", "surjective", "all", "balanced"):
+            with pytest.raises(ValueError, match=message):
+                MappingSet.from_name(name, *numbers, 3, 5)
+
+
+def test_copies_of_a_source_are_all_its_parts_each_once():
+    rows = copies_of_source(2, 4)
+    assert len(rows) == len({tuple(row) for row in rows.tolist()}) == 4 * 3 + 2 * 4
+    used = [sorted(row[row >= 0].tolist()) for row in rows]
+    assert used == [[0, 1]] * 12 + [[0]] * 4 + [[1]] * 4
+    # A source with more variables than the target gives as many as there is room for.
+    assert copies_of_source(3, 1).tolist() == [[0], [1], [2]]
+    with pytest.raises(ValueError, match="more than"):
+        copies_of_source(8, 12)
+    assert np.array_equal(copies_of_source(1, 1), [[0]])
