@@ -7,12 +7,12 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import pandas as pd
 
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.runs.job import Result
 
 #: Monitor logs of Stable-Baselines3 end in this.
 MONITOR_SUFFIX = "monitor.csv"
@@ -88,23 +88,11 @@ class LearningCurves:
         return LearningCurves(self.returns[:, :n], self.steps[:, :n])
 
 
-class HasEpisodes(Protocol):
-    """What has been kept of the episodes of a run."""
-
-    @property
-    def returns(self) -> Sequence[float]:
-        """Undiscounted return of each episode."""
-
-    @property
-    def steps(self) -> Sequence[float]:
-        """Environment steps of each episode."""
-
-
-def curves_of(runs: Iterable[HasEpisodes]) -> LearningCurves:
+def curves_of(runs: Iterable[Result]) -> LearningCurves:
     """
     Return the learning curves of some runs, in their order.
 
-    :param runs: results that have ``returns`` and ``steps`` of their episodes
+    :param runs: the results of the runs
     :raises ValueError: if there is no run, or one without an episode
     """
     runs = list(runs)

@@ -15,41 +15,16 @@ From Monitor logs of Stable-Baselines3, one file a run::
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite
 from sb3_combrel.comparison.curves import LearningCurves, episodes_of_all
-from sb3_combrel.comparison.statistics import (
-    Difference,
-    bootstrap_difference,
-    bootstrap_relative_difference,
-    cliffs_delta,
-    hedges_g,
-    p_value_of_difference,
-)
+from sb3_combrel.comparison.statistics import bootstrap_difference, bootstrap_relative_difference, p_value_of_difference
 
 #: Episodes of the initial and of the asymptotic return, and of the median that must reach a threshold.
 N_FIRST, N_LAST, WINDOW = 5, 10, 5
-
-
-class LearningMeasures(NamedTuple):
-    """
-    What is measured of each run of one method, each of shape (n_runs,).
-
-    :param initial_return: see :func:`initial_return`; higher is better
-    :param asymptotic_return: see :func:`asymptotic_return`; higher is better
-    :param total_reward: see :func:`total_reward`; higher is better
-    :param total_reward_by_steps: see :func:`total_reward_by_steps`; higher is better
-    :param time_to_threshold: see :func:`time_to_threshold`; lower is better; None without a threshold
-    """
-
-    initial_return: np.ndarray
-    asymptotic_return: np.ndarray
-    total_reward: np.ndarray
-    total_reward_by_steps: np.ndarray
-    time_to_threshold: np.ndarray | None
 
 
 def initial_return(curves: LearningCurves, n_first: int = N_FIRST) -> np.ndarray:
@@ -127,39 +102,9 @@ def time_to_threshold(curves: LearningCurves, threshold: float, window: int = WI
     return _steps_of(curves.steps, episodes_to_reach(-curves.returns, -threshold, window))
 
 
-def measure_learning(
-    curves: LearningCurves,
-    *,
-    threshold: float | None = None,
-    n_first: int = N_FIRST,
-    n_last: int = N_LAST,
-    window: int = WINDOW,
-    n_episodes: int | None = None,
-    n_steps: int | None = None,
-) -> LearningMeasures:
-    """
-    Compute all measures of each run of one method.
-
-    :param threshold: see :func:`time_to_threshold`; None: do not compute it
-    :param n_first: see :func:`initial_return`
-    :param n_last: see :func:`asymptotic_return`
-    :param window: see :func:`time_to_threshold`
-    :param n_episodes: see :func:`total_reward`
-    :param n_steps: see :func:`total_reward_by_steps`
-    :raises ValueError: if a run is shorter than these ask for
-    """
-    return LearningMeasures(
-        initial_return(curves, n_first),
-        asymptotic_return(curves, n_last),
-        total_reward(curves, n_episodes),
-        total_reward_by_steps(curves, n_steps),
-        None if threshold is None else time_to_threshold(curves, threshold, window),
-    )
-
-
 def counts_within(n_episodes: int) -> dict[str, int]:
     """
-    Return ``n_first`` and ``n_last`` of :func:`measure_learning`: the usual ones, or all episodes where there are fewer.
+    Return ``n_first`` and ``n_last`` of :func:`compare_learning`: the usual ones, or all episodes where there are fewer.
 
     :param n_episodes: episodes of the shortest run
     """
@@ -203,8 +148,6 @@ class Comparison(NamedTuple):
     :param low: lower bound of the effect's 95% bootstrap interval; NaN where there is none
     :param high: upper bound
     :param p_value: two-sided; NaN with fewer than two runs of either
-    :param hedges_g: see :func:`~sb3_combrel.comparison.statistics.hedges_g`; above 0 if the measure is higher with transfer
-    :param cliffs_delta: see :func:`~sb3_combrel.comparison.statistics.cliffs_delta`; likewise
     :param higher_is_better: whether an effect above 0 is a gain
     """
 
@@ -214,8 +157,6 @@ class Comparison(NamedTuple):
     low: float
     high: float
     p_value: float
-    hedges_g: float
-    cliffs_delta: float
     higher_is_better: bool = True
 
 
@@ -258,7 +199,7 @@ def compare_learning(
     seed: int = 0,
 ) -> TransferMeasures:
     """
-    Compute Taylor & Stone's measures of transfer, with 95% bootstrap intervals, p-values and effect sizes.
+    Compute Taylor & Stone's measures of transfer, with 95% bootstrap intervals and p-values.
 
     Each is with transfer minus without. Areas end where the shortest run of both does, in episodes or in environment steps;
     the asymptotic performance and the time to threshold use all episodes of every run. Effects are differences of means,
@@ -287,55 +228,38 @@ def compare_learning(
     n_episodes = min(int(curves.n_episodes.min()) for curves in both)
     n_steps = min(int(curves.n_steps.min()) for curves in both) if n_steps is None else n_steps
     floor = _checked_floor(floor, min(float(np.nanmin(curves.returns)) for curves in both))
-    of_with, of_without = (
-        measure_learning(
-            curves,
-            threshold=threshold,
-            n_first=n_first,
-            n_last=n_last,
-            window=window,
-            n_episodes=n_episodes,
-            n_steps=n_steps,
-        )
-        for curves in both
-    )
 
-    def compare(
-        first: np.ndarray, second: np.ndarray, difference: Callable[..., Difference] = bootstrap_difference
-    ) -> Comparison:
+    def compare(measure: Callable[[LearningCurves], np.ndarray], difference: Any = bootstrap_difference) -> Comparison:
+        first, second = (measure(curves) for curves in both)
         estimate = difference(first, second, n_resamples=n_resamples, seed=seed)
-        return _comparison(first, second, estimate, p_value_of_difference(first, second, "permutation", seed))
+        return Comparison(first, second, *estimate, p_value_of_difference(first, second, "permutation", seed))
 
-    def ratio(first: np.ndarray, second: np.ndarray, width: int) -> Comparison:
+    def ratio(area: Callable[[LearningCurves], np.ndarray], width: int) -> Comparison:
         # Rounding may leave a run that never rose above the floor just below it.
-        above = [np.maximum(area - floor * width, 0.0) for area in (first, second)]
-        return compare(above[0], above[1], bootstrap_relative_difference)
+        return compare(lambda curves: np.maximum(area(curves) - floor * width, 0.0), bootstrap_relative_difference)
 
+    def by_episodes(curves: LearningCurves) -> np.ndarray:
+        return total_reward(curves, n_episodes)
+
+    def by_steps(curves: LearningCurves) -> np.ndarray:
+        return total_reward_by_steps(curves, n_steps)
+
+    times = None
+    if threshold is not None:
+        first, second = (time_to_threshold(curves, threshold, window) for curves in both)
+        estimate = bootstrap_difference(first, second, "median", n_resamples, seed)
+        p_value = p_value_of_difference(first, second, "mann-whitney")
+        times = Comparison(first, second, *estimate, p_value, higher_is_better=False)
     return TransferMeasures(
-        jumpstart=compare(of_with.initial_return, of_without.initial_return),
-        asymptotic_performance=compare(of_with.asymptotic_return, of_without.asymptotic_return),
-        total_reward=compare(of_with.total_reward, of_without.total_reward),
-        total_reward_by_steps=compare(of_with.total_reward_by_steps, of_without.total_reward_by_steps),
-        transfer_ratio=ratio(of_with.total_reward, of_without.total_reward, n_episodes),
-        transfer_ratio_by_steps=ratio(of_with.total_reward_by_steps, of_without.total_reward_by_steps, n_steps),
-        time_to_threshold=_compare_times(of_with.time_to_threshold, of_without.time_to_threshold, n_resamples, seed),
+        jumpstart=compare(lambda curves: initial_return(curves, n_first)),
+        asymptotic_performance=compare(lambda curves: asymptotic_return(curves, n_last)),
+        total_reward=compare(by_episodes),
+        total_reward_by_steps=compare(by_steps),
+        transfer_ratio=ratio(by_episodes, n_episodes),
+        transfer_ratio_by_steps=ratio(by_steps, n_steps),
+        time_to_threshold=times,
         floor=floor,
     )
-
-
-def _compare_times(first: np.ndarray | None, second: np.ndarray | None, n_resamples: int, seed: int) -> Comparison | None:
-    if first is None or second is None:
-        return None
-    estimate = bootstrap_difference(first, second, "median", n_resamples, seed)
-    p_value = p_value_of_difference(first, second, "mann-whitney")
-    return _comparison(first, second, estimate, p_value, higher_is_better=False)
-
-
-def _comparison(
-    first: np.ndarray, second: np.ndarray, estimate: Difference, p_value: float, higher_is_better: bool = True
-) -> Comparison:
-    sizes = hedges_g(first, second), cliffs_delta(first, second)
-    return Comparison(first, second, *estimate, p_value, *sizes, higher_is_better)
 
 
 def _checked_floor(floor: float | None, lowest: float) -> float:

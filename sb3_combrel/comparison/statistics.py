@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import stats
-from scipy.special import gammaln
 
 from sb3_combrel.common.checks import check_count
 
@@ -237,41 +236,13 @@ def _percentiles(drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def as_sample(name: str, values: np.ndarray) -> np.ndarray:
-    """
-    Return the values of several runs as an array of floats.
-
-    :param name: name of the argument
-    :param values: one for each run, shape (n_runs,)
-    :raises ValueError: if the shape is another, there are none, or some are NaN
-    """
+    """Return one value for each run, shape (n_runs,), as floats; ``name`` is that of the argument, for errors."""
     sample = np.asarray(values, dtype=np.float64)
     if sample.ndim != 1 or not len(sample):
         raise ValueError(f"{name} must have one value for each run, shape (n_runs,), got shape {sample.shape}")
     if np.isnan(sample).any():
         raise ValueError(f"{name} must have no NaN, got {np.isnan(sample).sum()} of {len(sample)}: leave out runs on purpose")
     return sample
-
-
-def hedges_g(first: np.ndarray, second: np.ndarray) -> float:
-    """
-    Compute the difference of the means in units of the pooled standard deviation, unbiased for small samples (Hedges, 1981).
-
-    :param first: one value for each run, shape (n_first,)
-    :param second: those of the other method, shape (n_second,)
-    :return: above 0 if the first mean is higher; 0 if all values are equal, infinite if only the means differ; NaN with fewer
-        than two runs of each or an infinite value: take :func:`cliffs_delta` then
-    :raises ValueError: if a sample has another shape, is empty or has NaN
-    """
-    first, second = as_sample("first", first), as_sample("second", second)
-    if min(len(first), len(second)) < 2 or not np.isfinite(np.concatenate([first, second])).all():
-        return np.nan
-    if (first == first[0]).all() and (second == second[0]).all():
-        # The standard deviation is 0 but for rounding.
-        return 0.0 if first[0] == second[0] else float(np.copysign(np.inf, first[0] - second[0]))
-    freedom = len(first) + len(second) - 2
-    pooled = np.sqrt((len(first) * first.var() + len(second) * second.var()) / freedom)
-    unbiased = np.exp(gammaln(freedom / 2) - gammaln((freedom - 1) / 2)) / np.sqrt(freedom / 2)
-    return float(unbiased * (first.mean() - second.mean()) / pooled)
 
 
 def cliffs_delta(first: np.ndarray, second: np.ndarray) -> float:

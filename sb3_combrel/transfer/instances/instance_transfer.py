@@ -7,8 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sb3_combrel.common.prior import PriorPredictions
-from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
 from sb3_combrel.transfer.instances.selectors import Ranges, Selector

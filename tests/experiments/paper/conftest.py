@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 from helpers.paper_results import quiet
-
 from sb3_combrel.experiments.output_folder import SETTINGS_FILE
+from sb3_combrel.experiments.source_files import FOLDER
+
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
 from sb3_combrel.experiments.paper.sources import prepare_sources
-from sb3_combrel.experiments.source_files import FOLDER
 
 #: Enough for COMBREL to select mappings in the second episode, too few to reach a goal.
 SHORT = 60

@@ -2,9 +2,9 @@
 
 from helpers.paper_results import made_up
 
-from sb3_combrel.experiments.paper.baselines import PLAIN, QUANTILE
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baseline_runs import baselines_table, evaluation_rows
+from sb3_combrel.experiments.paper.baselines import PLAIN, QUANTILE
 
 EVALUATIONS = [[1000, -400.0, 0.0], [20_000, -30.0, 1.0]]
 RESULTS = {

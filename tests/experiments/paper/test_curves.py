@@ -7,8 +7,8 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 from imageio.v3 import imread
-
 from sb3_combrel.experiments.figures import moving_average
+
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.curves import STYLES, WINDOW, draw_curves, draw_selection, draw_times
 from sb3_combrel.experiments.paper.domains import DOMAINS, MOUNTAIN_CAR

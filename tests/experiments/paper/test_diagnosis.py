@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from imageio.v3 import imread
+from sb3_combrel.experiments.statistics import holm, p_value_of_difference
 
 from sb3_combrel.experiments.paper.diagnosis import (
     BREADTHS,
@@ -15,7 +16,6 @@ from sb3_combrel.experiments.paper.diagnosis import (
 )
 from sb3_combrel.experiments.paper.domains import EXPLORE, MOUNTAIN_CAR
 from sb3_combrel.experiments.paper.verdicts import p_text
-from sb3_combrel.experiments.statistics import holm, p_value_of_difference
 
 MEANS = dict(zip(METHODS, (400, 200, 300), strict=True))
 

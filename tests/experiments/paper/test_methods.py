@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.paper_results import made_up, quiet
+from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
-from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import BEST, DOMAINS, EXPLORE, ICUB, MOUNTAIN_CAR, PAPER, SETTINGS
 from sb3_combrel.experiments.paper.methods import METHODS, methods_in, target_names
 from sb3_combrel.experiments.paper.plan import frequent_mapping, jobs_of, methods_of, targets_of
 from sb3_combrel.experiments.paper.sources import prepare_sources
-from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
+from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.models.kernel_average import KernelAverage
 
 # Made by hand: the class, the mapping that TIMBREL is given (where it is text), and whether relevance counts.

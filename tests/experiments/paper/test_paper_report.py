@@ -5,13 +5,13 @@ import io
 
 from helpers.paper_results import made_up, quiet
 from rich.console import Console
+from sb3_combrel.experiments.report import Table
 
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import PAPER
 from sb3_combrel.experiments.paper.plan import targets_of
 from sb3_combrel.experiments.paper.report import running_times_table, write_report, write_tables
 from sb3_combrel.experiments.paper.runs import ResultFiles
-from sb3_combrel.experiments.report import Table
 
 CAR = "mountain_car"
 

@@ -17,14 +17,14 @@ from helpers import command_line
 from helpers.clusters import HOST, dask_cluster, free_port
 from helpers.paper_results import made_up
 from imageio.v3 import imread
+from sb3_combrel.experiments.result_files import RESULTS, TIMES
 
 from sb3_combrel.experiments import carrying_out
-from sb3_combrel.experiments.paper.baselines import ALGORITHMS
 from sb3_combrel.experiments.paper import baseline_runs, reproduce
 from sb3_combrel.experiments.paper import methods as m
+from sb3_combrel.experiments.paper.baselines import ALGORITHMS
 from sb3_combrel.experiments.paper.domains import DOMAINS
 from sb3_combrel.experiments.paper.runs import ResultFiles
-from sb3_combrel.experiments.result_files import RESULTS, TIMES
 
 # Of the paper's setting.
 FIGURES = ("fig2", "fig3", "fig4", "fig5", "fig6")

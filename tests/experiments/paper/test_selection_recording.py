@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.paper_results import made_up
+from sb3_combrel.experiments.result_files import RESULTS
+from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel import FittedRMax
@@ -14,8 +16,6 @@ from sb3_combrel.experiments.paper.domains import DOMAINS, PAPER
 from sb3_combrel.experiments.paper.plan import jobs_of
 from sb3_combrel.experiments.paper.recording import selections_at_sample, uses_of
 from sb3_combrel.experiments.paper.runs import Job, Result, ResultFiles, carry_out
-from sb3_combrel.experiments.result_files import RESULTS
-from sb3_combrel.experiments.runs import coarse_on_purpose, make_task
 
 CAP = 300
 METHODS = [("mountain_car", m.COMBREL_PLAIN), ("mountain_car", m.COMBREL_WHOLE), ("icub", m.COMBREL_PLAIN)]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sb3_combrel.experiments.statistics import holm
 
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
@@ -19,7 +20,6 @@ from sb3_combrel.experiments.paper.verdicts import (
     summary_table,
     verdict_table,
 )
-from sb3_combrel.experiments.statistics import holm
 
 CAR, ROBOT = MOUNTAIN_CAR.name, ICUB.name
 BETTER_THAN_NONE = "COMBREL better than no transfer"
