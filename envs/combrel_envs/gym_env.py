@@ -143,12 +143,7 @@ class DmControlEnv(RenderedEnv):
         return self._flatten(self._environment.reset().observation), {}
 
     def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
-        """
-        Take an action.
-
-        :param action: number of an action
-        :return: observation, reward, terminated, truncated and info
-        """
+        """Take the action of a number; returns observation, reward, terminated, truncated and info."""
         # dm_control would silently begin a new episode.
         if not self._running:
             raise ResetNeeded("call reset() before the first step and after the end of each episode")

@@ -63,14 +63,7 @@ class MountainCarEnv(RenderedEnv):
         return self._observation(self._state), {}
 
     def step(self, action: SupportsIndex) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
-        """
-        Advance the car by one step.
-
-        :param action: number of an action
-        :return: observation, reward -1, whether the car is at the goal, False (the step limit belongs to the ``TimeLimit``
-            wrapper), and a dictionary with ``is_success``
-        :raises ValueError: when there is no such action
-        """
+        """Take the action of a number; ``ValueError`` if there is none. ``TimeLimit`` has the step limit."""
         push = dynamics.executed_push(action, self.n_axes, self._action_noise, self.np_random.uniform)
         self._state = state = dynamics.step_car(*self._running_state(), push)
         terminated = dynamics.at_goal(state[0])

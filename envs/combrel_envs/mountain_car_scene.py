@@ -185,19 +185,18 @@ def _ground_texture(n_axes: int) -> np.ndarray:
     slope = np.hypot(*np.broadcast_arrays(*gradient(x, y, n_axes)))
     image = _draw(image, _near(z, top / 6, slope), 0.82 * image)
     axes = (x, y) if n_axes == 2 else (x,)
-    image = _draw(image, _everywhere(image, [axis >= dynamics.GOAL_POSITION for axis in axes]), 0.1 * image + 0.9 * _GOAL)
-    inside = [(axis >= dynamics.MIN_POSITION) & (axis <= dynamics.MAX_POSITION) for axis in axes]
-    return _draw(image, ~_everywhere(image, inside), 0.45 * image + 0.55 * _LINE)
+    goal = inside = np.ones((1, 1), dtype=np.bool_)
+    for axis in axes:
+        goal = goal & (axis >= dynamics.GOAL_POSITION)
+        inside = inside & (axis >= dynamics.MIN_POSITION) & (axis <= dynamics.MAX_POSITION)
+    image = _draw(image, goal, 0.1 * image + 0.9 * _GOAL)
+    return _draw(image, ~inside, 0.45 * image + 0.55 * _LINE)
 
 
 def _near(z: np.ndarray, spacing: float, slope: np.ndarray) -> np.ndarray:
     """Mark the points on contour lines, which have the same width on steep and on level ground."""
     distance = np.abs((z + spacing / 2) % spacing - spacing / 2)
     return distance < np.minimum(0.0028 * slope, 0.05 * spacing)
-
-
-def _everywhere(image: np.ndarray, conditions: list[np.ndarray]) -> np.ndarray:
-    return np.logical_and.reduce([np.broadcast_to(condition, image.shape[:2]) for condition in conditions])
 
 
 def _draw(image: np.ndarray, where: np.ndarray, colour: np.ndarray) -> np.ndarray:

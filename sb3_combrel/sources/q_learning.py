@@ -163,9 +163,7 @@ class QLearning:
             best = 0.0 if terminated else float(self._values(next_tiles).max())
             error = reward + self.gamma * best - values[action]
             if not math.isfinite(error):
-                raise ValueError(
-                    f"the Q-values overflow {when}, at the reward {reward:g}: scale the environment's rewards down"
-                )
+                raise ValueError(f"the Q-values overflow {when}, at the reward {reward:g}: scale the rewards down")
             traces *= self.gamma * self.trace_decay
             traces[tiles] = 0.0
             traces[tiles, action] = 1.0

@@ -127,8 +127,8 @@ class SourceInstances:
         :param model: an SB3 model or policy (anything with its ``predict``), a function from one state, raw units, shape
             (n_variables,), to an action, or None for random actions
         :param env: an environment, a vectorised one, or an id; one that was given is left open. Under ``VecNormalize``
-            the model sees normalised states and the original ones are recorded; those at the end of an episode are
-            computed back from normalised ones, so what ``clip_obs`` has cut off stays cut off.
+            the model sees normalised states and the original ones are recorded, but of an episode's last one what
+            ``clip_obs`` has cut off stays cut off.
         :param n_instances: number of transitions to record
         :param seed: seed of the environment, the random actions and the model's own randomness; None for none
         :param deterministic: whether an SB3 model takes its deterministic actions
@@ -302,7 +302,6 @@ class SourceInstances:
 
         :param path: path of the file; the suffix .npz is added if there is none
         :return: the path written to
-        :raises OSError: if the file cannot be written
         """
         target = _with_suffix(path)
         write_whole(target, self.to_bytes())
@@ -336,11 +335,7 @@ class SourceInstances:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> SourceInstances:
-        """
-        What :meth:`to_bytes` wrote.
-
-        :raises ValueError: if it is something else, or is cut short
-        """
+        """What :meth:`to_bytes` wrote; ``ValueError`` if it is something else, or is cut short."""
         try:
             # No pickle: a source file may come from anyone.
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:

@@ -19,9 +19,5 @@ class SourceRecorder(TransitionRecorder):
     """
 
     def source_instances(self) -> SourceInstances:
-        """
-        What has been recorded so far.
-
-        :raises ValueError: if nothing has been
-        """
+        """What has been recorded so far; ``ValueError`` if nothing has been."""
         return SourceInstances(*self.transitions())
