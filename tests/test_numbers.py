@@ -40,13 +40,12 @@ def marks():
     """Page, kind, content of each mark, and the table or paragraph that follows it."""
     found = []
     for page in [*pages(), *(ROOT / "sb3_combrel").rglob("*.py")]:
-        text = page.read_text()
-        pattern = MARK if page.suffix == ".md" else IN_DOCSTRING
-        position = 0
+        text, position, pattern = page.read_text(), 0, MARK if page.suffix == ".md" else IN_DOCSTRING
         while match := pattern.search(text, position):
             position = match.end(2)
             below = text[match.end() :].partition("\n\n")[0].partition("\n<!-- end")[0]
-            found.append(pytest.param(page, match[1], match[2], below, id=f"{name_of(page)}-{match[2][:60]}"))
+            mark = match[2] if pattern is MARK else re.sub(r"\n +", "\n", match[2])
+            found.append(pytest.param(page, match[1], mark, below, id=f"{name_of(page)}-{mark[:60]}"))
     return found
 
 
@@ -104,8 +103,10 @@ def figure_of(file, base, query, figure):
 def figures_of(page, mark, cells=None):
     """All figures of a mark; cells: by heading, of a row of the table that it stands before."""
     mark = re.sub(r"\{([\w -]+)\}", lambda found: cells[found[1]], re.sub(r"\n +", " ", mark))
-    (file, base), *lines = ([part.strip() for part in line.split("|", 1)] for line in mark.splitlines())
-    return [figure_of(page.parent / file, base, rows, each.strip()) for rows, all_ in lines for each in all_.split(";")]
+    (file, base), first, *more = ([part.strip() for part in line.split("|", 1)] for line in mark.splitlines())
+    return [
+        figure_of(page.parent / file, base, rows, each.strip()) for rows, all_ in [first, *more] for each in all_.split(";")
+    ]
 
 
 @pytest.mark.parametrize(("page", "kind", "mark", "below"), marks())
@@ -114,10 +115,8 @@ def test_numbers_are_those_of_the_file(page, kind, mark, below):
         file, number = mark.rsplit(", ", 1)
         stem = (page.parent / file).with_suffix("")
         names = (f"{stem.name}_{number}.csv", f"{stem.name}.csv", f"overview_{number}.csv")
-        [csv] = [stem.with_name(name) for name in names if stem.with_name(name).exists()]
-        headings, rows = cells_of(below)
-        written = read(csv)[1]
-        assert (headings, rows) == (list(written), written.to_numpy().tolist())
+        [written] = [read(stem.with_name(name))[1] for name in names if stem.with_name(name).exists()]
+        assert cells_of(below) == (list(written), written.to_numpy().tolist())
     elif below.startswith("|"):
         headings, rows = cells_of(below)
         for cells in rows:
