@@ -232,7 +232,7 @@ def compare_learning(
     def compare(measure: Callable[[LearningCurves], np.ndarray], difference: Any = bootstrap_difference) -> Comparison:
         first, second = (measure(curves) for curves in both)
         estimate = difference(first, second, n_resamples=n_resamples, seed=seed)
-        return Comparison(first, second, *estimate, p_value_of_difference(first, second, "permutation", seed))
+        return Comparison(first, second, *estimate, p_value_of_difference(first, second, "permutation", seed), True)
 
     def ratio(area: Callable[[LearningCurves], np.ndarray], width: int) -> Comparison:
         # Rounding may leave a run that never rose above the floor just below it.
@@ -249,7 +249,7 @@ def compare_learning(
         first, second = (time_to_threshold(curves, threshold, window) for curves in both)
         estimate = bootstrap_difference(first, second, "median", n_resamples, seed)
         p_value = p_value_of_difference(first, second, "mann-whitney")
-        times = Comparison(first, second, *estimate, p_value, higher_is_better=False)
+        times = Comparison(first, second, *estimate, p_value, False)
     return TransferMeasures(
         jumpstart=compare(lambda curves: initial_return(curves, n_first)),
         asymptotic_performance=compare(lambda curves: asymptotic_return(curves, n_last)),

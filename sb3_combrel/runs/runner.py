@@ -8,6 +8,7 @@ machines of a cluster need no folder in common, and a call that is stopped is co
 from __future__ import annotations
 
 import json
+import logging
 import os
 import pickle
 import signal
@@ -289,7 +290,7 @@ def _parallel(backend: Backend) -> Iterator[Callable[[list[bytes]], Iterator[byt
             import ray
             from ray.util.joblib import register_ray
 
-            ray.init(backend.address, log_to_driver=False, logging_level="ERROR")
+            ray.init(backend.address, log_to_driver=False, logging_level=logging.ERROR)
             stack.callback(ray.shutdown)
             register_ray()
             # Its backend hands results out when all are there.
