@@ -116,16 +116,16 @@ def mean_compliances(method, sample, source, near, action, guard):
     return np.column_stack(of_candidates)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(seeds, st.integers(1, 5), st.sampled_from([0.0, 0.1]))
 def test_combrel_selects_the_best_mapping_of_the_equations(seed, k, guard):
     method, sample, source, rng = combrel_and_its_sample(seed, n_neighbors=k, min_evidence=guard)
-    states, actions, first = rng.random((6, 3)), np.tile(np.arange(2), 3), method.candidates.arrays.first
+    states, actions, first = rng.random((4, 3)), np.tile(np.arange(2), 2), method.candidates.arrays.first
     chosen = method.selected(states, actions)
     changed_pairs(method)
     on_grid = method.choices().reshape(2, -1)
     asked = list(zip(states, actions, chosen, strict=True))
-    asked += [(GRID[p], a, on_grid[a, p]) for a in (0, 1) for p in rng.choice(len(GRID), 3)]
+    asked += [(GRID[p], a, on_grid[a, p]) for a in (0, 1) for p in rng.choice(len(GRID), 2)]
     for state, action, candidate in asked:
         near = equations.nearest_transitions(state, action, sample, k)
         compliances = mean_compliances(method, sample, source, near, action, guard)
@@ -138,7 +138,7 @@ def test_combrel_selects_the_best_mapping_of_the_equations(seed, k, guard):
             assert means[candidate - first[action]] == pytest.approx(means[best], rel=1e-9)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seeds, st.floats(0.1, 0.6))
 def test_combrel_transfers_the_instances_of_the_equations(seed, breadth):
     method, _, source, rng = combrel_and_its_sample(seed, breadth=breadth)

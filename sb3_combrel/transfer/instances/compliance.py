@@ -202,7 +202,9 @@ def _mapping_compliance(m, n, scratch):
         total += scratch.weight[j]
         transition += scratch.weight[j] * scratch.hit[j]
         rewarded += scratch.weight[j] * scratch.reward[j]
-    return 0.0 if total < scratch.min_evidence else (transition / total) * (rewarded / total)
+    if total < scratch.min_evidence or total == 0.0:
+        return 0.0
+    return (transition / total) * (rewarded / total)
 
 
 @part
