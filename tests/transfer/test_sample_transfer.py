@@ -20,7 +20,7 @@ from sb3_combrel.transfer import equations
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
-from sb3_combrel.transfer.methods.task_compliance import candidate_compliances, draw_instances
+from sb3_combrel.transfer.methods.sample_transfer import candidate_compliances, draw_instances
 
 POINTS = np.random.default_rng(5).random((12, 3))
 BANDWIDTHS = (0.05, 0.02, 1.0)

@@ -9,7 +9,6 @@ from helpers import factored as f
 
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.methods import soft_mapping as soft
-from sb3_combrel.transfer.methods.soft_predictions import MixturePredictions
 from sb3_combrel.transfer.source_model import SourceModel
 
 SIZES = [(1, 1, True), (2, 2, False), (2, 2, True), (2, 4, True), (3, 2, True), (3, 1, False)]
@@ -164,7 +163,7 @@ def mixture(sample, n_target=3):
     rng = np.random.default_rng(0)
     readings = soft.all_readings(2, n_target, True)
     logits = soft.Logits(rng.normal(size=(2, 2, 2 * n_target)), rng.normal(size=(2, 4, 3)))
-    predictions = MixturePredictions(model, readings, np.array([0.5, 0.5]), sample)
+    predictions = soft.MixturePredictions(model, readings, np.array([0.5, 0.5]), sample)
     predictions.set_terms(soft.most_probable(*soft.probabilities(logits, readings), 4, 0.9))
     return predictions
 

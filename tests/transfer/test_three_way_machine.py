@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_combrel.transfer.methods import three_way_machine as machines
+from sb3_combrel.transfer.methods import three_way_rbm as machines
 
 SIZES = 3, 4, 2
 N_FACTORS = 5
@@ -45,13 +45,6 @@ def naive_free_energy(machine, source, target):
 
 def tensors(*arrays):
     return [th.from_numpy(np.asarray(each, dtype=float)) for each in arrays]
-
-
-def test_the_energy_is_that_of_the_whole_tensor():
-    machine, (source, target) = some_machine(), some_units()
-    hidden = np.random.default_rng(2).integers(2, size=(6, SIZES[1])).astype(float)
-    expected = [naive_energy(machine, *rows) for rows in zip(source, hidden, target, strict=True)]
-    np.testing.assert_allclose(machines.energy(machine, *tensors(source, hidden, target)).numpy(), expected)
 
 
 def test_the_free_energy_sums_over_all_hidden_states():
