@@ -33,12 +33,8 @@ class Expert(NamedTuple):
 @dataclass
 class Playing:
     """
-    An episode that is going on.
+    An episode that is going on: who acts (agent or expert), the sum of rewards, steps, and how many an expert decided.
 
-    :param arm: who acts: the agent, or an expert
-    :param total: rewards so far
-    :param steps: steps so far
-    :param acted: how many of them an expert decided
     :param state: the state that was reached, unit coordinates; None before the first step
     """
 
@@ -55,9 +51,9 @@ class MappingExperts(Transfer):
     Every mapping gives a policy, and what acts in an episode, one of these or the agent, is chosen by the returns so far.
 
     Paper: Talvitie & Singh, "An experts algorithm for transfer learning" (IJCAI 2007). An expert is a mapping: a state of the
-    target is seen as one of the source, the action that is greedy there by the source's value function is found, and one of
-    the target actions that map to it is taken, at random if there are several. If none maps to it, the best source action to
-    which one does; where the source has no data, the agent decides. The value function is planned from the source's instances
+    target is seen as one of the source, and one of the target actions that map to the action that is greedy there is taken, at
+    random if there are several. If none maps to it, the best source action to which one does; where the source has no data,
+    the agent decides. The value function is planned from the source's instances
     (:class:`~sb3_combrel.transfer.source_policy.SourcePolicy`). Whatever acts, the agent learns from every transition, and
     nothing else is transferred: the model is that of no transfer.
 
@@ -72,11 +68,8 @@ class MappingExperts(Transfer):
       guess of the experts' mixing time, then the best as long as it keeps its promise. Here there are episodes, and UCB1. What
       is kept of the distrust is ``patience``: an expert that takes longer than the agent does hands over to it.
     - The learning agent is among those who may act. As it gets better, its mean is that of the later half of its episodes.
-    - The paper's algorithm is given its experts; here at most ``max_experts`` are drawn from a set of mappings.
-
-    Cost: an episode of the target for each expert before anything is repeated, of which the expert takes no more than
-    ``patience`` times as many steps as the agent in its own last one; the agent may then go on. If no expert is any good these
-    steps are lost, but for what the agent learns from them.
+    - The paper's algorithm is given its experts; here at most ``max_experts`` are drawn from a set of mappings. An episode of
+      the target goes to each before anything is repeated.
 
     Example::
 
@@ -238,7 +231,6 @@ class MappingExperts(Transfer):
         return [(name, mean, arms.count(k)) for k, (name, mean) in enumerate(zip(names, means, strict=True))]
 
     def _best(self) -> int:
-        """Who has had the highest mean return."""
         means = self.mean_returns()
         return AGENT if np.isnan(means).all() else int(np.nanargmax(means))
 
@@ -295,7 +287,6 @@ def best_by_ucb1(returns: list[list[float]], exploration: float) -> int:
     Choose by UCB1, on returns in parts of the range that they have had; the first of equal ones.
 
     :param returns: of the agent and of each expert; those that have none are not chosen
-    :param exploration: factor on the bonus
     """
     everything = [total for of_arm in returns for total in of_arm]
     bonus = (max(everything) - min(everything)) * exploration

@@ -74,11 +74,11 @@ class LearnedTranslation(Transfer):
     """
     Learns a mapping from random samples of both tasks, once; then all source data are instances in target coordinates.
 
-    The first ``n_random_steps`` transitions of the target are its sample: :meth:`action` asks for random actions until then,
-    and nothing is transferred. The sample of the source is drawn from its instances. Then a subclass translates all source
-    instances, with their rewards and ends, and nothing is learned any more. Where the target's own instances do not suffice,
-    the nearest translated ones come first, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`, which is given them
-    with the identity as its mapping.
+    The first ``n_random_steps`` transitions of the target, with random actions, are its sample; until then nothing is
+    transferred. The sample of the source is drawn from its instances. Then a subclass translates all source instances, with
+    their rewards and ends, which takes some seconds, and nothing is learned any more. Where the target's own instances do not
+    suffice, the nearest translated ones come first: :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL` is given them with
+    the identity as its mapping.
 
     :param source: source instances, or a path to them
     :param n_random_steps: steps of the target that its sample takes
@@ -166,7 +166,6 @@ class LearnedTranslation(Transfer):
         self._seconds = perf_counter() - began
 
     def _transfer_rows(self, rows: np.ndarray) -> None:
-        """Transfer the source's instances from now on, with these states, actions and next states in unit coordinates."""
         assert self.task is not None
         task, source, d = self.task, self._source, self.task.n_variables
         self._rows = rows
@@ -221,10 +220,7 @@ class LearnedTranslation(Transfer):
         return figures if self._timbrel is None else {**figures, **self._timbrel.statistics()}
 
     def _spread(self) -> float:
-        """Standard deviation of the translated instances' states over that of the sample's, mean over variables; or NaN.
-
-        Near 0 where the mapping takes all source states for the same target state, because it has found no relation.
-        """
+        """Standard deviation of the translated states over that of the sample's, mean over variables; near 0: no relation."""
         if self.translated is None or self.task is None:
             return np.nan
         sampled = self._samples[:, : self.task.n_variables].std(axis=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -353,6 +353,12 @@ def check_action_mappings(sets: Sequence[MappingSet]) -> None:
             )
 
 
-def action_table(mappings: MappingSet, numbers: Sequence[int]) -> np.ndarray:
-    """Return some action mappings of a set, one a row: int64, shape (len(numbers), n_target_actions)."""
-    return np.array([mappings.actions[number] for number in numbers], dtype=np.int64)
+def members_of(mappings: MappingSet) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Go through a set: state mappings, int64, shape (n, 1), with their source actions, int64, shape (n, n_target_actions)."""
+    numbers = range(mappings.n_action_mappings) if mappings.pairs is None else mappings.pairs[:, 1].tolist()
+    actions = np.array([mappings.actions[number] for number in numbers], dtype=np.int64)
+    if mappings.pairs is not None:
+        yield mappings.pairs[:, :1], actions
+        return
+    for row in range(mappings.n_state_mappings):
+        yield np.full((len(actions), 1), row), actions

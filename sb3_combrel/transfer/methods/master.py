@@ -15,14 +15,8 @@ from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
-from sb3_combrel.transfer.instances.selectors import Ranges, Selector, SelectorParts
-from sb3_combrel.transfer.methods.mapping_transfer import (
-    DEFAULT_BREADTH,
-    DEFAULT_BREADTH_DECAY,
-    MappingTransfer,
-    action_table,
-    check_action_mappings,
-)
+from sb3_combrel.transfer.instances.selectors import FixedSelector, Ranges, SelectorParts
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_choice import Choice
@@ -52,10 +46,8 @@ class MASTER(MappingTransfer):
       variables that a mapping leaves out stay as they are, as in COMBREL.
     - The learner is Fitted R-Max, and what is transferred is what TIMBREL transfers through a mapping that is given.
 
-    Cost: ``n_random_steps`` of the target, which are learned from as any others; until then nothing is transferred. In each of
-    these steps the source predicts once for each state mapping and source action, 36 times for Mountain Car 2D to 4D. The
-    number of action mappings does not matter where all of them are in the set. There 20 steps are enough; noisy tasks need
-    more.
+    The agent learns from the random steps as from any others; until they are over nothing is transferred. From Mountain Car 2D
+    to 4D 20 are enough; noisy tasks need more.
 
     Example::
 
@@ -86,7 +78,7 @@ class MASTER(MappingTransfer):
         if is_factored(self.mappings):
             raise ValueError(f"mappings must be a set of which one mapping is chosen, no factored ones, got {self.mappings!r}")
         if self.use is None:
-            if self.breadth == DEFAULT_BREADTH and self.breadth_decay == DEFAULT_BREADTH_DECAY:
+            if self.breadth == MappingTransfer.breadth and self.breadth_decay == MappingTransfer.breadth_decay:
                 self._left_open = {"use": None}
             self.use = "instances"
         super().__post_init__()
@@ -111,20 +103,15 @@ class MASTER(MappingTransfer):
             first_renewal=self.n_random_steps,
         )
 
-    @property
-    def _n_seen(self) -> int:
-        """Transitions by which is chosen that have been seen."""
-        return min(self.n_random_steps, self._source_use.n_observed)
-
     def action(self, state: np.ndarray) -> int | None:
-        if self._n_seen >= self.n_random_steps:
+        if self.mapping_steps() >= self.n_random_steps:
             return None
         assert self.task is not None
         return int(self.rng.integers(self.task.n_actions))
 
     def mapping_steps(self) -> int:
         """Return how many random steps of the target have been taken to find the mapping."""
-        return self._n_seen
+        return min(self.n_random_steps, self._source_use.n_observed)
 
     @property
     def chosen(self) -> InterTaskMapping | None:
@@ -153,34 +140,27 @@ def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
     :return: unit coordinates of the target, shape (n_copies, n_target_actions, most source actions)
     """
     left_out = (copies.state < 0).astype(np.float64)
-    found: np.ndarray = sums.error.sum(axis=3) + (left_out @ sums.effect.T)[:, :, None]
-    return found
+    return np.asarray(sums.error.sum(axis=3) + (left_out @ sums.effect.T)[:, :, None])
 
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
     """
     Find the mapping of a set with the least error, the first of equal ones.
 
-    :param errors: of each state mapping, target action and source action, shape (n_state_mappings, n_target_actions,
-        n_source_actions)
-    :param mappings: the set
+    :param errors: shape (n_state_mappings, n_target_actions, n_source_actions)
     :return: the error of all target actions together, the state mapping, and the source action of each target action
     """
-    pairs, each_action = mappings.pairs, np.arange(errors.shape[1])
-    if pairs is None and isinstance(mappings.actions, AllActionMappings):
+    if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # Every combination is in the set: the best source action of each target action can be found on its own.
         of_row = errors.min(axis=2).sum(axis=1)
         row = int(of_row.argmin())
         return float(of_row[row]), row, errors[row].argmin(axis=1)
-    if pairs is not None:
-        actions = action_table(mappings, pairs[:, 1].tolist())
-        of_member = errors[pairs[:, :1], each_action, actions].sum(axis=1)
+    found = []
+    for rows, actions in members_of(mappings):
+        of_member = errors[rows, np.arange(errors.shape[1]), actions].sum(axis=1)
         best = int(of_member.argmin())
-        return float(of_member[best]), int(pairs[best, 0]), actions[best]
-    actions = action_table(mappings, range(mappings.n_action_mappings))
-    totals = np.array([of_row[each_action, actions].sum(axis=1) for of_row in errors])
-    row, number = divmod(int(totals.argmin()), totals.shape[1])
-    return float(totals[row, number]), row, actions[number]
+        found.append((float(of_member[best]), int(rows[best, 0]), actions[best]))
+    return min(found, key=lambda one: one[0])
 
 
 def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySums) -> Choice:
@@ -201,7 +181,7 @@ def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySum
     return Choice(np.full((len(actions), 1), row, dtype=np.int64), actions[:, None].copy())
 
 
-class LeastErrorSelector(Selector):
+class LeastErrorSelector(FixedSelector):
     """
     Selects nothing until it has seen so many transitions; then, for good, the mapping that predicted their effects best.
 
@@ -210,18 +190,16 @@ class LeastErrorSelector(Selector):
     :param n_transitions: transitions by which is chosen
     """
 
-    makes_choices = True
     needs_transitions = True
 
     def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
-        super().__init__(*parts)
         task = parts.task
+        super().__init__(*parts, fixed=np.full(task.n_actions, -1, dtype=np.int64))
         self.copies = copies
         self.n_transitions = n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
         #: The mapping that was chosen, None before.
         self.choice: Choice | None = None
-        self._candidate = np.full(task.n_actions, -1, dtype=np.int64)
         self._just_chosen = False
 
     def takes_transitions(self) -> bool:
@@ -233,7 +211,7 @@ class LeastErrorSelector(Selector):
         if i + 1 == self.n_transitions:
             self.choice = choose_least_error(self.copies, self.candidates.sets, self.sums)
             for action, (row, source_action) in enumerate(np.hstack(self.choice).tolist()):
-                self._candidate[action] = self._find(action, row, source_action)
+                self.fixed[action] = self._find(action, row, source_action)
             self._just_chosen = True
 
     def _find(self, action: int, row: int, source_action: int) -> int:
@@ -247,15 +225,12 @@ class LeastErrorSelector(Selector):
         return int(first + np.flatnonzero(fits)[0])
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        chosen = self._candidate[actions]
+        chosen = self.fixed[actions]
         return np.maximum(chosen, 0), chosen + 1
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         just_chosen, self._just_chosen = self._just_chosen, False
         return just_chosen
-
-    def choices(self) -> np.ndarray:
-        return np.repeat(self._candidate, len(self.task.sample_states))
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         for i in range(min(self.transitions.n, self.n_transitions)):

@@ -17,7 +17,7 @@ from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
 from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.instances.task_compliance_selector import TaskComplianceSelector
-from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, action_table, check_action_mappings
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
@@ -38,16 +38,14 @@ class SampleTransfer(MappingTransfer):
     What differs from the paper:
 
     - The paper's tasks have the same variables and actions. Here each mapping of each source is a task, all sources being
-      equally likely beforehand, and all mappings to one source. There are thousands; their compliances are never listed: an
-      instance that is translated for a target action depends on the state mapping and one source action, and the compliances
-      of all tasks that have these are added up.
+      equally likely beforehand, and all mappings to one source. There are thousands, whose compliances are never listed: those
+      of all tasks with the same state mapping and source action for a target action are added up.
     - Instances are drawn for each target action, the same number for all, without replacement.
     - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice: the
       nearest first, until the threshold is reached, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
     - The paper draws once, after a batch of transitions of the target. Here instances are drawn after ``min_transitions``, and
       again whenever there are 1.2 times as many, with the same random numbers, so that more of those drawn stay. With
       ``min_transitions`` and ``max_transitions`` equal they are drawn once.
-    - As in COMBREL, a transition complies with no task whose instances are all far from it.
 
     What to expect: where tasks differ in one action or one pair of variables, as mappings do, their mean compliances over all
     transitions differ little, and many instances come through wrong mappings. COMBREL chooses by state and action instead.
@@ -117,25 +115,21 @@ class SampleTransfer(MappingTransfer):
         """Draw instances by compliance with the first ``n`` transitions, and relevance to them."""
         if self._n_draws == 0:
             self._seed = int(self.rng.integers(MAX_SEED))
-        self._show_drawn(self._drawn_by(n))
-        self._n_of_draw = n
-        self._n_draws += 1
-        if self._n_of_first == 0 and len(self.drawn):
-            self._n_of_first = n
-        self._instances.all_changed = True
-
-    def _drawn_by(self, n: int) -> np.ndarray:
-        """Candidates and numbers of the instances that the first ``n`` transitions, the selector's, say are to be drawn."""
         assert self.task is not None
         relevances = np.ones((len(self.candidates), int(self.candidates.instances.size.max())))
         if self.relevance:
             self._instances.measure_relevance(n_used=n, values=relevances)
         compliances = candidate_compliances(self.candidates, self._tasks.sums, n)
         n_each = max(1, self.n_instances // self.task.n_actions)
-        return draw_instances(self.candidates, compliances, relevances, n_each, np.random.default_rng(self._seed))
+        generator = np.random.default_rng(self._seed)
+        self._show_drawn(draw_instances(self.candidates, compliances, relevances, n_each, generator))
+        self._n_of_draw = n
+        self._n_draws += 1
+        if self._n_of_first == 0 and len(self.drawn):
+            self._n_of_first = n
+        self._instances.all_changed = True
 
     def _show_drawn(self, drawn: np.ndarray) -> None:
-        """Transfer these instances from now on."""
         assert self.task is not None
         self.drawn = drawn
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
@@ -187,9 +181,9 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
     Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
 
     The compliance of a task, Lambda_X of Eq. 6, is the sum over target actions of the compliances of their transitions,
-    divided by the number of all transitions. Every mapping of the set is as likely as any other.
+    divided by the number of all transitions.
 
-    :param mappings: the mappings to one source
+    :param mappings: the mappings to one source, each as likely as any other
     :param sums: compliances of the target's transitions added up, by state mapping, target action and source action, shape
         (n_state_mappings, n_target_actions, n_source_actions)
     :param n_transitions: of all target actions together
@@ -202,16 +196,11 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
         others = of_action.sum(axis=1, keepdims=True) - of_action
         everything: np.ndarray = sums + others[:, :, None]
         return everything / (n_transitions * n_rows * n_source_actions)
-    found, each_action = np.zeros_like(sums), np.arange(n_actions)
-    if mappings.pairs is not None:
-        rows, actions = mappings.pairs[:, :1], action_table(mappings, mappings.pairs[:, 1].tolist())
-        of_task = sums[rows, each_action, actions].sum(axis=1) / (n_transitions * len(rows))
-        np.add.at(found, (rows, each_action, actions), of_task[:, None])
-        return found
-    actions = action_table(mappings, range(mappings.n_action_mappings))
-    for row in range(n_rows):
-        of_task = sums[row][each_action, actions].sum(axis=1) / (n_transitions * n_rows * len(actions))
-        np.add.at(found[row], (each_action, actions), of_task[:, None])
+    found = np.zeros_like(sums)
+    for rows, actions in members_of(mappings):
+        members = rows, np.arange(n_actions), actions
+        of_task = sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings)
+        np.add.at(found, members, of_task[:, None])
     return found
 
 
@@ -219,11 +208,6 @@ def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transition
     """
     Return for each candidate the compliance of all virtual source tasks that have it, added up.
 
-    Among the candidates of a target action it is in proportion to the probability that an instance comes from a task with
-    that candidate, if tasks are drawn in proportion to their compliance. Sources are equally likely beforehand, and so are
-    the mappings to each.
-
-    :param candidates: the candidates of every target action, of all sources
     :param sums: see :func:`mean_compliances`; the state mappings of all sources one below the other, their actions numbered on
     :param n_transitions: of all target actions together
     :return: shape (n_candidates,); of each target action they add up to the mean compliance of all tasks
@@ -256,7 +240,6 @@ def draw_instances(
     :param compliances: of each candidate, shape (n_candidates,)
     :param relevances: of each candidate's instances, shape (n_candidates, most instances of an action)
     :param n: instances of each target action, at most; fewer if no more have a probability above 0
-    :param rng: the same one draws much the same from probabilities that are much the same
     :return: candidate and number of its instance, one a row, in order, int64, shape (n_drawn, 2)
     """
     size = candidates.instances.size[candidates.arrays.action]
@@ -276,11 +259,7 @@ def draw_instances(
 
 
 def instances_of_each(candidates: Candidates, drawn: np.ndarray) -> Instances:
-    """
-    Return drawn instances by candidate, in the coordinates of their sources.
-
-    :param drawn: candidate and number of its instance, one a row, in order, int64, shape (n, 2)
-    """
+    """Return what :func:`draw_instances` has drawn, by candidate, in the coordinates of their sources."""
     source, (candidate, number) = candidates.instances, drawn.T
     action = candidates.arrays.action[candidate]
     at = action, number

@@ -47,9 +47,9 @@ class SoftHomomorphism(Transfer):
     What was changed. The paper maps to a finite set of source states, or by features made by hand; a distribution over ways to
     read variables needs neither. It transfers the source's value function; here the mixture's model is the prior, and the
     agent plans. Actions are mapped as well, by parameters of their own. A target with twice the variables of the source is
-    taken for two copies of it, which are mapped each in its own way, with source actions of their own; their predictions are
-    added. Scale and offset are not parameters: in unit coordinates, ranges correspond. As only the mean is fitted, a source
-    action can also come out as the mean of others that it equals, such as no push as half a push to either side.
+    taken for two copies of it, mapped each in its own way; their predictions are added. Scale and offset are not parameters:
+    in unit coordinates, ranges correspond. As only the mean is fitted, a source action can also come out as the mean of others
+    that it equals, such as no push as half a push to either side.
 
     What it claims to know without instances of the target: see :class:`~sb3_combrel.transfer.prior.claims.Claims`.
 
@@ -109,7 +109,7 @@ class SoftHomomorphism(Transfer):
         self._mean = source.scaling.to_unit(source.states).mean(axis=0)
         self._readings = soft.all_readings(source.n_variables, d, self.mirrored)
         copies = max(1, d // source.n_variables) if self.n_copies is None else self.n_copies
-        columns = soft.n_readings(source.n_variables, d, self.mirrored)
+        columns = 1 + int(self._readings.number.max())
         self._shape = Logits(
             np.zeros((copies, source.n_variables, columns)), np.zeros((copies, task.n_actions, source.n_actions))
         )
@@ -191,13 +191,13 @@ class SoftHomomorphism(Transfer):
 
     def _all_predictions(self, states: np.ndarray) -> np.ndarray:
         """What each mapping with each source action predicts, shape (n, n_mappings, n_source_actions, n_target_variables)."""
-        variable, sign, _ = self._readings
-        n, m, d = len(states), len(variable), states.shape[1]
-        at = soft.as_source(np.repeat(states, m, axis=0), np.tile(variable, (n, 1)), np.tile(sign, (n, 1)), self._mean)
+        n, m, d = len(states), len(self._readings.variable), states.shape[1]
+        mapping = np.tile(np.arange(m), n)
+        at = soft.to_source(np.repeat(states, m, axis=0), self._readings, mapping, self._mean)
         found = np.empty((n, m, self._source.n_actions, d))
         for b in range(self._source.n_actions):
-            effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect.reshape(n, m, -1)
-            found[:, :, b] = soft.brought_back(effects, variable, sign, d)
+            effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect
+            found[:, :, b] = soft.to_target(effects, self._readings, mapping, d).reshape(n, m, d)
         return found
 
     def _judge(self, predicted: soft.Predicted) -> None:
@@ -246,7 +246,7 @@ class SoftHomomorphism(Transfer):
         """
         Say what each target action is taken for most probably: "East: Right on (x, vx) 0.97, Neutral on (y, vy) 0.41; ...".
 
-        Probabilities are those of mapping and source action together; low ones, where the mean of several is what fits.
+        Probabilities are those of mapping and source action together, low where the mean of several is what fits.
         """
         assert self.task is not None
         if self._logits is None:

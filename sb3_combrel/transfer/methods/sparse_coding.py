@@ -21,12 +21,7 @@ FIRST_NOISE = 0.1
 
 
 class Codes(NamedTuple):
-    """
-    Both samples as sparse codes over one dictionary.
-
-    :param source: float64, shape (n_source_samples, n_atoms); ``target``: the same for the target's
-    :param dictionary: shape (n_atoms, n_target_columns)
-    """
+    """Both samples as sparse codes, shape (n_samples, n_atoms), over one dictionary, shape (n_atoms, n_target_columns)."""
 
     source: np.ndarray
     target: np.ndarray
@@ -35,14 +30,9 @@ class Codes(NamedTuple):
 
 def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity: float, seed: int) -> Codes:
     """
-    Code the triplets of both tasks over one dictionary.
-
-    The source's are coded first over as many atoms as the target's triplets have columns, so that both have the same number
-    of columns; a larger dictionary is then learned for these codes, over which the target's triplets are coded as well.
+    Code the triplets of both tasks over one dictionary, see :class:`SparseCodingMapping`.
 
     :param source: standardised triplets, one a row; ``target``: the same
-    :param n_atoms: of the larger dictionary
-    :param sparsity: weight of the codes' absolute values beside half the squared error
     :param seed: of the dictionaries' first atoms
     """
     from sklearn.decomposition import DictionaryLearning, sparse_encode
@@ -94,17 +84,14 @@ class SparseCodingMapping(LearnedTranslation):
     paired with the target triplet whose code is nearest; a Gaussian process learns the mapping from these pairs, and carries
     all source data over to the target. Nothing is learned about the mapping afterwards.
 
-    What was changed. Triplets are of unit coordinates, with the effect in place of the next state, which beside its state
-    says little, and with one column for each action in place of its number; all columns are standardised, the first codes too.
-    The regression is an exact Gaussian process, on at most ``n_source_samples`` pairs, not a sparse one. Translated data are
-    instances that join the target's own, nearest first, instead of what fitted Q-iteration or LSPI starts from. Rewards and
-    ends are the source's.
+    What was changed. Triplets are of unit coordinates, with the effect in place of the next state and one column for each
+    action, standardised, the first codes too. The regression is an exact Gaussian process, not a sparse one. Translated data
+    are instances that join the target's own, nearest first, instead of what fitted Q-iteration or LSPI starts from. Rewards
+    and ends are the source's.
 
     What to expect. The atoms of the first dictionary come in any order and with any sign, and are compared with the columns of
     the target's triplets one by one: nothing in the method makes pairs correspond, and the regression fits whatever pairs it
     is given. ``transfer/prediction_error`` says how well the instances that were used then predicted the target.
-
-    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
 
     Example::
 

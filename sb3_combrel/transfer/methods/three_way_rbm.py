@@ -39,8 +39,6 @@ class ThreeWayRBM(LearnedTranslation):
     mean of the target's sample, whatever the source triplet (``transfer/translated_spread`` tells how near). Given pairs that
     belong together it does learn what relates them, but no task gives such pairs.
 
-    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
-
     Example::
 
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=ThreeWayRBM(source, n_random_steps=100))
@@ -100,14 +98,6 @@ class Machine(NamedTuple):
     hidden_bias: th.Tensor
     target_bias: th.Tensor
 
-    @classmethod
-    def random(cls, sizes: tuple[int, int, int], n_factors: int, generator: th.Generator) -> Machine:
-        """Draw small weights; ``sizes``: numbers of source, hidden and target units."""
-        source, hidden, target = (
-            th.randn((n, n_factors), generator=generator, dtype=th.float64) * FIRST_DEVIATION for n in sizes
-        )
-        return cls(source, hidden, target, *(th.zeros(n, dtype=th.float64) for n in sizes[1:]))
-
 
 def hidden_input(machine: Machine, source: th.Tensor, target: th.Tensor) -> th.Tensor:
     """Return the log-odds of the hidden units given all others, shape (n, n_hidden)."""
@@ -145,13 +135,13 @@ def train(
     Train a machine on samples of both tasks, in batches, by Adam.
 
     :param source: standardised triplets, one a row; ``target``: the same
-    :param n_updates: number of batches
-    :param seed: of the first weights, the batches and the hidden units
     :param paired: whether rows of the same number belong together; otherwise rows are paired at random, anew in each batch
     """
     generator = th.Generator().manual_seed(seed)
     sizes = source.shape[1], n_hidden, target.shape[1]
-    machine = Machine(*(each.requires_grad_() for each in Machine.random(sizes, n_factors, generator)))
+    weights = [th.randn((n, n_factors), generator=generator, dtype=th.float64) * FIRST_DEVIATION for n in sizes]
+    biases = [th.zeros(n, dtype=th.float64) for n in sizes[1:]]
+    machine = Machine(*(each.requires_grad_() for each in (*weights, *biases)))
     from_rows, to_rows = th.from_numpy(source), th.from_numpy(target)
     optimizer = th.optim.Adam(machine, lr=STEP_SIZE)
     for _ in range(n_updates):
@@ -164,12 +154,7 @@ def train(
 
 
 def reconstruct(machine: Machine, source: np.ndarray) -> np.ndarray:
-    """
-    Return the target units that the machine takes source units for: mean-field iterations from hidden units without a target.
-
-    :param source: standardised triplets, shape (n, n_source)
-    :return: shape (n, n_target)
-    """
+    """Return the target units, shape (n, n_target), that mean-field iterations find for source units, (n, n_source)."""
     units = th.from_numpy(np.ascontiguousarray(source))
     target = machine.target_bias.expand(len(units), -1)
     for _ in range(N_RECONSTRUCTIONS):
