@@ -1,6 +1,7 @@
-"""COMBREL's selection against a naive version of Algorithm 1, and that it finds which variables and actions correspond."""
+"""COMBREL's selection against a naive version of Algorithm 1; it finds which variables and actions correspond, and learns."""
 
 import copy
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -16,108 +17,45 @@ from helpers.asking import (
     transferred_to_all,
     transferred_to_pairs,
 )
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
-from sb3_combrel import COMBREL
-from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from combrel_envs.mountain_car_dynamics import PUSHES, step_axis
+from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.transfer.equations import Bandwidths
 
 BANDWIDTHS = Bandwidths(0.05, 0.05, 1.0)
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-class NaiveSelection:
-    """Lines 17 to 20 of Algorithm 1, mapping by mapping."""
-
-    def __init__(self, sources, mappings, n_neighbors):
-        self.sources, self.mappings, self.k = sources, mappings, n_neighbors
-        self.seen = []
-        self.known = {}
-
-    def means(self, state, action):
-        """Mean compliance of each (source, mapping) with the nearest transitions of ``action``."""
-        near = sorted((t for t in self.seen if t.action == action), key=lambda t: naive.distance(t.state, state))[: self.k]
-        if not near:
-            return {}
-        return {
-            (number, mapping.state, mapping.sign, mapping.action[action]): np.mean(
-                [self.compliance(t, number, mapping) for t in near]
-            )
-            for number, of_source in enumerate(self.mappings)
-            for mapping in of_source
-        }
-
-    def compliance(self, transition, number, mapping):
-        """Naive, but computed once only."""
-        key = (id(transition), number, mapping)
-        if key not in self.known:
-            self.known[key] = naive.compliance(transition, self.sources[number], mapping, BANDWIDTHS)
-        return self.known[key]
-
-
-@pytest.mark.parametrize("n_neighbors", [1, 3, 5])
-def test_every_pair_gets_the_mapping_with_the_highest_mean_compliance_of_its_neighbors(n_neighbors):
-    rng = np.random.default_rng(n_neighbors)
-    sources = [naive.random_source(rng, 40, 2, 2), naive.random_source(rng, 40, 1, 3)]
-    task = naive.target_task(POINTS[::5], 2)
-    method = bound(COMBREL(sources, n_neighbors=n_neighbors, bandwidths=BANDWIDTHS), task)
-    selection = NaiveSelection(sources, [MappingSet.injective(s.n_variables, 3, s.n_actions, 2) for s in sources], n_neighbors)
-    named, n_points = named_candidates(method), len(task.sample_states)
-    for _ in range(12):
-        transition = naive.random_transition(rng, 3, 2)
-        show(method, transition)
-        selection.seen.append(transition)
-    n_chosen, choices = 0, choices_of(method)
-    for pair in pairs_of(task):
-        means = selection.means(task.sample_states[pair % n_points], pair // n_points)
-        chosen = choices[pair]
-        if chosen < 0:
-            assert max(means.values(), default=0.0) == 0.0
-        else:
-            n_chosen += 1
-            assert means[named[chosen]] == pytest.approx(max(means.values()), rel=1e-9)
-    assert n_chosen > 0
-    for state in rng.random((20, 3)):
-        for action, chosen in enumerate(method.selected(np.tile(state, (2, 1)), np.arange(2))):
-            means = selection.means(state, action)
-            assert (chosen < 0) == (max(means.values()) == 0.0)
-            assert chosen < 0 or means[named[chosen]] == pytest.approx(max(means.values()), rel=1e-9)
-
-
-def test_the_chosen_mapping_translates_at_grid_points_and_at_exact_states():
-    rng = np.random.default_rng(5)
-    source = naive.random_source(rng, 200, 2, 2)
-    task = naive.target_task(POINTS, 2)
-    method = bound(COMBREL(source, breadth=0.2, bandwidths=BANDWIDTHS), task)
+@pytest.mark.parametrize("n_neighbors", [1, 3])
+def test_at_a_state_of_the_sample_the_choice_and_the_instances_are_those_of_the_exact_state(n_neighbors):
+    """That these are the equations' is tested with Algorithm 1."""
+    rng, task = np.random.default_rng(5), naive.target_task(POINTS, 2)
+    sources = [naive.random_source(rng, 200, 2, 2), naive.random_source(rng, 40, 1, 3)]
+    method = bound(COMBREL(sources, n_neighbors=n_neighbors, breadth=0.2, bandwidths=BANDWIDTHS), task)
     for _ in range(30):
         show(method, naive.random_transition(rng, 3, 2))
-    named, pairs, n_transferred = named_candidates(method), pairs_of(task), 0
-    own = rng.uniform(0.0, 1.2, len(pairs))
-    changed_pairs(method, own >= 1.0)
-    found = transferred_to_pairs(method, pairs, own)
-    for pair in pairs:
-        chosen, expected = method.choices()[pair], []
-        if chosen >= 0 and own[pair] < 1.0:
-            _, index, sign, source_action = named[chosen]
-            state = task.sample_states[pair % len(POINTS)]
-            drawn_from = [(source, InterTaskMapping(index, [source_action], sign), 0)]
-            expected = naive.transferred(state, own[pair], drawn_from, task, 0.2)
-        n = found.length[pair]
-        assert n == len(expected)
-        np.testing.assert_allclose(found.weight[pair, :n], [e[0] for e in expected], rtol=1e-9)
-        np.testing.assert_allclose(found.effect[pair, :n], np.array([e[1] for e in expected]).reshape(n, 3), atol=1e-12)
-        n_transferred += n > 0
-    assert n_transferred > 20
-    # At a sample state itself, the choice and the instances are those of the grid point.
     method.end_episode(False)
     changed_pairs(method)
+    on_grid, n_transferred = method.choices(), 0
     for point in range(len(POINTS)):
-        at = copy.deepcopy(transferred_at(method, POINTS[point], np.zeros(2)))
-        on_grid = transferred_to_pairs(method, point + len(POINTS) * np.arange(2), np.zeros(2))
-        for action in range(2):
-            n = at.length[action]
-            assert n == on_grid.length[action]
-            np.testing.assert_array_equal(at.effect[action, :n], on_grid.effect[action, :n])
+        own, pairs = rng.uniform(0.0, 1.2, 2), point + len(POINTS) * np.arange(2)
+        np.testing.assert_array_equal(method.selected(np.tile(POINTS[point], (2, 1)), np.arange(2)), on_grid[pairs])
+        at = copy.deepcopy(transferred_at(method, POINTS[point], own))
+        found = transferred_to_pairs(method, pairs, own)
+        np.testing.assert_array_equal(at.length, found.length[:2])
+        for action, n in enumerate(at.length):
+            np.testing.assert_array_equal(at.effect[action, :n], found.effect[action, :n])
+            n_transferred += n > 0
+        method.note_use(transferred_at(method, POINTS[point], own))
+    assert n_transferred > 20
+    counts, figures = method.mapping_counts(), method.statistics()
+    assert counts == sorted(counts, key=lambda entry: -entry[1])
+    assert figures["transfer/uses"] == sum(n for _, n in counts) == n_transferred
+    assert 0.0 <= figures["transfer/choice_entropy"] <= np.log(figures["transfer/distinct_mappings"]) + 1e-9
 
 
 def test_changed_marks_exactly_the_pairs_whose_choice_changed():
@@ -162,7 +100,7 @@ def test_a_choice_that_changed_and_changed_back_is_not_marked():
 
 
 def test_choices_of_known_pairs_are_not_renewed_until_they_are_unknown_again():
-    """And transitions that are near to known pairs only are not measured. A removed instance can make a pair unknown."""
+    """A removed instance can make a pair unknown."""
     rng = np.random.default_rng(3)
     task = naive.target_task(POINTS, 2)
     lazy, eager = (bound(COMBREL(naive.random_source(np.random.default_rng(9), 60, 2, 2)), task) for _ in range(2))
@@ -173,16 +111,8 @@ def test_choices_of_known_pairs_are_not_renewed_until_they_are_unknown_again():
         show(eager, transition)
     assert sorted(changed_pairs(lazy, known)) == sorted(set(changed_pairs(eager)) - set(np.flatnonzero(known)))
     assert (lazy.choices()[known] == -1).all()
-    assert 0 < lazy._instances.selector._cache.measured.sum() < eager._instances.selector._cache.measured.sum()
     lazy.end_episode(False)
     np.testing.assert_array_equal(choices_of(lazy), eager.choices())
-
-
-def test_without_transitions_nothing_is_transferred():
-    task = naive.target_task(POINTS, 2)
-    method = bound(COMBREL(naive.random_source(np.random.default_rng(0), 100, 2, 2), breadth=1.0), task)
-    assert not any(weights for weights, _, _ in transferred_to_all(method, task))
-    assert not transferred_at(method, POINTS[0], np.zeros(2)).length.any()
 
 
 def test_measured_in_the_first_episode_nothing_is_transferred_before_it_ends_and_nothing_changes_after():
@@ -212,9 +142,11 @@ def test_measured_in_the_first_episode_nothing_is_transferred_before_it_ends_and
     assert transferred_to_all(paper, task) == at_its_end != transferred_to_all(online, task)
 
 
-def test_no_more_transitions_are_recorded_than_allowed():
-    rng = np.random.default_rng(2)
-    method = bound(COMBREL(naive.random_source(rng, 50), max_transitions=7), naive.target_task(POINTS, 2))
+def test_without_transitions_nothing_is_transferred_and_no_more_are_recorded_than_allowed():
+    rng, task = np.random.default_rng(2), naive.target_task(POINTS, 2)
+    method = bound(COMBREL(naive.random_source(rng, 50), max_transitions=7, breadth=1.0), task)
+    assert not any(weights for weights, _, _ in transferred_to_all(method, task))
+    assert not transferred_at(method, POINTS[0], np.zeros(2)).length.any()
     for _ in range(20):
         show(method, naive.random_transition(rng, 3, 2))
     assert method.statistics()["transfer/target_transitions"] == 7
@@ -241,3 +173,112 @@ def test_episodes_that_reach_their_limit_narrow_the_kernel_of_contradicted_insta
     assert transferred_to_all(steady, task) == before
     assert transferred_to_all(decaying, task) == transferred_to_all(narrow, task) != before
     assert changed_pairs(decaying).tolist() == pairs_of(task).tolist()
+
+
+def mountain_car(n, seed, n_axes=1):
+    """Single steps of Mountain Car from states all over its space."""
+    rng = np.random.default_rng(seed)
+    low, high = np.repeat([-1.2, -0.07], n_axes), np.repeat([0.6, 0.07], n_axes)
+    states, actions = rng.uniform(low, high, (n, 2 * n_axes)), rng.integers(len(PUSHES[n_axes]), size=n)
+    after = np.empty_like(states)
+    for i, axis in np.ndindex(n, n_axes):
+        push = PUSHES[n_axes][actions[i]][axis]
+        after[i, [axis, n_axes + axis]] = step_axis(states[i, axis], states[i, n_axes + axis], push)
+    ends = (after[:, :n_axes] >= 0.5).all(axis=1)
+    return SourceInstances(states, actions, -np.ones(n), after, ends, low, high, len(PUSHES[n_axes]))
+
+
+def changed(source, columns, actions):
+    """The same steps with the variables in another order, and other numbers for the actions."""
+    units, ends = ((x - source.low) / (source.high - source.low) for x in (source.states, source.next_states))
+    rows = np.array(actions)[source.actions], source.rewards, ends[:, columns], source.terminated
+    return SourceInstances(units[:, columns], *rows, np.zeros(2), np.ones(2), 3)
+
+
+def noise(seed, n=500):
+    """A source that has nothing to do with any task: from anywhere to somewhere near."""
+    rng = np.random.default_rng(seed)
+    states = rng.random((n, 2))
+    after, never = np.clip(states + 0.1 * rng.normal(size=(n, 2)), 0.0, 1.0), np.zeros(n, dtype=bool)
+    return SourceInstances(states, rng.integers(3, size=n), -np.ones(n), after, never, np.zeros(2), np.ones(2), 3)
+
+
+def choices_after(method, target, resolution=8):
+    """What the method has chosen after it has seen the target: for each action (source, state, sign, source action)s."""
+    d = target.n_variables
+    axes = [np.linspace(0.05, 0.95, resolution)] * d
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
+    bound(method, naive.target_task(points, target.n_actions))
+    starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
+    for i in range(len(target)):
+        show(method, naive.Transition(starts[i], int(target.actions[i]), float(target.rewards[i]), ends[i]))
+    named = named_candidates(method)
+    return [[named[c] for c in row if c >= 0] for row in choices_of(method).reshape(target.n_actions, -1)]
+
+
+def share(chosen, fits):
+    """The part of the choices, over all actions, that ``fits(target action, choice)``."""
+    hits = [fits(action, choice) for action, row in enumerate(chosen) for choice in row]
+    assert len(hits) > 100
+    return np.mean(hits)
+
+
+def test_of_several_sources_the_one_that_fits_is_chosen_with_its_variables_and_actions_in_another_order():
+    sources = [noise(0), changed(mountain_car(1000, 0), columns=(1, 0), actions=(2, 0, 1)), noise(1)]
+    chosen = choices_after(COMBREL(sources), mountain_car(400, 1))
+    assert share(chosen, lambda action, choice: choice[:2] == (1, (1, 0))) > 0.9
+    # By chance it would be one in three.
+    assert share(chosen, lambda action, choice: choice[3] == [2, 0, 1][action]) > 0.65
+
+
+def test_each_action_of_the_larger_car_gets_the_axis_that_it_drives():
+    """East and West act like Right and Left on x; from y's point of view they do nothing. North and South: vice versa."""
+    chosen = choices_after(COMBREL(mountain_car(1000, 0)), mountain_car(1500, 2, 2), resolution=4)
+    along_x, along_y = (0, None, 1, None), (None, 0, None, 1)
+    fitting = [{(along_x, 0), (along_y, 0)}]
+    fitting += [{(along_x, 1), (along_y, 0)}, {(along_x, 2), (along_y, 0)}]
+    fitting += [{(along_y, 1), (along_x, 0)}, {(along_y, 2), (along_x, 0)}]
+    for action, row in enumerate(chosen):
+        by_number = Counter((choice[1], choice[3]) for choice in row).most_common(2)
+        assert {way for way, _ in by_number} == fitting[action]
+        assert sum(n for _, n in by_number) > 0.6 * len(row)
+
+
+def learned(transfer, n_episodes, seed=0):
+    """The lengths of the first episodes."""
+    env = make_vec_env("combrel/MountainCar2D-v0", seed=seed, env_kwargs=dict(max_episode_steps=500))
+    model = FittedRMax(env, transfer=transfer, model_breadth=1 / 16, resolution=4, seed=seed)
+    model.learn(10**6, callback=StopTrainingOnMaxEpisodes(n_episodes))
+    return np.array([episode["l"] for episode in model.ep_info_buffer])
+
+
+def test_a_source_that_is_the_target_saves_the_exploration():
+    with_transfer, without = learned(COMBREL(mountain_car(1000, 0)), 3), learned(None, 3)
+    assert with_transfer.max() < 250
+    assert with_transfer.sum() < without.sum() * 3 / 4
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+def test_a_source_that_has_nothing_to_do_with_the_target_does_not_hold_learning_up_for_long(seed):
+    with_transfer, without = learned(COMBREL(noise(seed)), 10, seed), learned(None, 10, seed)
+    assert with_transfer[-5:].max() < 250
+    assert with_transfer.sum() < 1.2 * without.sum()
+
+
+@pytest.mark.parametrize("relevance", [False, True, "near"])
+def test_with_relevance_the_instances_that_the_target_contradicts_come_last(relevance):
+    """Half of the source's instances are from the target, the other half say that nothing ever moves."""
+    good, target = mountain_car(400, 0), mountain_car(300, 1)
+    states, after = np.vstack([good.states, good.states + 1e-6]), np.vstack([good.next_states, good.states + 1e-6])
+    rows = np.tile(good.actions, 2), np.tile(good.rewards, 2)
+    source = SourceInstances(states, *rows, after, np.zeros(800, dtype=bool), good.low, good.high, 3)
+    task = naive.target_task(np.random.default_rng(0).uniform(0.1, 0.9, (100, 2)), 3)
+    method = bound(COMBREL(source, InterTaskMapping([0, 1], [0, 1, 2]), relevance=relevance), task)
+    starts, ends = ((x - target.low) / (target.high - target.low) for x in (target.states, target.next_states))
+    for i in range(len(target)):
+        show(method, naive.Transition(starts[i], int(target.actions[i]), -1.0, ends[i]))
+    changed_pairs(method)
+    effects = np.array([effect for _, of_pair, _ in transferred_to_all(method, task) for effect in of_pair])
+    still = np.mean(np.abs(effects).max(axis=1) == 0.0)
+    assert still < 0.1 if relevance else still > 0.4

@@ -1,18 +1,17 @@
 """Mappings as experts: what each does, who acts in which episode, and that the agent learns from all of it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
 from helpers.asking import bound
-from helpers.walk import GOAL, STRIDE, Walk, same_parameters, small, walk_source
+from helpers.walk import GOAL, STRIDE, Walk, small, walk_source
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingExperts, MappingSet, SourceInstances
-from sb3_combrel.tensorboard.callback import DashboardCallback
+from sb3_combrel import InterTaskMapping, MappingExperts, MappingSet, SourceInstances
 from sb3_combrel.transfer.methods.experts import best_by_ucb1
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
@@ -32,22 +31,6 @@ def play(method, total, steps=1, environment=0, truncated=False):
         state = after
     method.end_episode(truncated)
     return decided, method._episodes[-1][0]
-
-
-def test_values_of_the_walk_are_those_of_walking_to_the_goal():
-    """The walk's length from each place is known: V = -(1 - gamma^n) / (1 - gamma)."""
-    gamma = 0.95
-    policy = SourcePolicy(walk_source(400), gamma, 0.2)
-
-    def value(place):
-        return -(1.0 - gamma ** (math.floor((GOAL - place) / STRIDE) + 1)) / (1.0 - gamma)
-
-    for n in range(1, 13):
-        # Half a stride from where one step more is needed: rewards and ends are averages over a neighbourhood.
-        place = GOAL - STRIDE * (n - 0.5)
-        q = policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))
-        assert q[1] == pytest.approx(value(place), abs=0.2)
-        assert q[0] == pytest.approx(-1.0 + gamma * value(max(place - STRIDE, -1.0)), abs=0.2)
 
 
 def line_source(stride, reward_at_goal, n=400):
@@ -138,19 +121,9 @@ def test_source_variables_that_no_target_variable_maps_to_are_typical():
 
 
 def test_each_expert_uses_its_own_source():
-    away = walk_source()
     # The same walk with its actions exchanged.
-    other = type(away)(
-        states=away.states,
-        actions=1 - away.actions,
-        rewards=away.rewards,
-        next_states=away.next_states,
-        terminated=away.terminated,
-        low=away.low,
-        high=away.high,
-        n_actions=2,
-    )
-    method = experts_of([SAME], source=[away, other])
+    other = replace(walk_source(), actions=1 - walk_source().actions)
+    method = experts_of([SAME], source=[walk_source(), other])
     assert [expert.source for expert in method.experts] == [0, 1]
     assert [method.expert_action(k, np.array([0.4, 0.5])) for k in (1, 2)] == [1, 0]
 
@@ -305,110 +278,6 @@ def test_with_the_right_mapping_the_first_episode_of_the_expert_is_as_short_as_c
     assert first < second
     model.learn(10_000, StopTrainingOnMaxEpisodes(12))
     assert model.policy.transfer.describe()[1][1] == second
-
-
-def test_wrong_mappings_are_given_up():
-    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), OPPOSITE, exploration=0.1))
-    model.learn(10_000, StopTrainingOnMaxEpisodes(30))
-    arms = [arm for arm, *_ in model.policy.transfer._episodes]
-    assert arms[:2] == [0, 1] and arms.count(1) <= 5
-    assert model.policy.transfer.statistics()["transfer/best_expert"] == 0
-
-
-def test_experts_do_not_act_in_evaluation():
-    """The deterministic action is that of a model that was given the same transitions, and has no experts."""
-    model = small(transfer=MappingExperts(walk_source())).learn(150)
-    decided = model.policy.transfer._episodes, model.policy.transfer._playing.keys()
-    before = (list(decided[0]), list(decided[1]))
-    states = np.column_stack([np.linspace(-1.0, 1.0, 21), np.ones(21)]).astype(np.float32)
-    generator = model.policy.transfer.rng.bit_generator.state
-    for deterministic in (True, False):
-        model.predict(states, deterministic=deterministic)
-    assert (list(decided[0]), list(decided[1])) == before
-    assert model.policy.transfer.rng.bit_generator.state == generator
-
-
-def test_the_same_seed_gives_the_same_run():
-    one, same, other = (
-        small(transfer=MappingExperts(walk_source(), max_experts=3), seed=seed).learn(150) for seed in (1, 1, 2)
-    )
-    assert same_parameters(one, same)
-    assert one.policy.transfer.experts == same.policy.transfer.experts != other.policy.transfer.experts
-
-
-@pytest.mark.parametrize("n_episodes", [1, 3, 9])
-def test_saved_and_loaded_it_goes_on_as_it_would(n_episodes, tmp_path):
-    arguments = dict(max_experts=4, exploration=0.3, patience=None, gamma=0.9, source_breadth=0.3)
-    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), "all", **arguments))
-    model.learn(10_000, StopTrainingOnMaxEpisodes(n_episodes))
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk(start=-0.5))
-    method, again = model.policy.transfer, loaded.policy.transfer
-    assert same_parameters(model, loaded)
-    assert {name: again.arguments()[name] for name in arguments} == arguments
-    assert again.experts == method.experts and len(method.experts) == 4
-    assert again._episodes == method._episodes and len(method._episodes) == n_episodes
-    np.testing.assert_equal(again.statistics(), method.statistics())
-    for each in (model, loaded):
-        each.learn(each.num_timesteps + 100, reset_num_timesteps=False)
-    assert again._episodes == method._episodes and len(method._episodes) > n_episodes
-    assert same_parameters(model, loaded)
-
-
-def test_parameters_taken_back_in_the_middle_of_an_episode():
-    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), SAME, patience=None))
-    model.learn(10_000, StopTrainingOnMaxEpisodes(1))
-    model.learn(model.num_timesteps + 4, reset_num_timesteps=False)
-    method, saved = model.policy.transfer, model.get_parameters()
-    before = vars(method._playing[0]).copy()
-    assert (before["arm"], before["steps"], before["acted"]) == (1, 4, 4)
-    model.set_parameters(saved)
-    np.testing.assert_equal(vars(method._playing[0]), before)
-
-
-def test_its_figures_are_logged(tmp_path):
-    model = small(transfer=MappingExperts(walk_source()), tensorboard_log=str(tmp_path))
-    model.learn(300, DashboardCallback(scalar_share=1.0), tb_log_name="run")
-    events = EventAccumulator(str(next(tmp_path.glob("run_*"))))
-    events.Reload()
-    [*_, last] = events.Scalars("transfer/expert_steps")
-    assert last.value > 0.0
-    assert {"transfer/steps_to_find_mapping", "transfer/best_expert"} <= set(events.Tags()["scalars"])
-
-
-@pytest.mark.parametrize(
-    ("argument", "message"),
-    [
-        ({"max_experts": 0}, "max_experts must be a whole number of at least 1, got 0"),
-        ({"max_experts": 2.0}, "max_experts must be a whole number of at least 1, got 2.0"),
-        ({"exploration": -0.1}, "exploration must be at least 0, got -0.1"),
-        ({"exploration": np.nan}, "exploration must be a finite number, got nan"),
-        ({"patience": 0.0}, "patience must be a number above 0, got 0.0"),
-        ({"patience": "long"}, "patience must be a number above 0, got 'long'"),
-        ({"gamma": 1.0}, "gamma must be below 1, got 1.0"),
-        ({"gamma": 0.0}, "gamma must be a number above 0 and at most 1, got 0.0"),
-        ({"source_breadth": None}, "source_breadth must be a number above 0, got None"),
-        ({"mappings": "factored"}, "mappings must be a set of mappings, one an expert, no factored ones, got 'factored'"),
-        ({"mappings": FactoredMapping((SAME,))}, "mappings must be a set of mappings, one an expert, no factored ones"),
-    ],
-)
-def test_arguments_out_of_range_are_refused(argument, message):
-    with pytest.raises(ValueError, match=message):
-        MappingExperts(walk_source(), **argument)
-
-
-@pytest.mark.parametrize(
-    ("source", "mappings", "message"),
-    [
-        (None, "injective", "source must be SourceInstances, a path to them, or a list of these.*got None"),
-        (walk_source(), "bijective", "mappings must be one of injective"),
-        (walk_source(), InterTaskMapping([0, None, 1], [0, 1]), "state must have 2 entries"),
-        (walk_source(), InterTaskMapping([0, 1], [0, 2]), "action must hold indices from 0 to 1"),
-    ],
-)
-def test_what_does_not_fit_the_target_is_refused(source, mappings, message):
-    with pytest.raises(ValueError, match=message):
-        small(transfer=MappingExperts(source, mappings))
 
 
 def test_a_set_that_is_too_large_to_draw_from_is_refused():

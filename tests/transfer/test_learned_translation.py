@@ -1,27 +1,27 @@
-"""Learned translations: what the two methods share, and each of their parts against plain computations."""
+"""Learned translations: what they share, sparse codes, and the three-way machine, against plain computations."""
 
 import inspect
+from itertools import product
 
 import numpy as np
 import pytest
+import torch as th
 from helpers import factored as f
 from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import random_source, target_task
 from helpers.ring import Ring
-from helpers.walk import Walk, learnt_on, same_parameters, small, walk_source
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel import (
     TIMBREL,
     FittedRMax,
     InterTaskMapping,
-    SoftHomomorphism,
     SourceInstances,
     SparseCodingMapping,
     ThreeWayRBM,
 )
+from sb3_combrel.transfer.methods import three_way_rbm as machines
 from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
-from sb3_combrel.transfer.methods.sparse_coding import Regression, nearest_pairs, sparse_codes
+from sb3_combrel.transfer.methods.sparse_coding import fit_regression, sparse_codes
 
 METHODS = [SparseCodingMapping, ThreeWayRBM]
 QUICK = {SparseCodingMapping: {"n_atoms": 8}, ThreeWayRBM: {"n_updates": 50, "n_hidden": 4, "n_factors": 4}}
@@ -117,7 +117,7 @@ def test_it_samples_first_then_translates_once():
     assert len(drawn) == 40 and drawn <= {tuple(row) for row in source.scaling.to_unit(source.states)}
     before = method.translated
     observe(method, (states[12:], actions[12:], effects[12:]))
-    assert method.translated is before and method.n_samples == 12
+    assert method.translated is before and method.mapping_steps() == 12
     np.testing.assert_array_equal(before.rewards, source.rewards)
     np.testing.assert_array_equal(before.terminated, source.terminated)
     found = method.statistics()
@@ -151,113 +151,6 @@ def test_actions_are_random_until_the_sample_is_complete(method):
     assert made.action(states[0]) in (0, 1, 2)
     observe(made, (states[19:], actions[19:], effects[19:]))
     assert made.action(states[0]) is None
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_same_seed_gives_the_same_translation(method):
-    made = [bound(quick(method, f.oscillator_source(60)), f.target_task(2, 3), seed) for seed in (0, 0, 1)]
-    for each in made:
-        observe(each, random_transitions(20, 2, 3))
-    first, same, other = (each.get_state() for each in made)
-    assert all(np.array_equal(first[name], same[name]) for name in first)
-    assert not np.array_equal(first["translated"], other["translated"])
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("n", [0, 7, 20, 35])
-def test_what_is_restored_transfers_and_goes_on_as_if_nothing_had_happened(method, n):
-    transitions = random_transitions(50, 2, 3)
-    task = target_task(np.random.default_rng(0).random((6, 2)), 3)
-    one = bound(quick(method, f.oscillator_source(60)), task)
-    observe(one, [column[:n] for column in transitions])
-    again = bound(type(one)(**one.arguments()), task, seed=9)
-    assert {name: array.shape[1:] for name, array in again.get_state().items()} == {
-        name: array.shape[1:] for name, array in one.get_state().items()
-    }
-    again.set_state(one.get_state())
-    again.rng.bit_generator.state = one.rng.bit_generator.state
-    for _ in range(2):
-        for name, array in one.get_state().items():
-            np.testing.assert_array_equal(array, again.get_state()[name])
-        both = [transferred_to_pairs(each, np.arange(18), np.zeros(18)) for each in (one, again)]
-        np.testing.assert_array_equal(both[0].length, both[1].length)
-        for row, k in enumerate(both[0].length[:18]):
-            for ours, theirs in zip(both[0][1:], both[1][1:], strict=True):
-                np.testing.assert_array_equal(ours[row, :k], theirs[row, :k])
-        for each in (one, again):
-            observe(each, [column[n:] for column in transitions])
-    # Seconds are measured, not restored.
-    figures = [each.statistics() for each in (one, again)]
-    assert {**figures[0], "transfer/mapping_seconds": 0.0} == pytest.approx(
-        {**figures[1], "transfer/mapping_seconds": 0.0}, nan_ok=True
-    )
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("steps", [15, 60])
-def test_a_model_is_saved_and_loaded_with_it(method, steps, tmp_path):
-    path = walk_source().save(tmp_path / "source.npz")
-    arguments = {"source": str(path), "n_random_steps": 20, "breadth": 0.2, **QUICK[method]}
-    model = small(transfer={f"sb3_combrel.{method.__name__}": arguments}).learn(steps)
-    model.save(tmp_path / "model")
-    path.unlink()
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
-    assert type(loaded.policy.transfer) is method and loaded.policy.transfer.breadth == 0.2
-    assert same_parameters(model, loaded)
-    loaded.learn(40, reset_num_timesteps=False)
-    assert loaded.policy.transfer.statistics()["transfer/mapping_found"] == 1.0
-
-
-RESUMED = {
-    "SparseCodingMapping": lambda: quick(SparseCodingMapping, walk_source()),
-    "ThreeWayRBM": lambda: quick(ThreeWayRBM, walk_source()),
-    "SoftHomomorphism": lambda: SoftHomomorphism(walk_source(), n_starts=2),
-}
-
-
-@pytest.mark.parametrize("name", RESUMED)
-def test_learning_goes_on_to_the_last_bit(name, tmp_path):
-    """Saved at an episode's end, a loaded model learns what the model itself learns when it learns on."""
-    model, loaded = learnt_on(
-        small(transfer=RESUMED[name]()).learn(10**6, callback=StopTrainingOnMaxEpisodes(3)), tmp_path, 80
-    )
-    assert same_parameters(model, loaded)
-    assert model.agent.model.n_instances > 100
-
-
-def test_it_learns_with_instances_translated_by_the_right_mapping():
-    """The walk's line is its source's, its variables and actions swapped: pairs are modelled by what was translated."""
-    source = walk_source()
-    columns = {name: getattr(source, name)[:, ::-1] for name in ("states", "next_states")}
-    swapped = SourceInstances(**columns, actions=1 - source.actions, rewards=source.rewards, terminated=source.terminated,
-                              low=source.low[::-1], high=source.high[::-1], n_actions=2)  # fmt: skip
-    models = [small(transfer=Swapping(swapped, n_random_steps=n, breadth=0.15)).learn(12) for n in (10, 20)]
-    assert models[0].agent.statistics()["model/transferred"] > 0.1
-    assert models[1].agent.statistics()["model/transferred"] == 0.0
-
-
-BAD_ARGUMENTS = [
-    ("n_random_steps", 9),
-    ("n_random_steps", 1e3),
-    ("n_source_samples", 0),
-    ("breadth", 0.0),
-    ("breadth", np.nan),
-    ("breadth_decay", 1.1),
-    ("transfer_terminals", 1),
-]
-BAD_OF_ONE = [
-    (SparseCodingMapping, "n_atoms", 0),
-    (SparseCodingMapping, "sparsity", 0.0),
-    (ThreeWayRBM, "n_hidden", 0),
-    (ThreeWayRBM, "n_factors", None),
-    (ThreeWayRBM, "n_updates", -1),
-]
-
-
-@pytest.mark.parametrize(("method", "name", "value"), [(m, *bad) for m in METHODS for bad in BAD_ARGUMENTS] + BAD_OF_ONE)
-def test_an_argument_out_of_its_range_is_refused_by_name_and_value(method, name, value):
-    with pytest.raises(ValueError, match=f"{name} must be .*, got {value!r}"):
-        method(f.oscillator_source(60), **{name: value})
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -297,16 +190,121 @@ def test_codes_are_the_best_for_their_dictionary():
     assert np.abs(gradient[~on]).max() <= 0.3 + 5e-3
 
 
-def test_pairs_are_the_nearest():
-    rng = np.random.default_rng(0)
-    source, target = rng.normal(size=(30, 4)), rng.normal(size=(20, 4))
-    expected = [min(range(20), key=lambda j: ((target[j] - row) ** 2).sum()) for row in source]
-    assert nearest_pairs(source, target).tolist() == expected
-
-
 def test_from_the_right_pairs_the_regression_recovers_two_permuted_variables():
     rng = np.random.default_rng(0)
     source, unseen = rng.normal(size=(80, 2)), rng.normal(size=(40, 2))
-    regression = Regression(source, source[:, ::-1], seed=0)
-    assert regression.error < 1e-4
+    regression = fit_regression(source, source[:, ::-1], seed=0)
     np.testing.assert_allclose(regression.predict(unseen), unseen[:, ::-1], atol=0.05)
+
+
+SIZES = 3, 4, 2
+N_FACTORS = 5
+
+
+def some_machine(seed=0):
+    """A machine with weights of any size, and biases."""
+    rng = np.random.default_rng(seed)
+    shapes = [(n, N_FACTORS) for n in SIZES] + [(SIZES[1],), (SIZES[2],)]
+    return machines.Machine(*(th.from_numpy(0.5 * rng.normal(size=shape)) for shape in shapes))
+
+
+def some_units(n=6, seed=1):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n, SIZES[0])), rng.normal(size=(n, SIZES[2]))
+
+
+def naive_energy(machine, source, hidden, target):
+    """The energy with the whole tensor of weights, one unit after the other."""
+    w_source, w_hidden, w_target, hidden_bias, target_bias = (each.detach().numpy() for each in machine)
+    energy = 0.0
+    for i, j, k in product(*map(range, SIZES)):
+        weight = sum(w_source[i, f] * w_hidden[j, f] * w_target[k, f] for f in range(N_FACTORS))
+        energy -= weight * source[i] * hidden[j] * target[k]
+    energy -= sum(hidden[j] * hidden_bias[j] for j in range(SIZES[1]))
+    return energy + sum((target[k] - target_bias[k]) ** 2 / 2.0 for k in range(SIZES[2]))
+
+
+def all_hidden():
+    return [np.array(state, dtype=float) for state in product((0, 1), repeat=SIZES[1])]
+
+
+def naive_free_energy(machine, source, target):
+    return -np.log(sum(np.exp(-naive_energy(machine, source, hidden, target)) for hidden in all_hidden()))
+
+
+def tensors(*arrays):
+    return [th.from_numpy(np.asarray(each, dtype=float)) for each in arrays]
+
+
+def test_the_free_energy_sums_over_all_hidden_states():
+    machine, (source, target) = some_machine(), some_units()
+    expected = [naive_free_energy(machine, *rows) for rows in zip(source, target, strict=True)]
+    np.testing.assert_allclose(machines.free_energy(machine, *tensors(source, target)).numpy(), expected)
+
+
+def test_hidden_units_are_on_with_the_probability_that_the_energies_give():
+    machine, (source, target) = some_machine(), some_units()
+    found = th.sigmoid(machines.hidden_input(machine, *tensors(source, target))).numpy()
+    for row in range(6):
+        weights = [np.exp(-naive_energy(machine, source[row], hidden, target[row])) for hidden in all_hidden()]
+        expected = sum(w * hidden for w, hidden in zip(weights, all_hidden(), strict=True)) / sum(weights)
+        np.testing.assert_allclose(found[row], expected)
+
+
+def test_the_mean_of_the_target_units_is_where_the_energy_is_least():
+    machine, (source, _) = some_machine(), some_units()
+    hidden = np.random.default_rng(2).integers(2, size=(6, SIZES[1])).astype(float)
+    found = machines.target_mean(machine, *tensors(source, hidden)).numpy()
+    for row in range(6):
+        least = naive_energy(machine, source[row], hidden[row], found[row])
+        for k in range(SIZES[2]):
+            moved = [found[row] + step * np.eye(SIZES[2])[k] for step in (-0.1, 0.1)]
+            rises = [naive_energy(machine, source[row], hidden[row], each) - least for each in moved]
+            np.testing.assert_allclose(rises, 0.005)
+
+
+def test_contrastive_divergence_is_the_mean_free_energy_of_the_data_less_that_of_reconstructions_which_are_data_as_well():
+    source, target = some_units()
+    machine = machines.Machine(*(each.requires_grad_() for each in some_machine()))
+    found = machines.contrastive_divergence(machine, *tensors(source, target), th.Generator().manual_seed(3))
+    on = th.sigmoid(machines.hidden_input(machine, *tensors(source, target)))
+    drawn = (th.rand(on.shape, generator=th.Generator().manual_seed(3), dtype=th.float64) < on).double()
+    again = machines.target_mean(machine, th.from_numpy(source), drawn).detach()
+    energies = [naive_free_energy(machine, *rows) for rows in zip(source, target, strict=True)]
+    energies += [-naive_free_energy(machine, *rows) for rows in zip(source, again.numpy(), strict=True)]
+    assert found.item() == pytest.approx(sum(energies) / 6)
+    each = [machines.free_energy(machine, th.from_numpy(source), to) for to in (th.from_numpy(target), again)]
+    expected = th.autograd.grad((each[0] - each[1]).mean(), machine)
+    for ours, theirs in zip(th.autograd.grad(found, machine), expected, strict=True):
+        np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=1e-12)
+
+
+def test_from_pairs_that_belong_together_it_recovers_two_permuted_variables():
+    rng = np.random.default_rng(0)
+    source, unseen = rng.normal(size=(200, 2)), rng.normal(size=(50, 2))
+    sizes = dict(n_hidden=8, n_factors=8, n_updates=800, seed=0)
+    machine = machines.train(source, source[:, ::-1].copy(), paired=True, **sizes)
+    found = machines.reconstruct(machine, unseen)
+    assert ((found - unseen[:, ::-1]) ** 2).mean() < 0.02
+    # With the pairs of the samples unknown there is nothing to be recovered.
+    machine = machines.train(source, source[:, ::-1].copy(), **sizes)
+    assert ((machines.reconstruct(machine, unseen) - unseen[:, ::-1]) ** 2).mean() > 0.5
+
+
+def test_training_depends_on_its_seed_alone_and_leaves_pytorchs_generator_and_threads_alone():
+    source, target = some_units(30)
+    state, threads = th.get_rng_state(), th.get_num_threads()
+    made = [machines.train(source, target, n_hidden=3, n_factors=3, n_updates=20, seed=seed) for seed in (0, 0, 1)]
+    assert th.equal(th.get_rng_state(), state) and th.get_num_threads() == threads
+    assert all(th.equal(one, same) for one, same in zip(made[0], made[1], strict=True))
+    assert not th.equal(made[0].source, made[2].source)
+
+
+@pytest.mark.parametrize("n", [1, 7])
+def test_a_reconstruction_is_a_fixed_point_of_its_iterations_where_weights_are_small(n):
+    machine = machines.Machine(*(0.3 * each for each in some_machine()))
+    source = some_units(n)[0]
+    found = machines.reconstruct(machine, source)
+    units, target = tensors(source, found)
+    again = machines.target_mean(machine, units, th.sigmoid(machines.hidden_input(machine, units, target)))
+    np.testing.assert_allclose(found, again.numpy(), atol=1e-9)

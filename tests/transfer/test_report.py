@@ -265,7 +265,7 @@ def test_results_that_are_not_there_yet_are_refused_with_what_to_do(name):
 
 def test_an_object_shows_its_arguments():
     text = repr(COMBREL(SOURCE, n_neighbors=5, use="instances"))
-    assert text == f"COMBREL(source={SOURCE!r}, mappings='injective', n_neighbors=5, use='instances')"
+    assert text == f"COMBREL(source={SOURCE!r}, mappings='injective', use='instances', n_neighbors=5)"
     given = TIMBREL(SOURCE, InterTaskMapping((0, 1), (0, 1)), breadth=0.2)
     assert repr(given) == f"TIMBREL(source={SOURCE!r}, mapping=InterTaskMapping(state=(0, 1), action=(0, 1)), breadth=0.2)"
     assert repr(COMBREL(SOURCE)) == f"COMBREL(source={SOURCE!r})"

@@ -8,19 +8,15 @@ import numpy as np
 import pytest
 from helpers import naive_transfer as naive
 from helpers.asking import bound, changed_pairs, pairs_of, show, transferred_to_all, transferred_to_pairs
-from helpers.walk import Walk, same_parameters, small, walk_source
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
-from stable_baselines3.common.env_util import make_vec_env
 
-import sb3_combrel
-from sb3_combrel import FactoredMapping, FittedRMax, InterTaskMapping, MappingSet, SampleTransfer
+from sb3_combrel import InterTaskMapping, MappingSet, SampleTransfer
 from sb3_combrel.transfer import equations
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
-from sb3_combrel.transfer.methods.task_compliance import candidate_compliances, draw_instances
+from sb3_combrel.transfer.methods.sample_transfer import candidate_compliances, draw_instances
 
 POINTS = np.random.default_rng(5).random((12, 3))
 BANDWIDTHS = (0.05, 0.02, 1.0)
@@ -116,6 +112,8 @@ def test_every_mapping_to_every_source_is_a_task():
         for mapping in list(mappings)[::7]:
             expected = eq_6(transitions, sources[number], mapping, lambda _: BANDWIDTHS[0])
             assert method.task_compliance(mapping, number) == pytest.approx(expected, rel=1e-9)
+    with pytest.raises(ValueError, match="mapping must have a state mapping of the set of source 0, got"):
+        method.task_compliance(InterTaskMapping([0, None, None], [0, 0]))
     # What all candidates of an action have together is the mean compliance of all tasks.
     first = method.candidates.arrays.first
     totals = [found[begin:end].sum() for begin, end in itertools.pairwise(first)]
@@ -200,24 +198,6 @@ def places_within(method, number, candidate):
     return {j: int(np.flatnonzero((held == units[j]).all(axis=1))[0]) for j in np.flatnonzero(source.actions == own).tolist()}
 
 
-def test_relevance_is_that_of_the_equations():
-    source, transitions = source_of(), transitions_of(40)
-    for relevance in (True, "near"):
-        method = SampleTransfer(source, LISTED, min_transitions=40, relevance=relevance, bandwidths=BANDWIDTHS)
-        observed(method, transitions, naive.target_task(POINTS, 2))
-        values = np.full((len(method.candidates), int(method.candidates.instances.size.max())), np.nan)
-        method._instances.measure_relevance(n_used=40, values=values)
-        for candidate, (_, action, state, signs, source_action) in ((c, key_of(method, c)) for c in range(len(values))):
-            mapping, given = InterTaskMapping(state, [source_action] * 2, signs), Bandwidths(*BANDWIDTHS)
-            if relevance == "near":
-                expected = naive.near_relevances(source, mapping, action, transitions, given)
-            else:
-                rows = np.flatnonzero(source.actions == source_action).tolist()
-                expected = {j: naive.relevance(source, j, mapping, action, transitions, given, 0.5) for j in rows}
-            for j, place in places_within(method, 0, candidate).items():
-                assert values[candidate, place] == pytest.approx(expected[j], rel=1e-7, abs=1e-9)
-
-
 def test_nothing_is_transferred_before_the_first_draw_and_draws_follow_growth():
     task = naive.target_task(POINTS, 2)
     method = bound(SampleTransfer(source_of(), min_transitions=20, max_transitions=30), task)
@@ -245,96 +225,3 @@ def test_most_of_what_is_drawn_by_compliance_alone_stays_when_there_are_a_few_mo
     after = {tuple(row) for row in method.drawn.tolist()}
     assert method.statistics()["transfer/draws"] == 2
     assert len(before & after) > 0.8 * len(after)
-
-
-def test_more_is_drawn_from_the_source_that_complies_and_through_the_mapping_that_does():
-    """The first source is the target itself; in the second everything moves at random."""
-    rng = np.random.default_rng(0)
-    states, actions = rng.random((300, 2)), rng.integers(2, size=300)
-    effects = 0.1 * np.column_stack([2 * actions - 1, 0.5 - states[:, 0]])
-    good = sb3_combrel.SourceInstances(
-        states, actions, -np.ones(300), states + effects, np.zeros(300, dtype=bool), [0.0, 0.0], [1.0, 1.0], 2
-    )
-    bad = replace(good, next_states=states + 0.2 * rng.normal(size=(300, 2)))
-    method = bound(SampleTransfer([good, bad], min_transitions=100, n_instances=400), naive.target_task(rng.random((9, 2)), 2))
-    for state, action in zip(rng.random((100, 2)), rng.integers(2, size=100), strict=True):
-        after = state + 0.1 * np.array([2 * action - 1, 0.5 - state[0]])
-        show(method, naive.Transition(state, int(action), -1.0, after))
-    drawn = Counter(method.candidates.origins[c].source for c in method.drawn[:, 0])
-    assert drawn[0] > 2 * drawn[1]
-    exchanged = InterTaskMapping([1, 0], [1, 0])
-    compliances = [method.task_compliance(mapping, k) for mapping in (IDENTITY, exchanged) for k in (0, 1)]
-    assert compliances[0] == max(compliances) > 1.5 * max(compliances[1:])
-
-
-def test_it_helps_on_the_walk():
-    steps = {}
-    for name, transfer in (("none", None), ("drawn", SampleTransfer(walk_source(), "all", min_transitions=10))):
-        model = small(Walk(start=-0.5), transfer=transfer, degree=0)
-        model.learn(10_000, StopTrainingOnMaxEpisodes(6))
-        steps[name] = model.num_timesteps
-    assert steps["drawn"] < steps["none"]
-    assert model.policy.transfer.statistics()["transfer/instances_used"] > 0
-
-
-@pytest.mark.parametrize("arguments", [{}, {"relevance": "near"}, {"relevance": False}, {"min_transitions": 70}], ids=repr)
-def test_saved_and_loaded_it_goes_on_as_it_would(arguments, tmp_path):
-    given = {"min_transitions": 15, "n_instances": 40} | arguments
-    model = small(Walk(start=-0.5), transfer=SampleTransfer(walk_source(), **given), degree=0)
-    model.learn(10_000, StopTrainingOnMaxEpisodes(2))
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk(start=-0.5))
-    method, again = model.policy.transfer, loaded.policy.transfer
-    assert same_parameters(model, loaded)
-    assert {name: again.arguments()[name] for name in given} == given
-    draws = method.statistics()["transfer/draws"]
-    assert (draws == 0) == (given["min_transitions"] == 70)
-    np.testing.assert_array_equal(again._tasks.sums, method._tasks.sums)
-    # Shown the same: learning on, planners may differ by backups below the tolerance, which a file does not hold.
-    for transition in transitions_of(80, 2):
-        show(method, transition)
-        show(again, transition)
-        np.testing.assert_array_equal(changed_pairs(again), changed_pairs(method))
-    assert method.statistics()["transfer/draws"] > draws
-    np.testing.assert_array_equal(again.drawn, method.drawn)
-    np.testing.assert_equal(again.statistics(), method.statistics())
-
-
-def test_several_environments_are_observed_together():
-    model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=SampleTransfer(walk_source(), min_transitions=20)).learn(120)
-    assert model.policy.transfer.mapping_steps() == 20
-    assert "SampleTransfer" in str(model.policy.transfer.report())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"n_instances": 0}, "n_instances must be a whole number of at least 1, got 0"),
-        ({"min_transitions": 2.5}, "min_transitions must be a whole number of at least 1, got 2.5"),
-        ({"max_transitions": None}, "max_transitions must be a whole number of at least 1, got None"),
-        ({"min_transitions": 60, "max_transitions": 59}, "max_transitions must be at least min_transitions=60, got 59"),
-        ({"relevance": "far"}, "relevance must be True, False or \"near\", got 'far'"),
-        ({"relevance_fraction": 0.0}, "relevance_fraction must be a number above 0 and at most 1, got 0.0"),
-        ({"breadth": -1.0}, "breadth must be a number above 0, got -1.0"),
-        ({"bandwidths": (1.0, 2.0)}, "bandwidths must be three numbers"),
-        ({"mappings": "factored"}, "mappings must be a set whose members are tasks to draw from, no factored ones, got 'fact"),
-        ({"mappings": FactoredMapping((IDENTITY,))}, "mappings must be a set whose members are tasks to draw from"),
-    ],
-)
-def test_arguments_out_of_range_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        SampleTransfer(walk_source(), **arguments)
-
-
-def test_what_does_not_fit_the_target_is_refused():
-    with pytest.raises(ValueError, match="state must have 2 entries"):
-        small(transfer=SampleTransfer(walk_source(), InterTaskMapping([0, None, 1], [0, 1])))
-    # 12 target actions on 4 source actions, equally often: 369,600 ways.
-    task, many = naive.target_task(POINTS[:, :2].copy(), 12), MappingSet.balanced(2, 2, 4, 12)
-    with pytest.raises(ValueError, match=r"mappings must have at most 100,000 action mappings, .* got 369,600"):
-        bound(SampleTransfer(source_of(0, 2, 4), many), task)
-    # All ways, many more, are no problem.
-    method = observed(SampleTransfer(source_of(0, 2, 4), min_transitions=20), transitions_of(20, 2, 12), task)
-    assert len(method.drawn)
-    with pytest.raises(ValueError, match="mapping must have a state mapping of the set of source 0, got"):
-        method.task_compliance(InterTaskMapping([0, None], [0] * 12))

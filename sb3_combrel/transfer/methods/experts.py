@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -24,12 +24,7 @@ AGENT = 0
 
 
 class Expert(NamedTuple):
-    """
-    A mapping that gives a policy for the target.
-
-    :param source: number of the source task
-    :param mapping: from the target to it
-    """
+    """A mapping that gives a policy for the target; ``source``: number of the source task that it is to."""
 
     source: int
     mapping: InterTaskMapping
@@ -38,12 +33,8 @@ class Expert(NamedTuple):
 @dataclass
 class Playing:
     """
-    An episode that is going on.
+    An episode that is going on: who acts (agent or expert), the sum of rewards, steps, and how many an expert decided.
 
-    :param arm: who acts: the agent, or an expert
-    :param total: rewards so far
-    :param steps: steps so far
-    :param acted: how many of them an expert decided
     :param state: the state that was reached, unit coordinates; None before the first step
     """
 
@@ -54,14 +45,15 @@ class Playing:
     state: np.ndarray | None = None
 
 
+@dataclass(repr=False, eq=False)
 class MappingExperts(Transfer):
     """
     Every mapping gives a policy, and what acts in an episode, one of these or the agent, is chosen by the returns so far.
 
     Paper: Talvitie & Singh, "An experts algorithm for transfer learning" (IJCAI 2007). An expert is a mapping: a state of the
-    target is seen as one of the source, the action that is greedy there by the source's value function is found, and one of
-    the target actions that map to it is taken, at random if there are several. If none maps to it, the best source action to
-    which one does; where the source has no data, the agent decides. The value function is planned from the source's instances
+    target is seen as one of the source, and one of the target actions that map to the action that is greedy there is taken, at
+    random if there are several. If none maps to it, the best source action to which one does; where the source has no data,
+    the agent decides. The value function is planned from the source's instances
     (:class:`~sb3_combrel.transfer.source_policy.SourcePolicy`). Whatever acts, the agent learns from every transition, and
     nothing else is transferred: the model is that of no transfer.
 
@@ -76,23 +68,17 @@ class MappingExperts(Transfer):
       guess of the experts' mixing time, then the best as long as it keeps its promise. Here there are episodes, and UCB1. What
       is kept of the distrust is ``patience``: an expert that takes longer than the agent does hands over to it.
     - The learning agent is among those who may act. As it gets better, its mean is that of the later half of its episodes.
-    - The paper's algorithm is given its experts; here at most ``max_experts`` are drawn from a set of mappings.
-
-    Cost: an episode of the target for each expert before anything is repeated, of which the expert takes no more than
-    ``patience`` times as many steps as the agent in its own last one; the agent may then go on. If no expert is any good these
-    steps are lost, but for what the agent learns from them: on MountainCar4D, where no expert that was drawn got to the
-    goal in time, 12 episodes with 10 experts took 5,800 steps, with 5 experts 4,000, without transfer 2,700 (two seeds). The
-    value function takes 0.1 seconds for a source of two variables and 1000 instances, once; an expert's action 0.05
-    milliseconds.
+    - The paper's algorithm is given its experts; here at most ``max_experts`` are drawn from a set of mappings. An episode of
+      the target goes to each before anything is repeated.
 
     Example::
 
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=MappingExperts(source, max_experts=5))
         model.learn(total_timesteps=5_000)
 
-    :param source: source instances, a path to them, or a list of several
-    :param mappings: the set that the experts are drawn from: "injective", "surjective", "all", "balanced", one of the paper's
-        sets, a list of mappings or a ``MappingSet``
+    :param source: source instances, a path to them, or a list of several, see
+        :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`
+    :param mappings: the set that the experts are drawn from, see there
     :param max_experts: experts at most; of a larger set so many are drawn without replacement, when learning begins, all
         mappings being equally likely
     :param exploration: factor on the bonus for what has been tried seldom. 1 is UCB1's, whose bonus outweighs all differences
@@ -106,51 +92,43 @@ class MappingExperts(Transfer):
 
     use = "actions"
 
-    def __init__(
-        self,
-        source: SourceLike,
-        mappings: MappingsLike = "injective",
-        *,
-        max_experts: int = DEFAULT_MAX_EXPERTS,
-        exploration: float = 0.2,
-        patience: float | None = 1.0,
-        gamma: float = 0.99,
-        source_breadth: float = DEFAULT_SOURCE_BREADTH,
-    ):
-        check_count("max_experts", max_experts)
-        check_finite("exploration", exploration)
-        if exploration < 0.0:
-            raise ValueError(f"exploration must be at least 0, got {exploration!r}")
-        if patience is not None:
-            check_positive("patience", patience)
-        check_positive("gamma", gamma, max=1.0)
-        if gamma == 1.0:
-            raise ValueError(f"gamma must be below 1, got {gamma!r}")
-        check_positive("source_breadth", source_breadth)
-        if is_factored(mappings):
-            raise ValueError(f"mappings must be a set of mappings, one an expert, no factored ones, got {mappings!r}")
-        self.source: SourceLike = source
-        self.mappings = mappings
-        self.max_experts = max_experts
-        self.exploration = exploration
-        self.patience = patience
-        self.gamma = gamma
-        self.source_breadth = source_breadth
-        self._policies: list[SourcePolicy] = []
+    source: SourceLike
+    mappings: MappingsLike = "injective"
+    _: KW_ONLY
+    max_experts: int = DEFAULT_MAX_EXPERTS
+    exploration: float = 0.2
+    patience: float | None = 1.0
+    gamma: float = 0.99
+    source_breadth: float = DEFAULT_SOURCE_BREADTH
+    # They depend on the source alone, and are planned once.
+    _policies: list[SourcePolicy] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        check_count("max_experts", self.max_experts)
+        check_finite("exploration", self.exploration)
+        if self.exploration < 0.0:
+            raise ValueError(f"exploration must be at least 0, got {self.exploration!r}")
+        if self.patience is not None:
+            check_positive("patience", self.patience)
+        check_positive("gamma", self.gamma, max=1.0)
+        if self.gamma == 1.0:
+            raise ValueError(f"gamma must be below 1, got {self.gamma!r}")
+        check_positive("source_breadth", self.source_breadth)
+        if is_factored(self.mappings):
+            raise ValueError(f"mappings must be a set of mappings, one an expert, no factored ones, got {self.mappings!r}")
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         self.sources = load_sources(self.source)
-        # Once read, the instances themselves: the file of a saved model must not depend on other files.
+        # As of ``MappingTransfer``: a saved model must not depend on other files.
         self.source = self.sources if len(self.sources) > 1 else self.sources[0]
         self._sets = resolved_sets(self.sources, self.mappings, task)
         self.n_mappings = sum(mappings.n_mappings for mappings in self._sets)
         if self.n_mappings > MAX_MAPPINGS:
             raise ValueError(f"mappings must hold at most {MAX_MAPPINGS:,} mappings to draw from; list those of interest")
         if not self._policies:
-            # They depend on the source alone, and are planned once.
-            breadth = float(self.source_breadth)
-            self._policies = [SourcePolicy(source, float(self.gamma), breadth) for source in self.sources]
+            given = float(self.gamma), float(self.source_breadth)
+            self._policies = [SourcePolicy(source, *given) for source in self.sources]
         # Source coordinates that a mapping does not determine are typical ones.
         self._typical = [np.median(source.scaling.to_unit(source.states), axis=0) for source in self.sources]
         self._numbers = np.empty(0, dtype=np.int64)
@@ -211,7 +189,7 @@ class MappingExperts(Transfer):
             drawn = np.arange(self.n_mappings) if every else self.rng.choice(self.n_mappings, self.max_experts, replace=False)
             self._set_experts(drawn)
         acting = {playing.arm for playing in self._playing.values()}
-        returns = [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
+        returns = self._returns()
         if not returns[AGENT]:
             # Several environments: nobody else acts before it is known how long the agent takes.
             return AGENT
@@ -240,8 +218,11 @@ class MappingExperts(Transfer):
 
     def mean_returns(self) -> np.ndarray:
         """Return the mean return of the agent, of the later half of its episodes, and of each expert; NaN before the first."""
-        returns = [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
-        return np.array([mean_return(k, of_arm) if of_arm else np.nan for k, of_arm in enumerate(returns)])
+        return np.array([mean_return(k, of_arm) if of_arm else np.nan for k, of_arm in enumerate(self._returns())])
+
+    def _returns(self) -> list[list[float]]:
+        """The returns of the agent's episodes, and of each expert's."""
+        return [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
 
     def describe(self) -> list[tuple[str, float, int]]:
         """Return the name, the mean return and the number of episodes of all who may act, the agent first."""
@@ -250,7 +231,6 @@ class MappingExperts(Transfer):
         return [(name, mean, arms.count(k)) for k, (name, mean) in enumerate(zip(names, means, strict=True))]
 
     def _best(self) -> int:
-        """Who has had the highest mean return."""
         means = self.mean_returns()
         return AGENT if np.isnan(means).all() else int(np.nanargmax(means))
 
@@ -266,13 +246,12 @@ class MappingExperts(Transfer):
 
     def statistics(self) -> dict[str, float]:
         means, best = self.mean_returns(), self._best()
-        episodes_of_experts = sum(arm != AGENT for arm, *_ in self._episodes)
         return {
             "transfer/experts": len(self.experts),
             "transfer/best_expert": best,
             "transfer/expert_steps": sum(steps for _, steps in self._acted()),
             "transfer/steps_to_find_mapping": self.mapping_steps(),
-            "transfer/expert_episodes": episodes_of_experts,
+            "transfer/expert_episodes": sum(arm != AGENT for arm, *_ in self._episodes),
             "transfer/agent_return": float(means[AGENT]),
             "transfer/best_return": float(means[best]),
         }
@@ -291,15 +270,11 @@ class MappingExperts(Transfer):
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        # Whatever a file says: numbers that exist.
-        self._set_experts(np.clip(state["experts"][:, 0], 0, self.n_mappings - 1).astype(np.int64))
+        self._set_experts(state["experts"][:, 0].astype(np.int64))
         for arm, total, steps, acted in state["episodes"].tolist():
-            self._episodes.append((self._arm(arm), total, int(steps), int(acted)))
+            self._episodes.append((int(arm), total, int(steps), int(acted)))
         for environment, arm, total, steps, acted, *reached in state["playing"].tolist():
-            self._playing[int(environment)] = Playing(self._arm(arm), total, int(steps), int(acted), np.array(reached))
-
-    def _arm(self, number: float) -> int:
-        return int(np.clip(number, AGENT, len(self.experts)))
+            self._playing[int(environment)] = Playing(int(arm), total, int(steps), int(acted), np.array(reached))
 
 
 def mean_return(arm: int, returns: list[float]) -> float:
@@ -312,16 +287,11 @@ def best_by_ucb1(returns: list[list[float]], exploration: float) -> int:
     Choose by UCB1, on returns in parts of the range that they have had; the first of equal ones.
 
     :param returns: of the agent and of each expert; those that have none are not chosen
-    :param exploration: factor on the bonus
     """
     everything = [total for of_arm in returns for total in of_arm]
-    spread = max(everything) - min(everything)
-    scores = [
-        (
-            mean_return(k, of_arm) + spread * exploration * np.sqrt(2.0 * np.log(len(everything)) / len(of_arm))
-            if of_arm
-            else -np.inf
-        )
-        for k, of_arm in enumerate(returns)
-    ]
-    return int(np.argmax(scores))
+    bonus = (max(everything) - min(everything)) * exploration
+
+    def score(k: int, of_arm: list[float]) -> float:
+        return mean_return(k, of_arm) + bonus * np.sqrt(2.0 * np.log(len(everything)) / len(of_arm)) if of_arm else -np.inf
+
+    return int(np.argmax([score(k, of_arm) for k, of_arm in enumerate(returns)]))

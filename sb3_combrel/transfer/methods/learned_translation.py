@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import KW_ONLY, dataclass
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,46 +69,41 @@ class Standard(NamedTuple):
         return self.mean + rows * self.deviation
 
 
+@dataclass(repr=False, eq=False)
 class LearnedTranslation(Transfer):
     """
     Learns a mapping from random samples of both tasks, once; then all source data are instances in target coordinates.
 
-    The first ``n_random_steps`` transitions of the target are its sample: :meth:`action` asks for random actions until then,
-    and nothing is transferred. The sample of the source is drawn from its instances. Then a subclass translates all source
-    instances, with their rewards and ends, and nothing is learned any more. Where the target's own instances do not suffice,
-    the nearest translated ones come first, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`, which is given them
-    with the identity as its mapping.
+    The first ``n_random_steps`` transitions of the target, with random actions, are its sample; until then nothing is
+    transferred. The sample of the source is drawn from its instances. Then a subclass translates all source instances, with
+    their rewards and ends, which takes some seconds, and nothing is learned any more. Where the target's own instances do not
+    suffice, the nearest translated ones come first: :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL` is given them with
+    the identity as its mapping.
 
     :param source: source instances, or a path to them
-    :param n_random_steps: size of the target's sample, in steps of the target
-    :param n_source_samples: size of the source's sample, at most
+    :param n_random_steps: steps of the target that its sample takes
+    :param n_source_samples: source instances that the mapping is learned from, at most
     :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`;
+        ``transfer_terminals``: the same
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """
 
-    def __init__(
-        self,
-        source: SourceLike,
-        *,
-        n_random_steps: int = DEFAULT_SAMPLE_STEPS,
-        n_source_samples: int = 300,
-        breadth: float = DEFAULT_BREADTH,
-        breadth_decay: float = DEFAULT_BREADTH_DECAY,
-        transfer_terminals: bool = True,
-    ):
-        check_count("n_random_steps", n_random_steps, min=MIN_SAMPLES)
-        check_count("n_source_samples", n_source_samples, min=MIN_SAMPLES)
-        check_positive("breadth", breadth)
-        check_positive("breadth_decay", breadth_decay, max=1.0)
-        check_boolean("transfer_terminals", transfer_terminals)
-        self.source = source
-        self.n_random_steps = n_random_steps
-        self.n_source_samples = n_source_samples
-        self.breadth = breadth
-        self.breadth_decay = breadth_decay
-        self.transfer_terminals = bool(transfer_terminals)
+    source: SourceLike
+    _: KW_ONLY
+    n_random_steps: int = DEFAULT_SAMPLE_STEPS
+    n_source_samples: int = 300
+    breadth: float = DEFAULT_BREADTH
+    breadth_decay: float = DEFAULT_BREADTH_DECAY
+    transfer_terminals: bool = True
+
+    def __post_init__(self) -> None:
+        check_count("n_random_steps", self.n_random_steps, min=MIN_SAMPLES)
+        check_count("n_source_samples", self.n_source_samples, min=MIN_SAMPLES)
+        check_positive("breadth", self.breadth)
+        check_positive("breadth_decay", self.breadth_decay, max=1.0)
+        check_boolean("transfer_terminals", self.transfer_terminals)
+        self.transfer_terminals = bool(self.transfer_terminals)
 
     @abstractmethod
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
@@ -122,7 +118,8 @@ class LearnedTranslation(Transfer):
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         name = type(self).__name__
-        self._source = load_one_source(self.source, name)
+        # A saved model must not depend on other files.
+        self.source = self._source = load_one_source(self.source, name)
         for of, periodic in (("source", self._source.periodic), ("target", tuple(task.periodic or ()))):
             if any(periodic):
                 raise ValueError(
@@ -132,44 +129,28 @@ class LearnedTranslation(Transfer):
         self._samples = np.empty((0, 2 * task.n_variables + 1))
         # State, action and next state of each source instance in unit coordinates of the target, once there is a mapping.
         self._rows = self._samples
-        self._translated: SourceInstances | None = None
+        #: All source instances in target coordinates, raw units of the target; None until the mapping has been learned.
+        self.translated: SourceInstances | None = None
         self._timbrel: TIMBREL | None = None
         self._seconds = 0.0
 
-    @property
-    def n_samples(self) -> int:
-        """Transitions of the target that have been sampled for the mapping."""
-        return len(self._samples)
-
     def mapping_steps(self) -> int:
         """Return how many steps of the target have been taken for the mapping."""
-        return self.n_samples
-
-    @property
-    def translated(self) -> SourceInstances | None:
-        """All source instances in target coordinates, raw units of the target; None until the mapping has been learned."""
-        return self._translated
+        return len(self._samples)
 
     def action(self, state: np.ndarray) -> int | None:
-        """
-        Choose the agent's action while it learns: a random one until the target's sample is complete.
-
-        :param state: unit coordinates, shape (n_variables,)
-        :return: the action, from 0 on; None to leave it to the agent
-        """
         assert self.task is not None
-        return int(self.rng.integers(self.task.n_actions)) if self.n_samples < self.n_random_steps else None
+        return int(self.rng.integers(self.task.n_actions)) if len(self._samples) < self.n_random_steps else None
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         if self._timbrel is not None:
             self._timbrel.observe(state, action, reward, next_state, terminated)
             return
         self._samples = np.vstack([self._samples, [*state, action, *(next_state - state)]])
-        if self.n_samples == self.n_random_steps:
+        if len(self._samples) == self.n_random_steps:
             self._learn()
 
     def _learn(self) -> None:
-        """Learn the mapping, and translate all source instances."""
         assert self.task is not None
         began = perf_counter()
         source, d = self._source, self.task.n_variables
@@ -185,11 +166,10 @@ class LearnedTranslation(Transfer):
         self._seconds = perf_counter() - began
 
     def _transfer_rows(self, rows: np.ndarray) -> None:
-        """Transfer the source's instances from now on, with these states, actions and next states in unit coordinates."""
         assert self.task is not None
         task, source, d = self.task, self._source, self.task.n_variables
         self._rows = rows
-        self._translated = SourceInstances(
+        self.translated = SourceInstances(
             states=task.scaling.to_raw(rows[:, :d]),
             actions=np.clip(rows[:, d], 0, task.n_actions - 1).astype(np.int64),
             rewards=source.rewards,
@@ -203,7 +183,7 @@ class LearnedTranslation(Transfer):
             origin={"env": f"{source.origin.get('env', 'an unnamed task')} by {type(self).__name__}"},
         )
         self._timbrel = TIMBREL(
-            self._translated,
+            self.translated,
             InterTaskMapping(tuple(range(task.n_variables)), tuple(range(task.n_actions))),
             breadth=self.breadth,
             breadth_decay=self.breadth_decay,
@@ -240,19 +220,12 @@ class LearnedTranslation(Transfer):
         return figures if self._timbrel is None else {**figures, **self._timbrel.statistics()}
 
     def _spread(self) -> float:
-        """Standard deviation of the translated instances' states over that of the sample's, mean over variables; or NaN.
-
-        Near 0 where the mapping takes all source states for the same target state, because it has found no relation.
-        """
-        if self._translated is None or self.task is None:
+        """Standard deviation of the translated states over that of the sample's, mean over variables; near 0: no relation."""
+        if self.translated is None or self.task is None:
             return np.nan
         sampled = self._samples[:, : self.task.n_variables].std(axis=0)
-        spread = self.task.scaling.to_unit(self._translated.states).std(axis=0)
+        spread = self.task.scaling.to_unit(self.translated.states).std(axis=0)
         return float((spread / np.maximum(sampled, 1e-12))[sampled > 1e-12].mean()) if (sampled > 1e-12).any() else np.nan
-
-    def arguments(self) -> dict[str, Any]:
-        # Once read, the instances themselves: the file of a saved model must not depend on other files.
-        return super().arguments() if self.task is None else {**super().arguments(), "source": self._source}
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {"samples": self._samples.copy(), "translated": self._rows.copy(), **self._state_of_timbrel()}
@@ -260,11 +233,11 @@ class LearnedTranslation(Transfer):
     def _state_of_timbrel(self) -> dict[str, np.ndarray]:
         """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
         assert self.task is not None
-        if self._timbrel is None:
-            like = TIMBREL(self._source, InterTaskMapping((0,) * self.task.n_variables, (0,) * self.task.n_actions))
-            like.bind(self.task, np.random.default_rng(0))
-            return {f"timbrel_{name}": array for name, array in like.get_state().items()}
-        return {f"timbrel_{name}": array for name, array in self._timbrel.get_state().items()}
+        timbrel = self._timbrel
+        if timbrel is None:
+            timbrel = TIMBREL(self._source, InterTaskMapping((0,) * self.task.n_variables, (0,) * self.task.n_actions))
+            timbrel.bind(self.task, np.random.default_rng(0))
+        return {f"timbrel_{name}": array for name, array in timbrel.get_state().items()}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         self._samples = state["samples"].copy()
@@ -272,6 +245,4 @@ class LearnedTranslation(Transfer):
             return
         self._transfer_rows(state["translated"].copy())
         assert self._timbrel is not None
-        prefix = "timbrel_"
-        given = {name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)}
-        self._timbrel.set_state(given)
+        self._timbrel.set_state({name.removeprefix("timbrel_"): array for name, array in state.items()})

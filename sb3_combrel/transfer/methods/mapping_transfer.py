@@ -1,10 +1,11 @@
-"""What TIMBREL and COMBREL share: arguments, and what is done with the source as ``use`` says."""
+"""What the methods share that transfer through mappings: their arguments, and what ``use`` says is done with the source."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,19 +14,14 @@ import numpy as np
 from sb3_combrel.common.checks import check_boolean, check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
+from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.inter_task_mapping import MappingNames
+from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
 from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.candidates import (
-    Candidate,
-    Candidates,
-    MappedVariables,
-    MappingsLike,
-    SourceLike,
-    load_sources,
-)
+from sb3_combrel.transfer.candidates import Candidate, Candidates, MappedVariables, MappingsLike, SourceLike, load_sources
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer, MeasureRelevance
 from sb3_combrel.transfer.instances.relevance import renew_near_relevance, renew_relevance
@@ -39,97 +35,111 @@ from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
-#: What a method does with its source once bound, as ``use`` says.
+#: What is done with the source once bound, as ``use`` says.
 SourceUse = InstanceTransfer | SourcePrior
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8
 #: The relevance that does not favour distant instances, ``equations.near_relevances``.
 NEAR = "near"
+# Action mappings that are restricted as a whole are compared one by one.
+MAX_ACTION_MAPPINGS = 100_000
 
 
+@dataclass(repr=False, eq=False)
 class MappingTransfer(Transfer):
     """
     Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
 
-    What it does once bound is done by an object, as ``use`` says: an
-    :class:`~sb3_combrel.transfer.instances.instance_transfer.InstanceTransfer`, or a
-    :class:`~sb3_combrel.transfer.prior.source_prior.SourcePrior`.
-
-    :param source: instances, a path to them, the id or recipe of a task to learn them from, or a list of several
-    :param mappings: mappings from the target to the source (see ``resolve``)
-    :param breadth: kernel breadth of transferred instances, in unit coordinates
-    :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after the target's own transitions
-        have contradicted what was transferred (see :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`)
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's
-    :param relevance: whether instances come in the order of their relevance (Eq. 7), not of their distance; "near": of the
-        relevance that does not favour distant instances, times their weight
-    :param relevance_fraction: mu of Eq. 4
-    :param bandwidths: (start, outcome, reward) of compliance and relevance; None: from the data
-    :param use: "instances" or "prior": translated instances, or the source's own model seen through the mappings
-    :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
+    :param source: source instances, a path to them, or a list of several; or the id of an environment, "MountainCar-v0",
+        which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first needed, and kept in a file; or a
+        recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``: :func:`~sb3_combrel.sources.recipes.find_source`
+    :param mappings: the name of a set: "injective" (each source variable is mapped to by one target variable, the other target
+        variables are left unmapped), "surjective", "all", "balanced", these with ``signed_`` before them (variables may be
+        mirrored as well), or that of one of the paper's experiments, "paper_mountain_car" or "paper_icub"; a mapping, a list
+        of mappings or a ``MappingSet``
+    :param breadth: kernel breadth of transferred instances, in unit coordinates; the papers name none. It needs to be wide
+        enough for the instances to cover the source
+    :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after new evidence against what
+        was transferred: the target's own transitions were predicted worse than by "no change", or ends were predicted that
+        never came, or there was nothing left to find out (see
+        :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`). So pairs for which the source is wrong are
+        explored in the end, whatever the source. 1: never, as in the papers
+    :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The papers do not say.
+        Where this is wrong the target's own transitions correct it; without it no path leads to an end at first
+    :param relevance: True: instances come in the order of their relevance (Eq. 7) to the target's transitions, not of their
+        distance. COMBREL's paper finds it harmful: it favours instances that are far from these. "near": of a relevance that
+        does not, times the weight, see ``equations.near_relevances``
+    :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
+    :param bandwidths: (start, outcome, reward) bandwidths of compliance and relevance, delta_sa, delta_s' and delta_r of Eq.
+        2; None: from the data, that of starts in proportion to how many variables a mapping compares
+    :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own local linear
+        model, seen through the mappings, is the prior of the target's model (``FittedRMax(degree=1)``): the target's own
+        instances are fitted to what it leaves over. What it claims to know without them is said in
+        :class:`~sb3_combrel.transfer.prior.claims.Claims`. ``breadth``, ``breadth_decay``, relevance and its arguments have no
+        meaning then
+    :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
+    :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
     #: Whether relevance, where it is asked for, is the order in which instances are added.
     ranks_by_relevance: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        source: SourceLike,
-        mappings: MappingsLike,
-        *,
-        breadth: float,
-        breadth_decay: float,
-        transfer_terminals: bool,
-        relevance: bool | str,
-        relevance_fraction: float,
-        bandwidths: tuple[float, float, float] | None,
-        use: str = "instances",
-        source_breadth: float = DEFAULT_SOURCE_BREADTH,
-    ):
-        if use not in ("instances", "prior"):
-            raise ValueError(f'use must be "instances" or "prior", got {use!r}')
-        if use == "instances" and is_factored(mappings):
-            raise ValueError(f'factored mappings need use="prior", got use="instances" with {mappings!r}')
-        if use == "prior" and relevance:
+    source: SourceLike
+    mappings: MappingsLike
+    _: KW_ONLY
+    breadth: float = DEFAULT_BREADTH
+    breadth_decay: float = DEFAULT_BREADTH_DECAY
+    transfer_terminals: bool = True
+    relevance: bool | str = False
+    relevance_fraction: float = 0.5
+    bandwidths: tuple[float, float, float] | None = None
+    use: str = "instances"
+    source_breadth: float = DEFAULT_SOURCE_BREADTH
+    # Arguments that are left to the target's model, as they were given, until the method is bound.
+    _left_open: dict[str, None] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        check_either("use", self.use, "instances", "prior")
+        if self.use == "instances" and is_factored(self.mappings):
+            raise ValueError(f'factored mappings need use="prior", got use="instances" with {self.mappings!r}')
+        if self.use == "prior" and self.relevance:
             raise ValueError('relevance must be False with use="prior": no instances are transferred, got True')
-        check_source(source)
-        check_mappings(mappings)
-        check_positive("source_breadth", source_breadth)
-        check_positive("breadth", breadth)
-        check_positive("breadth_decay", breadth_decay, max=1.0)
-        check_positive("relevance_fraction", relevance_fraction, max=1.0)
-        if bandwidths is not None:
-            if isinstance(bandwidths, str) or not isinstance(bandwidths, Sequence | np.ndarray) or len(bandwidths) != 3:
-                raise ValueError(f"bandwidths must be three numbers (start, outcome, reward) or None, got {bandwidths!r}")
-            for value in bandwidths:
+        check_source(self.source)
+        check_mappings(self.mappings)
+        check_positive("source_breadth", self.source_breadth)
+        check_positive("breadth", self.breadth)
+        check_positive("breadth_decay", self.breadth_decay, max=1.0)
+        check_positive("relevance_fraction", self.relevance_fraction, max=1.0)
+        if self.bandwidths is not None:
+            given: Any = self.bandwidths
+            if isinstance(given, str) or not isinstance(given, Sequence | np.ndarray) or len(given) != 3:
+                raise ValueError(f"bandwidths must be three numbers (start, outcome, reward) or None, got {given!r}")
+            for value in given:
                 check_positive("bandwidths", value)
-        check_boolean("transfer_terminals", transfer_terminals)
-        check_relevance(relevance)
-        self.source = source
-        self.mappings = mappings
-        self.breadth = breadth
-        self.breadth_decay = breadth_decay
-        self.transfer_terminals = bool(transfer_terminals)
-        self.relevance = relevance if isinstance(relevance, str) else bool(relevance)
-        self.relevance_fraction = relevance_fraction
-        self.bandwidths = bandwidths
-        self.use = use
-        self.source_breadth = source_breadth
+        check_boolean("transfer_terminals", self.transfer_terminals)
+        is_near = isinstance(self.relevance, str) and self.relevance == NEAR
+        if not is_near and not isinstance(self.relevance, bool | np.bool_):
+            raise ValueError(f'relevance must be True, False or "{NEAR}", got {self.relevance!r}')
+        self.transfer_terminals = bool(self.transfer_terminals)
+        self.relevance = NEAR if is_near else bool(self.relevance)
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not there otherwise.
         self._check_bound(name)
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
+    def arguments(self) -> dict[str, Any]:
+        return {**super().arguments(), **self._left_open}
+
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
+        if self._left_open:
+            self.use, self._left_open = "prior" if task.takes_prior else "instances", {}
         sources = load_sources(self.source)
         # Once read, the instances themselves: the file of a saved model must not depend on other files.
         self.source = sources if len(sources) > 1 else sources[0]
         self._replace_names(sources, task)
         self._periodic = np.array(task.periodic)
-        self._wraps = bool(self._periodic.any())
-        #: What is done with the source, as ``use`` says.
         self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
     def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
@@ -155,11 +165,10 @@ class MappingTransfer(Transfer):
 
     def _relevance_to(self, transitions: RecordedTransitions, bandwidths: CandidateBandwidths) -> MeasureRelevance:
         """Return what measures the candidates' relevance to recorded transitions."""
-        given = self.candidates, transitions
+        given: dict[str, Any] = dict(bandwidths=bandwidths, periodic=self._periodic)
         if self.relevance == NEAR:
-            return partial(renew_near_relevance, *given, bandwidths=bandwidths, periodic=self._periodic)
-        mu = float(self.relevance_fraction)
-        return partial(renew_relevance, *given, bandwidths=bandwidths, periodic=self._periodic, mu=mu)
+            return partial(renew_near_relevance, self.candidates, transitions, **given)
+        return partial(renew_relevance, self.candidates, transitions, **given, mu=float(self.relevance_fraction))
 
     def _whole_mappings(self) -> bool:
         """Return whether whole mappings are the candidates."""
@@ -181,9 +190,9 @@ class MappingTransfer(Transfer):
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
         """Make the selector for the target task that the method was just bound to."""
 
-    @abstractmethod
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         """Make the prior of the target task that the method was just bound to."""
+        raise NotImplementedError(f"{type(self).__name__} transfers instances, it has no prior")
 
     @property
     def sources(self) -> list[SourceInstances]:
@@ -199,12 +208,11 @@ class MappingTransfer(Transfer):
         """
         self._check_bound("source_prior")
         if not isinstance(self._source_use, SourcePrior):
-            raise ValueError(f'use must be "prior" for source_prior, got {self.use!r}')
+            raise ValueError(f'use must be "prior" for what the source is taken for, got {self.use!r}')
         return self._source_use
 
     @property
     def _instances(self) -> InstanceTransfer:
-        """The transfer of instances, once bound; only with ``use="instances"``."""
         assert isinstance(self._source_use, InstanceTransfer)
         return self._source_use
 
@@ -230,8 +238,7 @@ class MappingTransfer(Transfer):
         return min(float(source.rewards.min()) for source in self.sources)
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
-        effect = differences(next_state, state, self._periodic) if self._wraps else next_state - state
-        self._source_use.observe(state, action, reward, effect, terminated)
+        self._source_use.observe(state, action, reward, differences(next_state, state, self._periodic), terminated)
 
     def end_episode(self, truncated: bool) -> None:
         self._source_use.end_episode(truncated)
@@ -247,13 +254,11 @@ class MappingTransfer(Transfer):
         """
         Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
 
-        Target variables are named first, then the source variables that they are taken for, where these have other names.
+        Target variables come first, then the source variables that they are taken for, where these have other names.
 
         :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
         """
         self._check_bound("describe_prior")
-        if self.use != "prior":
-            raise ValueError(f'use must be "prior" for describe_prior, got {self.use!r}')
         return self.source_prior.describe()
 
     def candidate(self, number: int) -> Candidate:
@@ -324,9 +329,35 @@ class MappingTransfer(Transfer):
         self._source_use.set_state(state)
 
 
-def check_relevance(value: object) -> None:
+def check_either(name: str, value: object, one: str, other: str) -> None:
     """
-    :raises ValueError: unless ``value`` is True, False or "near"
+    :raises ValueError: unless ``value`` is one of two words
     """
-    if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value == NEAR):
-        raise ValueError(f'relevance must be True, False or "{NEAR}", got {value!r}')
+    if value not in (one, other):
+        raise ValueError(f'{name} must be "{one}" or "{other}", got {value!r}')
+
+
+def check_action_mappings(sets: Sequence[MappingSet]) -> None:
+    """
+    Check that the mappings of these sets can be compared.
+
+    :raises ValueError: if there are too many
+    """
+    for mappings in sets:
+        one_by_one = mappings.pairs is None and not isinstance(mappings.actions, AllActionMappings)
+        if one_by_one and mappings.n_action_mappings > MAX_ACTION_MAPPINGS:
+            raise ValueError(
+                f"mappings must have at most {MAX_ACTION_MAPPINGS:,} action mappings, or all there are, whose source "
+                f'actions are chosen one by one ("injective"), got {mappings.n_action_mappings:,}'
+            )
+
+
+def members_of(mappings: MappingSet) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Go through a set: state mappings, int64, shape (n, 1), with their source actions, int64, shape (n, n_target_actions)."""
+    numbers = range(mappings.n_action_mappings) if mappings.pairs is None else mappings.pairs[:, 1].tolist()
+    actions = np.array([mappings.actions[number] for number in numbers], dtype=np.int64)
+    if mappings.pairs is not None:
+        yield mappings.pairs[:, :1], actions
+        return
+    for row in range(mappings.n_state_mappings):
+        yield np.full((len(actions), 1), row), actions

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike
+from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
-from sb3_combrel.transfer.instances.selectors import SelectorParts
-from sb3_combrel.transfer.methods.least_error import LeastErrorSelector, check_action_mappings, choose_least_error
-from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
+from sb3_combrel.transfer.instances.selectors import FixedSelector, Ranges, SelectorParts
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.copy_sums import CopySums
+from sb3_combrel.transfer.prior.prior_choice import Choice
 from sb3_combrel.transfer.prior.prior_sets import copies_of, is_factored
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
-from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 DEFAULT_RANDOM_STEPS = 100
 
 
+@dataclass(repr=False, eq=False)
 class MASTER(MappingTransfer):
     """
     Modeling Approximate State Transitions by Exploiting Regression: finds a mapping by random actions, then transfers.
@@ -41,72 +46,42 @@ class MASTER(MappingTransfer):
       variables that a mapping leaves out stay as they are, as in COMBREL.
     - The learner is Fitted R-Max, and what is transferred is what TIMBREL transfers through a mapping that is given.
 
-    Cost: ``n_random_steps`` of the target, which are learned from as any others; until then nothing is transferred. In each of
-    these steps the source predicts once for each state mapping and source action: Mountain Car 2D to 4D, 36 predictions, 0.1
-    milliseconds. The number of action mappings does not matter where all of them are in the set. Which mapping is right there
-    was found with 20 steps in 12 of 12 seeds: that of one of the two axes. Noisy tasks need more.
+    The agent learns from the random steps as from any others; until they are over nothing is transferred. From Mountain Car 2D
+    to 4D 20 are enough; noisy tasks need more.
 
     Example::
 
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=MASTER(source, n_random_steps=20))
         model.learn(total_timesteps=5_000)
 
-    :param source: source instances, a path to them, or a list of several, of which one mapping to one is chosen
-    :param mappings: the mappings to choose from: the name of a set ("injective", "surjective", "all", "balanced"), one of the
-        paper's sets, a list of mappings or a ``MappingSet``. Of mappings with the same error the first is chosen
+    Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; it has
+    neither ``relevance`` and its fraction nor ``bandwidths``.
+
+    :param mappings: the mappings to choose from, a set as there. Of mappings with the same error the first is chosen
     :param n_random_steps: random actions by which is chosen; with several environments all of them act randomly until there
         are so many transitions. A target action that was never drawn has no say
-    :param breadth: kernel breadth of transferred instances, in unit coordinates
-    :param breadth_decay: as of :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's too
-    :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own model, seen
-        through the mapping, is the prior of the target's. None: "prior" where the target's model takes one
-        (``FittedRMax(degree=1)``), unless ``breadth`` or ``breadth_decay``, which mean nothing then, differ from their
-        defaults
-    :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
+    :param use: as there; None: "prior" where the target's model takes one (``FittedRMax(degree=1)``), unless ``breadth`` or
+        ``breadth_decay``, which mean nothing then, differ from their defaults
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
-    def __init__(
-        self,
-        source: SourceLike,
-        mappings: MappingsLike = "injective",
-        *,
-        n_random_steps: int = DEFAULT_RANDOM_STEPS,
-        breadth: float = DEFAULT_BREADTH,
-        breadth_decay: float = DEFAULT_BREADTH_DECAY,
-        transfer_terminals: bool = True,
-        use: str | None = None,
-        source_breadth: float = DEFAULT_SOURCE_BREADTH,
-    ):
-        check_count("n_random_steps", n_random_steps)
-        if is_factored(mappings):
-            raise ValueError(f"mappings must be a set of which one mapping is chosen, no factored ones, got {mappings!r}")
-        super().__init__(
-            source,
-            mappings,
-            breadth=breadth,
-            breadth_decay=breadth_decay,
-            transfer_terminals=transfer_terminals,
-            relevance=False,
-            relevance_fraction=0.5,
-            bandwidths=None,
-            use="instances" if use is None else use,
-            source_breadth=source_breadth,
-        )
-        self.n_random_steps = n_random_steps
-        # With nothing given that says which, it depends on the target's model, and is decided when that is known.
-        self._decides = use is None and breadth == DEFAULT_BREADTH and breadth_decay == DEFAULT_BREADTH_DECAY
+    mappings: MappingsLike = "injective"
+    _: KW_ONLY
+    n_random_steps: int = DEFAULT_RANDOM_STEPS
+    use: str | None = None  # type: ignore[assignment]
+    relevance: bool | str = field(default=False, init=False)
+    relevance_fraction: float = field(default=0.5, init=False)
+    bandwidths: tuple[float, float, float] | None = field(default=None, init=False)
 
-    def arguments(self) -> dict[str, Any]:
-        given = super().arguments()
-        return {**given, "use": None} if self._decides else given
-
-    def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
-        if self._decides:
-            self.use = "prior" if task.takes_prior else "instances"
-            self._decides = False
-        super().bind(task, rng)
+    def __post_init__(self) -> None:
+        check_count("n_random_steps", self.n_random_steps)
+        if is_factored(self.mappings):
+            raise ValueError(f"mappings must be a set of which one mapping is chosen, no factored ones, got {self.mappings!r}")
+        if self.use is None:
+            if self.breadth == MappingTransfer.breadth and self.breadth_decay == MappingTransfer.breadth_decay:
+                self._left_open = {"use": None}
+            self.use = "instances"
+        super().__post_init__()
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> LeastErrorSelector:
         check_action_mappings(parts.candidates.sets)
@@ -128,20 +103,15 @@ class MASTER(MappingTransfer):
             first_renewal=self.n_random_steps,
         )
 
-    @property
-    def _n_seen(self) -> int:
-        """Transitions by which is chosen that have been seen."""
-        return min(self.n_random_steps, self._source_use.n_observed)
-
     def action(self, state: np.ndarray) -> int | None:
-        if self._n_seen >= self.n_random_steps:
+        if self.mapping_steps() >= self.n_random_steps:
             return None
         assert self.task is not None
         return int(self.rng.integers(self.task.n_actions))
 
     def mapping_steps(self) -> int:
         """Return how many random steps of the target have been taken to find the mapping."""
-        return self._n_seen
+        return min(self.n_random_steps, self._source_use.n_observed)
 
     @property
     def chosen(self) -> InterTaskMapping | None:
@@ -159,3 +129,110 @@ class MASTER(MappingTransfer):
             "transfer/steps_to_find_mapping": self.mapping_steps(),
             "transfer/mapping_found": float(self.chosen is not None),
         }
+
+
+def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
+    """
+    Return the squared errors of the predicted effects, added up over the transitions of each target action.
+
+    :param copies: one for each state mapping; variables that it does not map are predicted to stay as they are
+    :param sums: over the target's transitions
+    :return: unit coordinates of the target, shape (n_copies, n_target_actions, most source actions)
+    """
+    left_out = (copies.state < 0).astype(np.float64)
+    return np.asarray(sums.error.sum(axis=3) + (left_out @ sums.effect.T)[:, :, None])
+
+
+def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
+    """
+    Find the mapping of a set with the least error, the first of equal ones.
+
+    :param errors: shape (n_state_mappings, n_target_actions, n_source_actions)
+    :return: the error of all target actions together, the state mapping, and the source action of each target action
+    """
+    if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
+        # Every combination is in the set: the best source action of each target action can be found on its own.
+        of_row = errors.min(axis=2).sum(axis=1)
+        row = int(of_row.argmin())
+        return float(of_row[row]), row, errors[row].argmin(axis=1)
+    found = []
+    for rows, actions in members_of(mappings):
+        of_member = errors[rows, np.arange(errors.shape[1]), actions].sum(axis=1)
+        best = int(of_member.argmin())
+        found.append((float(of_member[best]), int(rows[best, 0]), actions[best]))
+    return min(found, key=lambda one: one[0])
+
+
+def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySums) -> Choice:
+    """
+    Choose the mapping with the least mean squared error of the predicted effects, of all sources.
+
+    :param copies: the state mappings of all sets, one below the other
+    :param sets: the mappings to each source
+    :param sums: over the target's transitions
+    """
+    errors, first, found = squared_errors(copies, sums), 0, []
+    for number, mappings in enumerate(sets):
+        rows = slice(first, first + mappings.n_state_mappings)
+        error, row, actions = least_error_member(errors[rows, :, : copies.sources[number].n_actions], mappings)
+        found.append((error, first + row, actions))
+        first += mappings.n_state_mappings
+    _, row, actions = min(found, key=lambda one: one[0])
+    return Choice(np.full((len(actions), 1), row, dtype=np.int64), actions[:, None].copy())
+
+
+class LeastErrorSelector(FixedSelector):
+    """
+    Selects nothing until it has seen so many transitions; then, for good, the mapping that predicted their effects best.
+
+    :param parts: see :class:`~sb3_combrel.transfer.instances.selectors.SelectorParts`
+    :param copies: the candidates' state mappings with the sources' models
+    :param n_transitions: transitions by which is chosen
+    """
+
+    needs_transitions = True
+
+    def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
+        task = parts.task
+        super().__init__(parts, fixed=np.full(task.n_actions, -1, dtype=np.int64))
+        self.copies = copies
+        self.n_transitions = n_transitions
+        self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
+        #: The mapping that was chosen, None before.
+        self.choice: Choice | None = None
+        self._just_chosen = False
+
+    def takes_transitions(self) -> bool:
+        return self.transitions.n < self.n_transitions
+
+    def add_transition(self, i: int) -> None:
+        seen = self.transitions
+        self.copies.measure(seen.states[i], int(seen.actions[i]), seen.effects[i], self.sums, True)
+        if i + 1 == self.n_transitions:
+            self.choice = choose_least_error(self.copies, self.candidates.sets, self.sums)
+            for action, (row, source_action) in enumerate(np.hstack(self.choice).tolist()):
+                self.fixed[action] = self._find(action, row, source_action)
+            self._just_chosen = True
+
+    def _find(self, action: int, row: int, source_action: int) -> int:
+        """The candidate of a target action with a state mapping, or an equal one, and a source action of its source."""
+        arrays, table = self.candidates.arrays, self.candidates.table
+        first, last = arrays.first[action], arrays.first[action + 1]
+        same = (table.variable == table.variable[row]) & (table.sign == table.sign[row])
+        # Actions are numbered on from source to source.
+        number = source_action + sum(source.n_actions for source in self.candidates.sources[: self.copies.source[row]])
+        fits = same.all(axis=1)[arrays.row[first:last]] & (arrays.action[first:last] == number)
+        return int(first + np.flatnonzero(fits)[0])
+
+    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
+        chosen = self.fixed[actions]
+        return np.maximum(chosen, 0), chosen + 1
+
+    def changed(self, known: np.ndarray) -> bool | np.ndarray:
+        just_chosen, self._just_chosen = self._just_chosen, False
+        return just_chosen
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        for i in range(min(self.transitions.n, self.n_transitions)):
+            self.add_transition(i)
+        self._just_chosen = False

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass, field
+
 import numpy as np
 
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
 from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.instances.task_compliance_selector import TaskComplianceSelector
-from sb3_combrel.transfer.methods.least_error import check_action_mappings
-from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY, MappingTransfer
-from sb3_combrel.transfer.methods.task_compliance import candidate_compliances, draw_instances, instances_of_each
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.prior_sets import is_factored
-from sb3_combrel.transfer.prior.source_prior import SourcePrior
+from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
 # Seeds are saved as float64.
 MAX_SEED = 2**53
 
 
+@dataclass(repr=False, eq=False)
 class SampleTransfer(MappingTransfer):
     """
     Draws instances of all sources, through all mappings, more from tasks that comply with the target and more relevant ones.
@@ -34,85 +38,59 @@ class SampleTransfer(MappingTransfer):
     What differs from the paper:
 
     - The paper's tasks have the same variables and actions. Here each mapping of each source is a task, all sources being
-      equally likely beforehand, and all mappings to one source. There are thousands; their compliances are never listed: an
-      instance that is translated for a target action depends on the state mapping and one source action, and the compliances
-      of all tasks that have these are added up.
+      equally likely beforehand, and all mappings to one source. There are thousands, whose compliances are never listed: those
+      of all tasks with the same state mapping and source action for a target action are added up.
     - Instances are drawn for each target action, the same number for all, without replacement.
     - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice: the
       nearest first, until the threshold is reached, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
     - The paper draws once, after a batch of transitions of the target. Here instances are drawn after ``min_transitions``, and
       again whenever there are 1.2 times as many, with the same random numbers, so that more of those drawn stay. With
       ``min_transitions`` and ``max_transitions`` equal they are drawn once.
-    - As in COMBREL, a transition complies with no task whose instances are all far from it.
 
     What to expect: where tasks differ in one action or one pair of variables, as mappings do, their mean compliances over all
     transitions differ little, and many instances come through wrong mappings. COMBREL chooses by state and action instead.
-    The number of instances does not depend on whether any task complies well: sources of no use are transferred too.
-
-    Cost: no steps of the target but the first ``min_transitions``, in which the agent learns as without transfer. Each
-    transition is compared with all instances through every state mapping and source action, Mountain Car 2D to 4D 0.3
-    milliseconds; to draw after n transitions takes as long as relevance, the number of candidates times instances times n.
+    The number of instances does not depend on whether any task complies well: sources of no use are transferred too. No steps
+    of the target are spent on it but the first ``min_transitions``, in which the agent learns as without transfer.
 
     Example::
 
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=SampleTransfer(source, relevance="near"))
         model.learn(total_timesteps=5_000)
 
-    :param source: source instances, a path to them, or a list of several
-    :param mappings: the mappings to each source: the name of a set ("injective", "surjective", "all", "balanced"), one of the
-        paper's sets, a list of mappings or a ``MappingSet``
+    Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; it has
+    neither ``use`` nor ``source_breadth``.
+
+    :param mappings: the mappings to each source, a set as there
     :param n_instances: source instances that are drawn, at most; the same number for each target action
     :param min_transitions: transitions of the target after which instances are first drawn
     :param max_transitions: transitions that are recorded, at most
-    :param breadth: kernel breadth of transferred instances, in unit coordinates
-    :param breadth_decay: as of :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's too
     :param relevance: True: instances of a task are drawn in proportion to their relevance, Eq. 7; "near": to a relevance that
         does not favour those far from the target's transitions, ``equations.near_relevances``; False: all alike
-    :param relevance_fraction: mu of Eq. 4: the fraction of the weight over which distances are averaged
-    :param bandwidths: (start, outcome, reward) bandwidths of compliance and relevance; None: from the data
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
     ranks_by_relevance = False
 
-    def __init__(
-        self,
-        source: SourceLike,
-        mappings: MappingsLike = "injective",
-        *,
-        n_instances: int = 1000,
-        min_transitions: int = 50,
-        max_transitions: int = 3000,
-        breadth: float = DEFAULT_BREADTH,
-        breadth_decay: float = DEFAULT_BREADTH_DECAY,
-        transfer_terminals: bool = True,
-        relevance: bool | str = True,
-        relevance_fraction: float = 0.5,
-        bandwidths: tuple[float, float, float] | None = None,
-    ):
-        check_count("n_instances", n_instances)
-        check_count("min_transitions", min_transitions)
-        check_count("max_transitions", max_transitions)
-        if max_transitions < min_transitions:
-            raise ValueError(f"max_transitions must be at least min_transitions={min_transitions}, got {max_transitions}")
-        if is_factored(mappings):
-            raise ValueError(
-                f"mappings must be a set whose members are tasks to draw from, no factored ones, got {mappings!r}"
-            )
-        super().__init__(
-            source,
-            mappings,
-            breadth=breadth,
-            breadth_decay=breadth_decay,
-            transfer_terminals=transfer_terminals,
-            relevance=relevance,
-            relevance_fraction=relevance_fraction,
-            bandwidths=bandwidths,
-        )
-        self.n_instances = n_instances
-        self.min_transitions = min_transitions
-        self.max_transitions = max_transitions
+    mappings: MappingsLike = "injective"
+    _: KW_ONLY
+    n_instances: int = 1000
+    min_transitions: int = 50
+    max_transitions: int = 3000
+    relevance: bool | str = True
+    use: str = field(default="instances", init=False)
+    source_breadth: float = field(default=DEFAULT_SOURCE_BREADTH, init=False)
+
+    def __post_init__(self) -> None:
+        check_count("n_instances", self.n_instances)
+        check_count("min_transitions", self.min_transitions)
+        check_count("max_transitions", self.max_transitions)
+        if self.max_transitions < self.min_transitions:
+            least = f"min_transitions={self.min_transitions}"
+            raise ValueError(f"max_transitions must be at least {least}, got {self.max_transitions}")
+        if is_factored(self.mappings):
+            message = "mappings must be a set whose members are tasks to draw from, no factored ones, got"
+            raise ValueError(f"{message} {self.mappings!r}")
+        super().__post_init__()
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
@@ -127,9 +105,6 @@ class SampleTransfer(MappingTransfer):
         self._tasks = TaskComplianceSelector(parts, *bandwidths, self.max_transitions)
         return self._tasks
 
-    def _make_prior(self, task: TargetTask) -> SourcePrior:
-        raise NotImplementedError(f"{type(self).__name__} transfers instances, it has no prior")
-
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         super().observe(state, action, reward, next_state, terminated)
         n = self._tasks.transitions.n
@@ -140,25 +115,21 @@ class SampleTransfer(MappingTransfer):
         """Draw instances by compliance with the first ``n`` transitions, and relevance to them."""
         if self._n_draws == 0:
             self._seed = int(self.rng.integers(MAX_SEED))
-        self._show_drawn(self._drawn_by(n))
-        self._n_of_draw = n
-        self._n_draws += 1
-        if self._n_of_first == 0 and len(self.drawn):
-            self._n_of_first = n
-        self._instances.all_changed = True
-
-    def _drawn_by(self, n: int) -> np.ndarray:
-        """Candidates and numbers of the instances that the first ``n`` transitions, the selector's, say are to be drawn."""
         assert self.task is not None
         relevances = np.ones((len(self.candidates), int(self.candidates.instances.size.max())))
         if self.relevance:
             self._instances.measure_relevance(n_used=n, values=relevances)
         compliances = candidate_compliances(self.candidates, self._tasks.sums, n)
         n_each = max(1, self.n_instances // self.task.n_actions)
-        return draw_instances(self.candidates, compliances, relevances, n_each, np.random.default_rng(self._seed))
+        generator = np.random.default_rng(self._seed)
+        self._show_drawn(draw_instances(self.candidates, compliances, relevances, n_each, generator))
+        self._n_of_draw = n
+        self._n_draws += 1
+        if self._n_of_first == 0 and len(self.drawn):
+            self._n_of_first = n
+        self._instances.all_changed = True
 
     def _show_drawn(self, drawn: np.ndarray) -> None:
-        """Transfer these instances from now on."""
         assert self.task is not None
         self.drawn = drawn
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
@@ -202,9 +173,95 @@ class SampleTransfer(MappingTransfer):
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         super().set_state(state)
         self._seed, self._n_of_draw, self._n_of_first, self._n_draws = (int(figure) for figure in state["draw"])
-        # Whatever a file says: instances that exist, of each candidate in their order.
-        candidate = np.clip(state["drawn"][:, 0], 0, len(self.candidates) - 1).astype(np.int64)
-        size = self.candidates.instances.size[self.candidates.arrays.action[candidate]]
-        number = np.clip(state["drawn"][:, 1], 0, size - 1).astype(np.int64)
-        kept = size > 0
-        self._show_drawn(np.column_stack([candidate[kept], number[kept]]))
+        self._show_drawn(state["drawn"].astype(np.int64))
+
+
+def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
+    """
+    Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
+
+    The compliance of a task, Lambda_X of Eq. 6, is the sum over target actions of the compliances of their transitions,
+    divided by the number of all transitions.
+
+    :param mappings: the mappings to one source, each as likely as any other
+    :param sums: compliances of the target's transitions added up, by state mapping, target action and source action, shape
+        (n_state_mappings, n_target_actions, n_source_actions)
+    :param n_transitions: of all target actions together
+    :return: sum over X of Lambda_X / n_mappings, shape of ``sums``
+    """
+    n_rows, n_actions, n_source_actions = sums.shape
+    if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
+        # In the mean over all source actions that the other target actions may have.
+        of_action = sums.mean(axis=2)
+        others = of_action.sum(axis=1, keepdims=True) - of_action
+        everything: np.ndarray = sums + others[:, :, None]
+        return everything / (n_transitions * n_rows * n_source_actions)
+    found = np.zeros_like(sums)
+    for rows, actions in members_of(mappings):
+        members = rows, np.arange(n_actions), actions
+        of_task = sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings)
+        np.add.at(found, members, of_task[:, None])
+    return found
+
+
+def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
+    """
+    Return for each candidate the compliance of all virtual source tasks that have it, added up.
+
+    :param sums: see :func:`mean_compliances`; the state mappings of all sources one below the other, their actions numbered on
+    :param n_transitions: of all target actions together
+    :return: shape (n_candidates,); of each target action they add up to the mean compliance of all tasks
+    """
+    origins = np.array(candidates.origins, dtype=np.int64)
+    found, row, action = np.zeros(len(origins)), 0, 0
+    for number, (source, mappings) in enumerate(zip(candidates.sources, candidates.sets, strict=True)):
+        rows, actions = slice(row, row + mappings.n_state_mappings), slice(action, action + source.n_actions)
+        each = mean_compliances(mappings, sums[rows, :, actions], n_transitions) / len(candidates.sources)
+        # Of equal state mappings one is a candidate, which stands for all.
+        same = np.unique(np.hstack([mappings.state_mappings, mappings.state_signs]), axis=0, return_inverse=True)[1].ravel()
+        of_equal = np.zeros_like(each)
+        np.add.at(of_equal, same, each)
+        own = origins[:, 0] == number
+        _, target_action, state_index, source_action = origins[own].T
+        found[own] = of_equal[same[state_index], target_action, source_action]
+        row, action = rows.stop, actions.stop
+    return found
+
+
+def draw_instances(
+    candidates: Candidates, compliances: np.ndarray, relevances: np.ndarray, n: int, rng: np.random.Generator
+) -> np.ndarray:
+    """
+    Draw translated instances for each target action, without replacement.
+
+    Each time one is drawn, a candidate is drawn in proportion to its compliance, and of it an instance in proportion to its
+    relevance, of those that are left. Drawn as the n largest of log-probabilities with Gumbel noise, which is the same.
+
+    :param compliances: of each candidate, shape (n_candidates,)
+    :param relevances: of each candidate's instances, shape (n_candidates, most instances of an action)
+    :param n: instances of each target action, at most; fewer if no more have a probability above 0
+    :return: candidate and number of its instance, one a row, in order, int64, shape (n_drawn, 2)
+    """
+    size = candidates.instances.size[candidates.arrays.action]
+    exists = np.arange(relevances.shape[1]) < size[:, None]
+    relevant = np.where(exists, relevances, 0.0)
+    total = relevant.sum(axis=1, keepdims=True)
+    probability = compliances[:, None] * np.divide(relevant, total, out=np.zeros_like(relevant), where=total > 0.0)
+    noise = rng.gumbel(size=probability.shape)
+    rank = np.log(probability, out=np.full_like(probability, -np.inf), where=probability > 0.0) + noise
+    found = []
+    for first, last in zip(candidates.arrays.first[:-1], candidates.arrays.first[1:], strict=True):
+        of_action = rank[first:last].ravel()
+        best = np.argsort(-of_action, kind="stable")[:n]
+        best = np.sort(best[of_action[best] > -np.inf])
+        found.append(np.column_stack([first + best // rank.shape[1], best % rank.shape[1]]))
+    return np.vstack(found).astype(np.int64)
+
+
+def instances_of_each(candidates: Candidates, drawn: np.ndarray) -> Instances:
+    """Return what :func:`draw_instances` has drawn, by candidate, in the coordinates of their sources."""
+    source, (candidate, number) = candidates.instances, drawn.T
+    action = candidates.arrays.action[candidate]
+    at = action, number
+    columns = source.state[at], source.effect[at], source.reward[at], source.terminated[at]
+    return Instances.of_rows(len(candidates), candidate, *columns, periodic=source.periodic)

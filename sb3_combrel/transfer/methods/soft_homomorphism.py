@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -12,19 +12,8 @@ from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
-from sb3_combrel.transfer.methods.soft_mapping import (
-    FitData,
-    Logits,
-    all_readings,
-    as_source,
-    brought_back,
-    count_mappings,
-    fit,
-    most_probable,
-    n_readings,
-    probabilities,
-)
-from sb3_combrel.transfer.methods.soft_predictions import MixturePredictions, Predicted
+from sb3_combrel.transfer.methods import soft_mapping as soft
+from sb3_combrel.transfer.methods.soft_mapping import Logits
 from sb3_combrel.transfer.prior.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
 from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
 from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
@@ -38,6 +27,7 @@ MAX_FITTED = 500
 MASS, MAX_TERMS = 0.98, 12
 
 
+@dataclass(repr=False, eq=False)
 class SoftHomomorphism(Transfer):
     """
     The source's model, seen through a stochastic mapping of states that is fitted to the target, is the prior of its model.
@@ -56,17 +46,14 @@ class SoftHomomorphism(Transfer):
     What was changed. The paper maps to a finite set of source states, or by features made by hand; a distribution over ways to
     read variables needs neither. It transfers the source's value function; here the mixture's model is the prior, and the
     agent plans. Actions are mapped as well, by parameters of their own. A target with twice the variables of the source is
-    taken for two copies of it, which are mapped each in its own way, with source actions of their own; their predictions are
-    added. Scale and offset are not parameters: in unit coordinates, ranges correspond. As only the mean is fitted, a source
-    action can also come out as the mean of others that it equals, such as no push as half a push to either side.
+    taken for two copies of it, mapped each in its own way; their predictions are added. Scale and offset are not parameters:
+    in unit coordinates, ranges correspond. As only the mean is fitted, a source action can also come out as the mean of others
+    that it equals, such as no push as half a push to either side.
 
-    What it claims to know, without instances of the target, is as in :class:`~sb3_combrel.transfer.prior.claims.Claims`:
-    by the weight of the source's data, and by the part of the target's effects that the mixture explains, of the variable of
-    which it explains least; nothing of what it explains less than half, and no end before one has been confirmed. Effects on
-    variables of which it explains less than half under an action, of ten or more transitions, are predicted as 0.
+    What it claims to know without instances of the target: see :class:`~sb3_combrel.transfer.prior.claims.Claims`.
 
-    Cost: no steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. MountainCar2D to 4D
-    (48 mappings, two copies): about 1 s for each of the 16 fits in a run of 12 episodes. It needs ``FittedRMax(degree=1)``.
+    No steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. A fit takes about 1 s for
+    MountainCar2D to 4D (48 mappings, two copies). It needs ``FittedRMax(degree=1)``.
 
     Example::
 
@@ -85,53 +72,48 @@ class SoftHomomorphism(Transfer):
 
     use = "prior"
 
-    def __init__(
-        self,
-        source: SourceLike,
-        *,
-        n_copies: int | None = None,
-        mirrored: bool = True,
-        n_starts: int = 4,
-        max_transitions: int = 3000,
-        transfer_terminals: bool = True,
-        source_breadth: float = DEFAULT_SOURCE_BREADTH,
-    ):
-        check_count("n_copies", n_copies, none_allowed=True)
-        check_count("n_starts", n_starts)
-        check_count("max_transitions", max_transitions, min=FIRST_RENEWAL)
-        check_boolean("mirrored", mirrored)
-        check_boolean("transfer_terminals", transfer_terminals)
-        check_positive("source_breadth", source_breadth)
-        self.source = source
-        self.n_copies = n_copies
-        self.mirrored = bool(mirrored)
-        self.n_starts = n_starts
-        self.max_transitions = max_transitions
-        self.transfer_terminals = bool(transfer_terminals)
-        self.source_breadth = source_breadth
+    source: SourceLike
+    _: KW_ONLY
+    n_copies: int | None = None
+    mirrored: bool = True
+    n_starts: int = 4
+    max_transitions: int = 3000
+    transfer_terminals: bool = True
+    source_breadth: float = DEFAULT_SOURCE_BREADTH
+
+    def __post_init__(self) -> None:
+        check_count("n_copies", self.n_copies, none_allowed=True)
+        check_count("n_starts", self.n_starts)
+        check_count("max_transitions", self.max_transitions, min=FIRST_RENEWAL)
+        check_boolean("mirrored", self.mirrored)
+        check_boolean("transfer_terminals", self.transfer_terminals)
+        check_positive("source_breadth", self.source_breadth)
+        self.mirrored = bool(self.mirrored)
+        self.transfer_terminals = bool(self.transfer_terminals)
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         self._source = load_one_source(self.source, type(self).__name__)
-        source, d = self._source, task.n_variables
-        n_mappings = count_mappings(source.n_variables, d, self.mirrored)
+        # A saved model must not depend on other files.
+        self.source = source = self._source
+        d = task.n_variables
+        n_mappings = soft.count_mappings(source.n_variables, d, self.mirrored)
         if n_mappings > MAX_MAPPINGS:
             advice = "mirrored=False would do, or " if self.mirrored else ""
             raise ValueError(
                 f"SoftHomomorphism needs at most {MAX_MAPPINGS:,} mappings of states, got {n_mappings:,} of {d} target to "
                 f"{source.n_variables} source variables; {advice}a source with fewer variables"
             )
-        instances = stacked_instances([source])
-        self._model = SourceModel(instances, float(self.source_breadth))
+        self._model = SourceModel(stacked_instances([source]), float(self.source_breadth))
         self._mean = source.scaling.to_unit(source.states).mean(axis=0)
-        self._readings = all_readings(source.n_variables, d, self.mirrored)
+        self._readings = soft.all_readings(source.n_variables, d, self.mirrored)
         copies = max(1, d // source.n_variables) if self.n_copies is None else self.n_copies
-        columns = n_readings(source.n_variables, d, self.mirrored)
+        columns = 1 + int(self._readings.number.max())
         self._shape = Logits(
             np.zeros((copies, source.n_variables, columns)), np.zeros((copies, task.n_actions, source.n_actions))
         )
         self._logits: Logits | None = None
-        self._mixture = MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
+        self._mixture = soft.MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
         self._periodic = np.array(task.periodic)
         self._transitions = RecordedEpisodes(d)
         self._claims = Claims(source.rewards, task, self.transfer_terminals)
@@ -188,10 +170,10 @@ class SoftHomomorphism(Transfer):
         rows = np.arange(n) if n <= MAX_FITTED else np.sort(self.rng.choice(n, MAX_FITTED, replace=False))
         size = np.abs(seen.effects[:n]).mean(axis=0)
         scale = np.maximum(size, max(1e-2 * float(size.max()), 1e-6))
-        data = FitData(self._all_predictions(seen.states[rows]), seen.actions[rows], seen.effects[rows], scale)
+        data = soft.FitData(self._all_predictions(seen.states[rows]), seen.actions[rows], seen.effects[rows], scale)
         found = self._state_mappings()
         seed = int(self.rng.integers(2**63))
-        self._use(fit(self._logits, self._shape, self._readings, data, self.n_starts, seed))
+        self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, seed))
         if self._state_mappings() != found:
             self._steps_to_find = self._n_observed
         predicted = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
@@ -204,22 +186,20 @@ class SoftHomomorphism(Transfer):
     def _use(self, logits: Logits) -> None:
         """Predict with these parameters from now on."""
         self._logits = logits
-        self._mixture.set_terms(most_probable(*probabilities(logits, self._readings), MAX_TERMS, MASS))
+        self._mixture.set_terms(soft.most_probable(*soft.probabilities(logits, self._readings), MAX_TERMS, MASS))
 
     def _all_predictions(self, states: np.ndarray) -> np.ndarray:
         """What each mapping with each source action predicts, shape (n, n_mappings, n_source_actions, n_target_variables)."""
-        readings, n_actions = self._readings, self._source.n_actions
-        n, m, d = len(states), len(readings.variable), states.shape[1]
-        at = as_source(
-            np.repeat(states, m, axis=0), np.tile(readings.variable, (n, 1)), np.tile(readings.sign, (n, 1)), self._mean
-        )
-        found = np.empty((n, m, n_actions, d))
-        for b in range(n_actions):
-            effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect.reshape(n, m, -1)
-            found[:, :, b] = brought_back(effects, readings.variable, readings.sign, d)
+        n, m, d = len(states), len(self._readings.variable), states.shape[1]
+        mapping = np.tile(np.arange(m), n)
+        at = soft.to_source(np.repeat(states, m, axis=0), self._readings, mapping, self._mean)
+        found = np.empty((n, m, self._source.n_actions, d))
+        for b in range(self._source.n_actions):
+            effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect
+            found[:, :, b] = soft.to_target(effects, self._readings, mapping, d).reshape(n, m, d)
         return found
 
-    def _judge(self, predicted: Predicted) -> None:
+    def _judge(self, predicted: soft.Predicted) -> None:
         """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
         assert self.task is not None
         effects, actions = self._transitions.effects[: self._transitions.n], self._transitions.actions[: self._transitions.n]
@@ -232,20 +212,11 @@ class SoftHomomorphism(Transfer):
         founded = np.repeat((taken @ each)[:, None], len(size), axis=1)
         self._claims.renew(missed, founded)
 
-    def _best(self) -> list[tuple[int, ...]]:
-        """The most probable mapping and source action of each target action and copy; none before the first fit."""
-        if self._logits is None:
-            return []
-        terms = self._mixture.terms
-        action = np.repeat(np.arange(len(terms.first) - 1), np.diff(terms.first))
-        best: dict[tuple[int, int], tuple[int, ...]] = {}
-        for row in zip(action.tolist(), *(column.tolist() for column in terms[1:4]), strict=True):
-            best.setdefault(row[:2], row)
-        return list(best.values())
-
     def _state_mappings(self) -> list[int]:
         """The most probable mapping of states of each copy, in any order of the copies; none before the first fit."""
-        return [] if self._logits is None else sorted(probabilities(self._logits, self._readings)[0].argmax(axis=1).tolist())
+        if self._logits is None:
+            return []
+        return sorted(soft.probabilities(self._logits, self._readings)[0].argmax(axis=1).tolist())
 
     def mapping_steps(self) -> int:
         """Return how many steps of the target had been taken when the mapping was first fitted; all if it never was."""
@@ -263,7 +234,7 @@ class SoftHomomorphism(Transfer):
         if self._logits is None:
             raise ValueError(f"there is no mapping before the target has been seen for {FIRST_RENEWAL} transitions")
         assert self.task is not None
-        of_mapping, of_action = probabilities(self._logits, self._readings)
+        of_mapping, of_action = soft.probabilities(self._logits, self._readings)
         found = np.zeros((len(of_mapping), 2, self._source.n_variables, self.task.n_variables))
         for (m, k), v in np.ndenumerate(self._readings.variable):
             if v >= 0:
@@ -274,37 +245,37 @@ class SoftHomomorphism(Transfer):
         """
         Say what each target action is taken for most probably: "East: Right on (x, vx) 0.97, Neutral on (y, vy) 0.41; ...".
 
-        Probabilities are those of mapping and source action together; low ones, where the mean of several is what fits.
+        Probabilities are those of mapping and source action together, low where the mean of several is what fits.
         """
         assert self.task is not None
         if self._logits is None:
             return "; ".join(f"{name}: nothing" for name in self.task.action_names)
-        words: dict[str, list[str]] = {name: [] for name in self.task.action_names}
-        of_mapping, of_action = probabilities(self._logits, self._readings)
-        for a, c, m, b in self._best():
-            read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
-            names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self.task.state_names[v] for v, s in read]
-            share = of_mapping[c, m] * of_action[c, a, b]
-            words[self.task.action_names[a]].append(f"{self._source.action_names[b]} on ({', '.join(names)}) {share:.2f}")
-        return "; ".join(f"{name}: {', '.join(each)}" for name, each in words.items())
+        of_mapping, of_action = soft.probabilities(self._logits, self._readings)
+        words = []
+        for a, target_action in enumerate(self.task.action_names):
+            of_copies = []
+            for copy, actions in zip(of_mapping, of_action[:, a], strict=True):
+                joint = np.outer(copy, actions)
+                m, b = np.unravel_index(joint.argmax(), joint.shape)
+                read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
+                names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self.task.state_names[v] for v, s in read]
+                of_copies.append(f"{self._source.action_names[b]} on ({', '.join(names)}) {joint.max():.2f}")
+            words.append(f"{target_action}: {', '.join(of_copies)}")
+        return "; ".join(words)
 
     def statistics(self) -> dict[str, float]:
         wrong, baseline = self._squares.tolist()
-        certainty = float(probabilities(self._logits, self._readings)[0].max(axis=1).mean()) if self._logits else np.nan
+        of_mapping = soft.probabilities(self._logits, self._readings)[0] if self._logits else np.full((1, 1), np.nan)
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
             "transfer/prior_trust": float(self._claims.trust.mean()),
             "transfer/prior_doubted": float(self._claims.evidence.doubted),
-            "transfer/mapping_probability": certainty,
+            "transfer/mapping_probability": float(of_mapping.max(axis=1).mean()),
             "transfer/steps_to_find_mapping": self._steps_to_find,
             "transfer/fits": self._n_fits,
             "transfer/fit_seconds": self._seconds,
             "transfer/target_transitions": self._n_observed,
         }
-
-    def arguments(self) -> dict[str, Any]:
-        # Once read, the instances themselves: the file of a saved model must not depend on other files.
-        return super().arguments() if self.task is None else {**super().arguments(), "source": self._source}
 
     def get_state(self) -> dict[str, np.ndarray]:
         logits = self._shape if self._logits is None else self._logits

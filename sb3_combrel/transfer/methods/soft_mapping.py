@@ -1,4 +1,4 @@
-"""Stochastic mappings of target states to source states, with continuous parameters that are fitted by gradient descent."""
+"""Stochastic mappings of target to source states: their parameters, fitted by gradient descent, and what they predict."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_combrel.transfer.prior.copies import distinct_rows
+from sb3_combrel.transfer.source_model import SourceModel, SourcePredictions
+
 # Logits have a normal prior of this standard deviation: a few transitions do not make anything certain.
 LOGIT_DEVIATION = 3.0
 N_STEPS, STEP_SIZE = 200, 0.1
 NOTHING = -1
+# Predictions of the sample are stored for so many mappings with a source action.
+MAX_STORED = 128
+# Pairs that are predicted at once.
+BATCH = 4096
+
+Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Readings(NamedTuple):
@@ -38,18 +47,8 @@ def count_mappings(n_source: int, n_target: int, mirrored: bool) -> int:
     return perm(max(n_source, n_target), n_read) * (2**n_read if mirrored else 1)
 
 
-def n_readings(n_source: int, n_target: int, mirrored: bool) -> int:
-    """Return how many things a source variable may read: the number of columns of its logits."""
-    return n_target * (2 if mirrored else 1) + (n_source > n_target)
-
-
 def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
-    """
-    List the deterministic mappings of states.
-
-    :param n_source: number of source variables; ``n_target``: of target variables
-    :param mirrored: whether target variables may be read mirrored
-    """
+    """List the deterministic mappings of states; ``mirrored``: target variables may be read mirrored as well."""
     nothing = [NOTHING] * max(0, n_source - n_target)
     orders = sorted(set(permutations([*range(n_target), *nothing], n_source)))
     rows = []
@@ -59,37 +58,33 @@ def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
     variable = np.array([order for order, _ in rows], dtype=np.int64)
     sign = np.array([signs for _, signs in rows], dtype=np.float64)
     number = np.where(sign < 0.0, variable + n_target, variable)
-    number[variable == NOTHING] = n_readings(n_source, n_target, mirrored) - 1
+    number[variable == NOTHING] = n_target * (2 if mirrored else 1)
     return Readings(variable, sign, number)
 
 
-def as_source(states: np.ndarray, variable: np.ndarray, sign: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def to_source(states: np.ndarray, readings: Readings, mapping: np.ndarray | int, mean: np.ndarray) -> np.ndarray:
     """
-    Return target states as mappings have them in the source, unit coordinates.
+    Return target states as mappings have them in the source, unit coordinates, shape (n, n_source_variables).
 
     :param states: of the target, shape (n, n_target_variables)
-    :param variable: shape (n, n_source_variables) or (n_source_variables,), as in :class:`Readings`; ``sign``: the same
+    :param mapping: the number of each state's mapping, shape (n,), or of that of all
     :param mean: of the source's instances, shape (n_source_variables,), for variables that read nothing
-    :return: shape (n, n_source_variables)
     """
-    variable, sign = (np.broadcast_to(array, (len(states), len(mean))) for array in (variable, sign))
+    variable, sign = (np.broadcast_to(array[mapping], (len(states), len(mean))) for array in readings[:2])
     read = np.take_along_axis(states, np.maximum(variable, 0), axis=1)
     return np.where(variable == NOTHING, mean, np.where(sign < 0.0, 1.0 - read, read))
 
 
-def brought_back(effects: np.ndarray, variable: np.ndarray, sign: np.ndarray, n_target: int) -> np.ndarray:
+def to_target(effects: np.ndarray, readings: Readings, mapping: np.ndarray | int, n_target: int) -> np.ndarray:
     """
     Return effects of the source in target coordinates: each target variable moves as the source variable that reads it.
 
-    :param effects: unit coordinates of the source, shape (..., n_source_variables)
-    :param variable: same shape, or one that is broadcast to it; ``sign``: the same
-    :return: shape (..., n_target): 0 for variables that are not read
+    :param effects: unit coordinates of the source, shape (n, n_source_variables)
+    :param mapping: see :func:`to_source`
+    :return: shape (n, n_target): 0 for variables that are not read
     """
-    variable, sign = (np.broadcast_to(array, effects.shape) for array in (variable, sign))
-    found = np.zeros((*effects.shape[:-1], n_target))
-    for v in range(n_target):
-        found[..., v] = np.where(variable == v, sign * effects, 0.0).sum(axis=-1)
-    return found
+    variable, sign = readings.variable[mapping], readings.sign[mapping]
+    return np.column_stack([np.where(variable == v, sign * effects, 0.0).sum(axis=-1) for v in range(n_target)])
 
 
 class Logits(NamedTuple):
@@ -106,19 +101,15 @@ class Logits(NamedTuple):
 
 def probabilities(logits: Logits, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the mixture that the parameters stand for.
+    Return the probabilities of the deterministic mappings, shape (n_copies, n_mappings), and of source actions.
 
-    A mapping's probability is the product of those of its source variables' readings, normalised over the mappings listed: a
-    target variable is read once.
-
-    :return: of each deterministic mapping, shape (n_copies, n_mappings); of each source action, as ``logits.action``
+    A mapping's is the product of those of its source variables' readings, normalised over the mappings listed.
     """
     state, action = _log_probabilities(th.from_numpy(logits.state), th.from_numpy(logits.action), readings.number)
     return state.exp().numpy(), action.exp().numpy()
 
 
 def _log_probabilities(state: th.Tensor, action: th.Tensor, number: np.ndarray) -> tuple[th.Tensor, th.Tensor]:
-    """Log-probabilities of mappings, shape (..., n_mappings), and of source actions; see :func:`probabilities`."""
     each = [state[..., k, :][..., th.from_numpy(column)] for k, column in enumerate(number.T)]
     return th.log_softmax(th.stack(each).sum(dim=0), dim=-1), th.log_softmax(action, dim=-1)
 
@@ -143,9 +134,8 @@ def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData)
     """
     Compute the error of mixtures, to be minimised; differentiable.
 
-    Of a transition, the sum over variables of sqrt(1 + (error / scale)^2) - 1: like a squared error where errors are small, so
-    that the mean is fitted, but a few large effects, such as those of a car that hits the wall, do not decide alone. Added is
-    the negative logarithm of the logits' normal prior.
+    Of a transition, the sum over variables of sqrt(1 + (error / scale)^2) - 1: like a squared error where errors are small,
+    but a few large effects do not decide alone. Added is the negative logarithm of the logits' normal prior.
 
     :param state: logits of ``n_starts`` sets of parameters, shape (n_starts, *logits.state.shape); ``action``: the same
     :return: shape (n_starts,)
@@ -168,8 +158,7 @@ def fit(before: Logits | None, shape: Logits, readings: Readings, data: FitData,
 
     :param before: parameters to start from as well, those of the last fit
     :param shape: any parameters of the shapes wanted
-    :param n_starts: random starts
-    :param seed: of the random starts, the only random numbers here
+    :param n_starts: random starts, which ``seed`` decides
     """
     generator = th.Generator().manual_seed(seed)
     starts = []
@@ -223,3 +212,91 @@ def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int,
         first.append(len(rows))
     copy, mapping, action = (np.array([row[k] for row in rows], dtype=np.int64) for k in range(3))
     return Terms(np.array(first, dtype=np.int64), copy, mapping, action, np.array([row[3] for row in rows]))
+
+
+class MixturePredictions:
+    """
+    Predicts pairs of the target by the mean over a mixture.
+
+    The effect is the sum of the copies'; the reward is the mean of theirs; an end, the product; the weight of the source's
+    data, the least.
+
+    :param model: of the source
+    :param readings: the deterministic mappings
+    :param mean: of the source's states, unit coordinates, shape (n_source_variables,)
+    :param sample: states that are asked for again and again, unit coordinates, shape (n_points, n_target_variables)
+    """
+
+    terms: Terms
+
+    def __init__(self, model: SourceModel, readings: Readings, mean: np.ndarray, sample: np.ndarray):
+        self.model = model
+        self.readings = readings
+        self.mean = mean
+        self.sample = sample
+        self._stored: dict[tuple[int, int], tuple[np.ndarray, SourcePredictions]] = {}
+
+    def set_terms(self, terms: Terms) -> None:
+        """Use this mixture from now on."""
+        self.terms = terms
+        self.n_copies = 1 + int(terms.copy.max())
+
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
+        """
+        Predict pairs of the target.
+
+        :param states: unit coordinates, shape (n, n_target_variables)
+        :param actions: int64, shape (n,)
+        :return: effects, shape (n, n_target_variables); rewards, probabilities of termination, and weights, shape (n,)
+        """
+        n, d = states.shape
+        if n == len(self.sample) and n > 1 and (actions == actions[0]).all() and np.array_equal(states, self.sample):
+            return self._predict_sample(int(actions[0]))
+        found = np.zeros((n, d)), np.zeros(n), np.ones(n), np.zeros(n)
+        for first in range(0, n, BATCH):
+            rows = slice(first, first + BATCH)
+            for array, part in zip(found, self._predict_some(states[rows], actions[rows]), strict=True):
+                array[rows] = part
+        return found
+
+    def _predict_some(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
+        terms, (n, d) = self.terms, states.shape
+        count = np.diff(terms.first)[actions]
+        row = np.repeat(np.arange(n), count)
+        term = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(terms.first[actions], count)
+        mapping, share, place = terms.mapping[term], terms.share[term], row * self.n_copies + terms.copy[term]
+        predicted = self.model.predict(to_source(states[row], self.readings, mapping, self.mean), terms.action[term])
+        effects = share[:, None] * to_target(predicted.effect, self.readings, mapping, d)
+        effect = np.column_stack([np.bincount(row, effects[:, v], n) for v in range(d)])
+        each = [
+            np.bincount(place, share * of_terms, n * self.n_copies).reshape(n, self.n_copies) for of_terms in predicted[1:]
+        ]
+        return _joined(effect, each[0], each[1], each[2])
+
+    def _predict_sample(self, action: int) -> Predicted:
+        """Predict the whole sample, one term after the other; different states of the source once."""
+        terms, (n, d) = self.terms, self.sample.shape
+        effect, each = np.zeros((n, d)), np.zeros((3, n, self.n_copies))
+        for t in range(terms.first[action], terms.first[action + 1]):
+            mapping = int(terms.mapping[t])
+            kind, predicted = self._of_sample(mapping, int(terms.action[t]))
+            effect += terms.share[t] * to_target(predicted.effect, self.readings, mapping, d)[kind]
+            for sums, of_kinds in zip(each, predicted[1:], strict=True):
+                sums[:, terms.copy[t]] += terms.share[t] * of_kinds[kind]
+        return _joined(effect, each[0], each[1], each[2])
+
+    def _of_sample(self, mapping: int, action: int) -> tuple[np.ndarray, SourcePredictions]:
+        """The number of each state's prediction, int32, shape (n_points,), and the predictions."""
+        if (mapping, action) not in self._stored:
+            at = to_source(self.sample, self.readings, mapping, self.mean)
+            chosen, kind = distinct_rows(at)
+            predicted = self.model.predict(at[chosen], np.full(len(chosen), action, dtype=np.int64))
+            if len(self._stored) >= MAX_STORED:
+                del self._stored[next(iter(self._stored))]
+            self._stored[mapping, action] = kind.astype(np.int32), predicted
+        return self._stored[mapping, action]
+
+
+def _joined(effect: np.ndarray, reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> Predicted:
+    """Join what copies predict, shape (n, n_copies) each; effects have been added."""
+    return effect, reward.mean(axis=1), end.prod(axis=1), weight.min(axis=1)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from sb3_combrel.common.checks import check_count, check_positive
-from sb3_combrel.transfer.candidates import SourceLike
-from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
-from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
+from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
 N_ITERATIONS = 30
 # Noise of the standardised target triplets, as a variance, that the regression starts from.
@@ -19,12 +21,7 @@ FIRST_NOISE = 0.1
 
 
 class Codes(NamedTuple):
-    """
-    Both samples as sparse codes over one dictionary.
-
-    :param source: float64, shape (n_source_samples, n_atoms); ``target``: the same for the target's
-    :param dictionary: shape (n_atoms, n_target_columns)
-    """
+    """Both samples as sparse codes, shape (n_samples, n_atoms), over one dictionary, shape (n_atoms, n_target_columns)."""
 
     source: np.ndarray
     target: np.ndarray
@@ -33,14 +30,9 @@ class Codes(NamedTuple):
 
 def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity: float, seed: int) -> Codes:
     """
-    Code the triplets of both tasks over one dictionary.
-
-    The source's are coded first over as many atoms as the target's triplets have columns, so that both have the same number
-    of columns; a larger dictionary is then learned for these codes, over which the target's triplets are coded as well.
+    Code the triplets of both tasks over one dictionary, see :class:`SparseCodingMapping`.
 
     :param source: standardised triplets, one a row; ``target``: the same
-    :param n_atoms: of the larger dictionary
-    :param sparsity: weight of the codes' absolute values beside half the squared error
     :param seed: of the dictionaries' first atoms
     """
     from sklearn.decomposition import DictionaryLearning, sparse_encode
@@ -62,39 +54,26 @@ def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity:
         return Codes(encode(first, dictionary), encode(target, dictionary), dictionary)
 
 
-def nearest_pairs(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the row of ``target`` that is nearest to each row of ``source``, int64, shape (n_source_rows,)."""
-    return np.asarray(cKDTree(target).query(source)[1], dtype=np.int64)
-
-
-class Regression:
+def fit_regression(source: np.ndarray, target: np.ndarray, seed: int) -> GaussianProcessRegressor:
     """
-    Gaussian process regression from standardised source triplets to target triplets, all columns with one kernel.
+    Fit a Gaussian process from standardised source triplets to target triplets, all columns with one kernel.
 
     :param source: shape (n, n_source_columns); ``target``: shape (n, n_target_columns)
     :param seed: of the regression's optimiser
     """
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    def __init__(self, source: np.ndarray, target: np.ndarray, seed: int):
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
-        noise = WhiteKernel(FIRST_NOISE, (1e-6, 1e1))
-        kernel = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.sqrt(source.shape[1]), (1e-1, 1e3)) + noise
-        self._regressor = GaussianProcessRegressor(kernel, random_state=seed)
-        with warnings.catch_warnings():
-            # A noise or a length at its bound is what it is.
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            self._regressor.fit(source, target)
-        #: Mean squared error on the pairs that it was fitted to; 1 is that of the mean of standardised columns.
-        self.error = float(((self.predict(source) - target) ** 2).mean())
-
-    def predict(self, source: np.ndarray) -> np.ndarray:
-        """Return the mean for source triplets, shape (n, n_target_columns)."""
-        return np.asarray(self._regressor.predict(source)).reshape(len(source), -1)
+    noise = WhiteKernel(FIRST_NOISE, (1e-6, 1e1))
+    kernel = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.sqrt(source.shape[1]), (1e-1, 1e3)) + noise
+    with warnings.catch_warnings():
+        # A noise or a length at its bound is what it is.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return GaussianProcessRegressor(kernel, random_state=seed).fit(source, target)
 
 
+@dataclass(repr=False, eq=False)
 class SparseCodingMapping(LearnedTranslation):
     """
     Pairs random transitions of both tasks by their sparse codes, and transfers all source data by regression on the pairs.
@@ -105,59 +84,38 @@ class SparseCodingMapping(LearnedTranslation):
     paired with the target triplet whose code is nearest; a Gaussian process learns the mapping from these pairs, and carries
     all source data over to the target. Nothing is learned about the mapping afterwards.
 
-    What was changed. Triplets are of unit coordinates, with the effect in place of the next state, which beside its state
-    says little, and with one column for each action in place of its number; all columns are standardised, the first codes too.
-    The regression is an exact Gaussian process, on at most ``n_source_samples`` pairs, not a sparse one. Translated data are
-    instances that join the target's own, nearest first, instead of what fitted Q-iteration or LSPI starts from. Rewards and
-    ends are the source's.
+    What was changed. Triplets are of unit coordinates, with the effect in place of the next state and one column for each
+    action, standardised, the first codes too. The regression is an exact Gaussian process, not a sparse one. Translated data
+    are instances that join the target's own, nearest first, instead of what fitted Q-iteration or LSPI starts from. Rewards
+    and ends are the source's.
 
     What to expect. The atoms of the first dictionary come in any order and with any sign, and are compared with the columns of
     the target's triplets one by one: nothing in the method makes pairs correspond, and the regression fits whatever pairs it
     is given. ``transfer/prediction_error`` says how well the instances that were used then predicted the target.
-
-    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
 
     Example::
 
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=SparseCodingMapping(source, n_random_steps=100))
         model.learn(total_timesteps=5_000)
 
-    :param source: source instances, or a path to them
-    :param n_random_steps: steps of the target that its sample takes
-    :param n_source_samples: source instances that pairs are made of, at most
+    Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.learned_translation.LearnedTranslation`.
+
     :param n_atoms: atoms of the second dictionary; None: twice the columns of a target triplet
     :param sparsity: weight of the codes' absolute values beside half the squared error
-    :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """
 
-    def __init__(
-        self,
-        source: SourceLike,
-        *,
-        n_random_steps: int = DEFAULT_SAMPLE_STEPS,
-        n_source_samples: int = 300,
-        n_atoms: int | None = None,
-        sparsity: float = 0.1,
-        breadth: float = DEFAULT_BREADTH,
-        breadth_decay: float = DEFAULT_BREADTH_DECAY,
-        transfer_terminals: bool = True,
-    ):
-        super().__init__(
-            source,
-            n_random_steps=n_random_steps,
-            n_source_samples=n_source_samples,
-            breadth=breadth,
-            breadth_decay=breadth_decay,
-            transfer_terminals=transfer_terminals,
-        )
-        check_count("n_atoms", n_atoms, none_allowed=True)
-        check_positive("sparsity", sparsity)
-        self.n_atoms = n_atoms
-        self.sparsity = sparsity
-        self.regression_error = np.nan
+    _: KW_ONLY
+    n_atoms: int | None = None
+    sparsity: float = 0.1
+
+    #: Mean squared error on the pairs that the regression was fitted to; 1 is that of the mean of standardised columns.
+    regression_error = np.nan
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("n_atoms", self.n_atoms, none_allowed=True)
+        check_positive("sparsity", self.sparsity)
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
         assert self.task is not None
@@ -168,8 +126,9 @@ class SparseCodingMapping(LearnedTranslation):
         from_rows, to_rows = of_source.to(source_columns), of_target.to(target_columns)
         n_atoms = 2 * to_rows.shape[1] if self.n_atoms is None else self.n_atoms
         codes = sparse_codes(from_rows, to_rows, n_atoms, self.sparsity, seed)
-        regression = Regression(from_rows, to_rows[nearest_pairs(codes.source, codes.target)], seed)
-        self.regression_error = regression.error
+        _, nearest = cKDTree(codes.target).query(codes.source)
+        regression = fit_regression(from_rows, to_rows[nearest], seed)
+        self.regression_error = float(((regression.predict(from_rows) - to_rows[nearest]) ** 2).mean())
         found = regression.predict(of_source.to(instances.columns(n_source)))
         return Triplets.of_columns(of_target.back(found), n_target)
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.transfer.candidates import SourceLike
-from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS, LearnedTranslation, Standard, Triplets
-from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
-from sb3_combrel.transfer.methods.three_way_machine import reconstruct, train
+from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
+
+STEP_SIZE = 0.01
+FIRST_DEVIATION = 0.1
+BATCH = 64
+N_RECONSTRUCTIONS = 20
 
 
+@dataclass(repr=False, eq=False)
 class ThreeWayRBM(LearnedTranslation):
     """
     Trains a three-way restricted Boltzmann machine on random transitions of both tasks; it turns source into target data.
@@ -30,52 +39,29 @@ class ThreeWayRBM(LearnedTranslation):
     mean of the target's sample, whatever the source triplet (``transfer/translated_spread`` tells how near). Given pairs that
     belong together it does learn what relates them, but no task gives such pairs.
 
-    Cost: ``n_random_steps`` steps of the target with random actions, and some seconds once (MountainCar2D to 4D: 2 to 4 s).
-
     Example::
 
         model = FittedRMax("combrel/MountainCar4D-v0", transfer=ThreeWayRBM(source, n_random_steps=100))
         model.learn(total_timesteps=5_000)
 
-    :param source: source instances, or a path to them
-    :param n_random_steps: steps of the target that its sample takes
-    :param n_source_samples: source instances that the machine is trained on, at most
+    Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.learned_translation.LearnedTranslation`.
+
     :param n_hidden: hidden units
     :param n_factors: factors of the tensor of weights
     :param n_updates: batches of 64 that it is trained on
-    :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """
 
-    def __init__(
-        self,
-        source: SourceLike,
-        *,
-        n_random_steps: int = DEFAULT_SAMPLE_STEPS,
-        n_source_samples: int = 1000,
-        n_hidden: int = 30,
-        n_factors: int = 30,
-        n_updates: int = 3000,
-        breadth: float = DEFAULT_BREADTH,
-        breadth_decay: float = DEFAULT_BREADTH_DECAY,
-        transfer_terminals: bool = True,
-    ):
-        super().__init__(
-            source,
-            n_random_steps=n_random_steps,
-            n_source_samples=n_source_samples,
-            breadth=breadth,
-            breadth_decay=breadth_decay,
-            transfer_terminals=transfer_terminals,
-        )
-        check_count("n_hidden", n_hidden)
-        check_count("n_factors", n_factors)
-        check_count("n_updates", n_updates)
-        self.n_hidden = n_hidden
-        self.n_factors = n_factors
-        self.n_updates = n_updates
+    _: KW_ONLY
+    n_source_samples: int = 1000
+    n_hidden: int = 30
+    n_factors: int = 30
+    n_updates: int = 3000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("n_hidden", "n_factors", "n_updates"):
+            check_count(name, getattr(self, name))
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
         assert self.task is not None
@@ -92,3 +78,85 @@ class ThreeWayRBM(LearnedTranslation):
         )
         found = reconstruct(machine, of_source.to(instances.columns(n_source)))
         return Triplets.of_columns(of_target.back(found), n_target)
+
+
+class Machine(NamedTuple):
+    """
+    Parameters of a machine with source and target units that are real numbers and hidden units that are 0 or 1.
+
+    The weight between source unit i, hidden unit j and target unit k is the sum over factors f of
+    ``source[i, f] * hidden[j, f] * target[k, f]``.
+
+    :param source: float64, shape (n_source, n_factors); ``hidden``: shape (n_hidden, n_factors)
+    :param target: shape (n_target, n_factors)
+    :param hidden_bias: shape (n_hidden,); ``target_bias``: shape (n_target,)
+    """
+
+    source: th.Tensor
+    hidden: th.Tensor
+    target: th.Tensor
+    hidden_bias: th.Tensor
+    target_bias: th.Tensor
+
+
+def hidden_input(machine: Machine, source: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """Return the log-odds of the hidden units given all others, shape (n, n_hidden)."""
+    return ((source @ machine.source) * (target @ machine.target)) @ machine.hidden.T + machine.hidden_bias
+
+
+def target_mean(machine: Machine, source: th.Tensor, hidden: th.Tensor) -> th.Tensor:
+    """Return the mean of the target units, which are normal with variance 1, given all others, shape (n, n_target)."""
+    return machine.target_bias + ((source @ machine.source) * (hidden @ machine.hidden)) @ machine.target.T
+
+
+def free_energy(machine: Machine, source: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """Return minus the logarithm of the sum over all hidden states of exp(-E), shape (n,)."""
+    apart = ((target - machine.target_bias) ** 2).sum(dim=1) / 2.0
+    return apart - th.nn.functional.softplus(hidden_input(machine, source, target)).sum(dim=1)
+
+
+def contrastive_divergence(machine: Machine, source: th.Tensor, target: th.Tensor, generator: th.Generator) -> th.Tensor:
+    """
+    Return what has the gradient of contrastive divergence (CD-1): the mean free energy of data less that of reconstructions.
+
+    Hidden units are drawn given the data, and the target's units are reconstructed by their mean; the source's stay.
+    """
+    with th.no_grad():
+        on = th.sigmoid(hidden_input(machine, source, target))
+        drawn = (th.rand(on.shape, generator=generator, dtype=th.float64) < on).double()
+        again = target_mean(machine, source, drawn)
+    return (free_energy(machine, source, target) - free_energy(machine, source, again)).mean()
+
+
+def train(
+    source: np.ndarray, target: np.ndarray, *, n_hidden: int, n_factors: int, n_updates: int, seed: int, paired: bool = False
+) -> Machine:
+    """
+    Train a machine on samples of both tasks, in batches, by Adam.
+
+    :param source: standardised triplets, one a row; ``target``: the same
+    :param paired: whether rows of the same number belong together; otherwise rows are paired at random, anew in each batch
+    """
+    generator = th.Generator().manual_seed(seed)
+    sizes = source.shape[1], n_hidden, target.shape[1]
+    weights = [th.randn((n, n_factors), generator=generator, dtype=th.float64) * FIRST_DEVIATION for n in sizes]
+    biases = [th.zeros(n, dtype=th.float64) for n in sizes[1:]]
+    machine = Machine(*(each.requires_grad_() for each in (*weights, *biases)))
+    from_rows, to_rows = th.from_numpy(source), th.from_numpy(target)
+    optimizer = th.optim.Adam(machine, lr=STEP_SIZE)
+    for _ in range(n_updates):
+        of_source = th.randint(len(from_rows), (BATCH,), generator=generator)
+        of_target = of_source if paired else th.randint(len(to_rows), (BATCH,), generator=generator)
+        optimizer.zero_grad()
+        contrastive_divergence(machine, from_rows[of_source], to_rows[of_target], generator).backward()
+        optimizer.step()
+    return Machine(*(each.detach() for each in machine))
+
+
+def reconstruct(machine: Machine, source: np.ndarray) -> np.ndarray:
+    """Return the target units, shape (n, n_target), that mean-field iterations find for source units, (n, n_source)."""
+    units = th.from_numpy(np.ascontiguousarray(source))
+    target = machine.target_bias.expand(len(units), -1)
+    for _ in range(N_RECONSTRUCTIONS):
+        target = target_mean(machine, units, th.sigmoid(hidden_input(machine, units, target)))
+    return target.numpy().copy()
