@@ -32,8 +32,10 @@ CONSTRAINTS ?= constraints.txt
 OLDEST_PYTHON ?= python3.11
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
-PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python; do \
+ifndef PYTHON
+PYTHON := $(shell for python in python3 python3.12 python3.11 python3.13 python; do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && { echo $$python; break; }; done)
+endif
 
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
