@@ -1,6 +1,5 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
-# make test    the tests that are quick, what CI runs   make test-all   all of them    make test-fast    all but the slow ones
-# make test-oldest   unit tests with the oldest Numba and NumPy allowed, in an environment of their own
+# make test    the tests that are quick   make test-all   all of them   make test-oldest   quick ones, oldest Numba and NumPy
 # make build   wheel and source distribution in dist/   make smoke   install the wheel into an empty environment, and try it
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
 # make reproduce   the figures and tables of the COMBREL paper, with controls, in reproduction/; REPRODUCE_ARGS="fig2 --runs 2"
@@ -14,8 +13,9 @@
 # make doc     the documentation as HTML, in docs/_build; any warning is an error
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
 #
-# Each of them first installs what it needs into .venv, at the versions in constraints.txt. make PYTHON=python3.12 chooses
-# the interpreter, make VENV=path another environment. As in any pip install, PIP_EXTRA_INDEX_URL and the like are heeded.
+# Each of them first installs what it needs into .venv, at the versions in constraints.txt, with uv if there is one. Variables:
+#   PYTHON=python3.12  the interpreter          VENV=path  another environment, which make may delete    UV=  pip, not uv
+#   TORCH_INDEX=       PyTorch from PyPI        PIP_INDEX_URL, PIP_EXTRA_INDEX_URL and uv's UV_...: indexes of your own
 SHELL := /bin/bash
 
 VENV ?= .venv
@@ -32,13 +32,15 @@ CONSTRAINTS ?= constraints.txt
 OLDEST_PYTHON ?= python3.11
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
-PYTHON ?= $(shell for python in python3 python3.12 python3.11 python3.13 python; do \
+ifndef PYTHON
+PYTHON := $(shell for python in python3 python3.12 python3.11 python3.13 python; do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && { echo $$python; break; }; done)
+endif
 
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-fast test-oldest pytest bench lint type format check-codestyle commit-checks build smoke gl clean
+.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -99,17 +101,10 @@ test-all: $(VENV)/.installed-all gl
 	$(BIN)/python -m sb3_combrel.experiments.warm_up
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist worksteal --durations 25
 
-pytest: test
-
-FAST := -n $(PYTEST_WORKERS) --dist worksteal -m "not slow and not integration"
-
-test-fast: $(VENV)/.installed-all
-	$(BIN)/python -m pytest $(FAST)
-
 # In an environment, and with a cache of compiled code, of its own.
 test-oldest: $(VENV)-oldest.txt
-	NUMBA_CACHE_DIR=$(abspath $(VENV)-oldest/numba-cache) \
-		$(MAKE) test-fast VENV=$(VENV)-oldest CONSTRAINTS=$(VENV)-oldest.txt PYTHON=$(OLDEST_PYTHON)
+	NUMBA_CACHE_DIR="$(abspath $(VENV)-oldest/numba-cache)" \
+		$(MAKE) test VENV=$(VENV)-oldest CONSTRAINTS=$(VENV)-oldest.txt PYTHON=$(OLDEST_PYTHON)
 
 $(VENV)-oldest.txt: constraints.txt tests/constraints-oldest.txt
 	{ grep -vE '^(llvmlite|numba|numpy)==' constraints.txt; cat tests/constraints-oldest.txt; } > $@
@@ -142,9 +137,9 @@ build: $(VENV)/.installed-all
 
 # Away from the clone, so that only what the wheel has installed can be imported.
 smoke: build
-	$(PYTHON) -m venv --clear $(VENV)-smoke
-	$(VENV)-smoke/bin/python -m pip --disable-pip-version-check install -q -c $(CONSTRAINTS) "$$(echo dist/*.whl)[all]"
-	cd "$$(mktemp -d)" && $(abspath $(VENV)-smoke)/bin/python $(abspath tests/helpers/smoke.py)
+	$(call new_venv,$(VENV)-smoke)
+	$(call pip,$(VENV)-smoke) "$$(echo dist/*.whl)[all]"
+	root="$$PWD" && cd "$$(mktemp -d)" && "$(abspath $(VENV)-smoke/bin/python)" "$$root/tests/helpers/smoke.py"
 
 # The source folder is that of the repository: see docs/conf.py.
 doc: $(VENV)/.installed-all
@@ -154,33 +149,51 @@ doc: $(VENV)/.installed-all
 clean:
 	rm -rf $(VENV) $(VENV)-oldest* $(VENV)-smoke build dist docs/_build *.egg-info
 
-# An installation that was interrupted leaves no stamp and is done again; a changed pin or dependency renews it.
 $(VENV)/.installed-demo: pyproject.toml sb3_combrel/version.txt $(CONSTRAINTS)
-	$(call make_venv)
 	$(call install,experiments)
-	@touch $@
 
 $(VENV)/.installed-all: pyproject.toml sb3_combrel/version.txt $(CONSTRAINTS)
-	$(call make_venv)
 	$(call install,all$(comma)dev)
-	@touch $(VENV)/.installed-demo $@
+	@touch $(VENV)/.installed-demo
 
 comma := ,
-PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-define make_venv
+# uv does not read pip's settings: who has some gets pip.
+OWN_INDEX := $(PIP_INDEX_URL)$(PIP_EXTRA_INDEX_URL)$(PIP_NO_INDEX)
+UV ?= $(if $(OWN_INDEX)$(PIP_FIND_LINKS)$(PIP_CONFIG_FILE),,$(if $(shell command -v uv),uv))
+pip = $(if $(UV),$(UV) pip install --python $(1)/bin/python --index-strategy unsafe-best-match,$\
+	$(1)/bin/python -m pip --disable-pip-version-check install) -c $(CONSTRAINTS) $(torch_index)
+new_venv = rm -rf $(1) && $(if $(UV),$(UV) venv --quiet --seed --python "$$(command -v $(PYTHON))" $(1),$(PYTHON) -m venv $(1))
+
+# PyTorch for CPUs spares several GB of CUDA, which the default wheel for Linux brings: from its own index, if that answers.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+WITHOUT_CUDA := $(if $(OWN_INDEX)$(UV_INDEX)$(UV_INDEX_URL)$(UV_EXTRA_INDEX_URL)$(UV_DEFAULT_INDEX),,$\
+	$(if $(filter Linux,$(shell uname)),$(TORCH_INDEX)))
+answers = timeout 4 $(PYTHON) -c 'import urllib.request as r; r.urlopen("$(WITHOUT_CUDA)/torch/", timeout=3)' 2>/dev/null
+torch_index = $(if $(and $(PYTHON),$(WITHOUT_CUDA)),$(shell $(answers) && echo --extra-index-url $(WITHOUT_CUDA) || \
+	echo "$(WITHOUT_CUDA) does not answer: going on without it" >&2))
+
+# A first installation that was interrupted starts anew. The package is built with the setuptools of the environment, and
+# dm_control goes in without labmaze where this has no wheel: only dm_control's locomotion tasks use it.
+define install
 @$(if $(PYTHON),,echo "Python 3.11, 3.12 or 3.13 is needed, and none was found. Install one, or name it: make PYTHON=/path/to/python" >&2; exit 1)
 @$(PYTHON) -c '$(SUPPORTED)' || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1); Python 3.11, 3.12 or 3.13 is needed: make PYTHON=/path/to/python" >&2; exit 1; }
-@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+@[ ! -e $(VENV)/.unfinished ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || { $(call new_venv,$(VENV)) && touch $(VENV)/.unfinished; }
+@install="$(call pip,$(VENV))" && $$install setuptools && $$install --no-build-isolation -e ".[$(1)]" && \
+	{ $(BIN)/python -c 'import importlib.util as u; exit(u.find_spec("dm_control") is None)' || \
+		$$install --no-deps dm_control; } || { echo "$$INSTALLATION_FAILED" >&2; exit 1; }
+@rm -f $(VENV)/.unfinished && touch $@
 endef
 
-# labmaze, which dm_control's locomotion tasks alone use, has no wheel for Python 3.13: there dm_control goes in without it.
-define install
-$(PIP) install -c $(CONSTRAINTS) -e ".[$(1)]"
-@$(BIN)/python -c 'import importlib.util as u; exit(u.find_spec("dm_control") is None)' || $(PIP) install -c $(CONSTRAINTS) --no-deps dm_control
+define INSTALLATION_FAILED
+
+The installation failed, see above. It needs Python 3.11 to 3.13 and a package index that answers: pypi.org, or one of your own
+by PIP_INDEX_URL=https://... (make UV= takes pip, with its settings, where there is uv). When this is mended, call make again.
 endef
+export INSTALLATION_FAILED
 
 # Tests that draw need OpenGL; where it cannot be installed here they say what is missing.
 gl:
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && ! ldconfig -p | grep -q libEGL_mesa; then \
-		apt-get update -qq && apt-get install -y -qq libegl1 libgl1-mesa-dri; fi
+		export DEBIAN_FRONTEND=noninteractive; apt-get update -qq && apt-get install -y -qq libegl1 libgl1-mesa-dri || \
+		echo "OpenGL could not be installed: tests that draw will fail, all others run" >&2; fi

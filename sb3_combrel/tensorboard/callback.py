@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from importlib.util import find_spec
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,26 +16,21 @@ from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.tensorboard import readings
-from sb3_combrel.tensorboard.explain import planes_of
 from sb3_combrel.tensorboard.history import ChoiceHistory
-from sb3_combrel.tensorboard.hyperparameters import METRICS, USUALLY_DIFFER, all_settings, hyperparameters
-from sb3_combrel.tensorboard.layout import LAYOUT
 from sb3_combrel.tensorboard.mapping_table import mapping_table
-from sb3_combrel.tensorboard.plane import Plane, VariablePair
+from sb3_combrel.tensorboard.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 if TYPE_CHECKING:
     # TensorBoard's writer and matplotlib take a second to import: only where there is a log.
     from torch.utils.tensorboard import SummaryWriter
 
-# A set takes half a second: a few per cent of the time where a step takes a third of a millisecond.
 DEFAULT_PICTURE_FREQ = 50_000
-# Of a dashboard that the user did not ask for. Matplotlib is loaded with the first set, which took up to two seconds.
+# Of the time, for a dashboard that the user did not ask for. Matplotlib is loaded with the first set.
 DEFAULT_PICTURE_SHARE = 0.05
 FIRST_PICTURES_SECONDS = 1.5
-# Half for the algorithm's logs, half for points between them.
 DEFAULT_SCALAR_SHARE = 0.03
-# Between logs, in a run that is not stopped early; fewer where they would take more than their share of the time.
+# Points between logs, in a run that is not stopped early.
 MAX_POINTS = 500
 
 
@@ -44,17 +38,16 @@ class DashboardCallback(BaseCallback):
     """
     Shows in TensorBoard what Fitted R-Max has learned and what was transferred.
 
-    ``FittedRMax.learn`` adds one where there is a TensorBoard log (``tensorboard_log``, or a logger of the
-    user's with that format) and none was given. Its pictures come at the end, which takes half a second, and before where
-    they take less than a twentieth of the time. Pass one to choose what is shown. Without such a log it does nothing; what is
-    learned is the same in any case.
+    ``FittedRMax.learn`` adds one where there is a TensorBoard log (``tensorboard_log``, or a logger of the user's with that
+    format) and none was given; its pictures come at the end, and before where they take less than a twentieth of the time.
+    Pass one to choose what is shown. Without such a log it does nothing; what is learned is the same in any case.
 
     - Scalars: ``rollout/`` and ``time/`` with every log of the algorithm (``log_interval``); ``model/``, ``planner/`` and
       ``transfer/`` with these and between them, up to 500 times in a run; and a page of custom scalars on which runs with
       and without transfer can be compared. With ``log_interval=None`` there are none.
     - Pictures: V and the greedy policy over two state variables; the source action that each target action is
       mapped to (Figure 4 of the COMBREL paper); which state mappings were chosen when. They need matplotlib.
-    - Text: the mappings used most (Table 2 of that paper). HPARAMS: the settings, those first in which runs usually differ.
+    - Text: the mappings used most (Table 2 of that paper). HPARAMS: the settings.
 
     :param picture_freq: environment steps between two sets of pictures and tables; the last set comes at the end of
         ``learn``. None: no pictures, and a table at the end only.
@@ -71,6 +64,8 @@ class DashboardCallback(BaseCallback):
         do not fit the task
     :raises ModuleNotFoundError: when learning starts, if pictures are wanted and matplotlib is not installed
     """
+
+    model: FittedRMax  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -92,8 +87,6 @@ class DashboardCallback(BaseCallback):
         self.picture_share = picture_share
         self._writer: SummaryWriter | None = None
 
-    model: FittedRMax  # type: ignore[assignment]
-
     @property
     def agent(self) -> FittedRMaxAgent:
         """The agent of the algorithm."""
@@ -103,82 +96,78 @@ class DashboardCallback(BaseCallback):
         self._writer = tensorboard_writer(self.logger)
         if self._writer is None:
             return
-        self._check_pictures()
-        self._planes = self._make_planes()
-        self._transfer = _with_mappings(self.agent)
-        self._history = _new_history(self._transfer)
-        self._shown_at = self._drawn_at = self.model.num_timesteps
+        if self.picture_freq is not None:
+            check_matplotlib("pass picture_freq=None")
+        self._planes = planes_of(self.agent, self.variables, self.at)
+        transfer = self.agent.transfer
+        self._transfer = transfer if isinstance(transfer, MappingTransfer) else None
+        self._history = ChoiceHistory() if self._transfer is not None and self._transfer.makes_choices else None
+        self._shown_at = self._drawn_at = self._scalars_at = self.model.num_timesteps
         self._next_pictures = self._following_pictures()
-        self.agent.timed = True
-        self._mark_time()
-        self._started = time.perf_counter()
-        self._log_began: float | None = None
-        self._spent = self._last_log = 0.0
-        # Of the points between logs. Nobody wants scalars who wants no logs.
-        self._spent_between = self._last_between = 0.0
         n_steps = self.model._total_timesteps - self.model.num_timesteps
+        # Nobody wants scalars between logs who wants no logs.
         self._scalar_freq = max(1, n_steps // MAX_POINTS) if self.locals.get("log_interval") is not None else None
-        self._scalars_at = self.model.num_timesteps
-        self._spent_on_pictures, self._last_pictures = 0.0, FIRST_PICTURES_SECONDS
-        self._write_settings()
+        half = 1.0 if self.scalar_share == 1.0 else 0.5 * self.scalar_share
+        self._of_logs, self._between_logs = _Allowance(half), _Allowance(half)
+        self._of_pictures = _Allowance(self.picture_share, FIRST_PICTURES_SECONDS)
+        self._log_began: float | None = None
+        self.agent.timed = True
+        self._marked = time.perf_counter(), self.agent.planning_seconds
+        self._write_settings(self._writer)
 
-    def _check_pictures(self) -> None:
-        if self.picture_freq is not None and find_spec("matplotlib") is None:
-            raise ModuleNotFoundError(
-                "DashboardCallback needs matplotlib for pictures: install it, or pass picture_freq=None", name="matplotlib"
-            )
+    def _write_settings(self, writer: SummaryWriter) -> None:
+        from sb3_combrel.tensorboard.summaries import LAYOUT, hyperparameters, settings_summaries
 
-    def _make_planes(self) -> list[Plane]:
-        return planes_of(self.model, self.variables, self.at)
-
-    def _write_settings(self) -> None:
-        from sb3_combrel.tensorboard.summaries import settings_summaries
-
-        assert self._writer is not None
-        self._writer.add_custom_scalars(LAYOUT)
-        for summary in settings_summaries(hyperparameters(self.model), all_settings(self.model), USUALLY_DIFFER, METRICS):
-            self._writer._get_file_writer().add_summary(summary)
+        writer.add_custom_scalars(LAYOUT)
+        for summary in settings_summaries(hyperparameters(self.model)):
+            writer._get_file_writer().add_summary(summary)
 
     def _on_rollout_end(self) -> None:
         """Add scalars to the log that the algorithm writes after this."""
         if self._writer is None:
             return
-        self._log_began = time.perf_counter()
-        self.model.logs_statistics = self._can_afford(self._spent + self._last_log)
+        self.model.logs_statistics = self._of_logs.suffices()
+        # The time of a log without these scalars depends on the user's log_interval, and does not count.
+        self._log_began = time.perf_counter() if self.model.logs_statistics else None
         if self.model.logs_statistics:
             self._scalars_at = self.num_timesteps
             for name, value in self._readings().items():
                 self.logger.record(name, value)
 
     def _on_rollout_start(self) -> None:
-        """Note the time that the log has taken."""
         if self._writer is not None and self._log_began is not None:
-            # The time of a log without these scalars depends on the user's log_interval, and does not count.
-            if self.model.logs_statistics:
-                self._last_log = time.perf_counter() - self._log_began
-                self._spent += self._last_log
+            self._of_logs.spend_since(self._log_began)
 
-    def _can_afford(self, seconds: float) -> bool:
-        """Return whether scalars of so many seconds, since the start, are within half of their share of the time."""
-        return self.scalar_share == 1.0 or seconds <= 0.5 * self.scalar_share * (time.perf_counter() - self._started)
-
-    def _scalars_are_due(self) -> bool:
-        if self._scalar_freq is None or self.num_timesteps < self._scalars_at + self._scalar_freq:
-            return False
+    def _on_step(self) -> bool:
+        if self._writer is None:
+            return True
+        due = self._scalar_freq is not None and self.num_timesteps >= self._scalars_at + self._scalar_freq
         # Where an episode ends there may be a log, which has them too.
-        return not np.any(self.locals["dones"]) and self._can_afford(self._spent_between + self._last_between)
+        if due and not np.any(self.locals["dones"]) and self._between_logs.suffices():
+            self._write_scalars(self._writer)
+        if self.num_timesteps >= self._next_pictures:
+            self._show(self._writer, at_end=False)
+        return True
 
-    def _write_scalars(self) -> None:
-        """Write what a log would have, between logs, in one piece: twenty single scalars would take several times as long."""
+    def _on_training_end(self) -> None:
+        if self._writer is None:
+            return
+        self.agent.timed, self.model.logs_statistics = False, True
+        if self._scalar_freq is not None and self.model.num_timesteps > self._scalars_at:
+            self._write_scalars(self._writer)
+        self._show(self._writer, at_end=True)
+        self._writer.flush()
+        self._writer = None
+
+    def _write_scalars(self, writer: SummaryWriter) -> None:
+        """Write what a log would have, between logs, in one piece: single scalars would take several times as long."""
         from sb3_combrel.tensorboard.summaries import scalars_summary
 
-        assert self._writer is not None
         began = time.perf_counter()
         scalars = {**self.agent.statistics(), **self._readings(), "planner/backups": self.agent.n_backups}
-        self._writer._get_file_writer().add_summary(scalars_summary(scalars), self.num_timesteps)
+        writer._get_file_writer().add_summary(scalars_summary(scalars), self.num_timesteps)
         self._scalars_at = self.num_timesteps
-        self._last_between = time.perf_counter() - began
-        self._spent_between += self._last_between
+        self._between_logs.spend_since(began)
 
     def _readings(self) -> dict[str, float]:
         found = {
@@ -195,24 +184,11 @@ class DashboardCallback(BaseCallback):
                 found["transfer/compliance"] = compliance
         return found
 
-    def _mark_time(self) -> None:
-        self._marked = time.perf_counter(), self.agent.planning_seconds
-
     def _planning_share(self) -> float:
-        """Compute the fraction of the time since the last log that planning took, transferred instances included."""
+        """Compute the fraction of the time since the last call that planning took, transferred instances included."""
         since, planning_before = self._marked
-        self._mark_time()
-        now, planning = self._marked
+        self._marked = now, planning = time.perf_counter(), self.agent.planning_seconds
         return (planning - planning_before) / max(now - since, 1e-9)
-
-    def _on_step(self) -> bool:
-        if self._writer is None:
-            return True
-        if self._scalars_are_due():
-            self._write_scalars()
-        if self.num_timesteps >= self._next_pictures:
-            self._show(at_end=False)
-        return True
 
     def _following_pictures(self) -> float:
         """Return the next multiple of ``picture_freq``."""
@@ -220,65 +196,54 @@ class DashboardCallback(BaseCallback):
             return float("inf")
         return (self.model.num_timesteps // self.picture_freq + 1) * self.picture_freq
 
-    def _on_training_end(self) -> None:
-        if self._writer is None:
-            return
-        self.agent.timed, self.model.logs_statistics = False, True
-        if self._scalar_freq is not None and self.model.num_timesteps > self._scalars_at:
-            self._write_scalars()
-        self._show(at_end=True)
-        self._writer.flush()
-        self._writer = None
-
-    def _show(self, at_end: bool) -> None:
+    def _show(self, writer: SummaryWriter, at_end: bool) -> None:
         """Write table and pictures, unless there are some of this step."""
         now = self.model.num_timesteps
         self._next_pictures = self._following_pictures()
         if now > self._shown_at and self._transfer is not None:
-            self._write_table(self._transfer, now)
+            writer.add_text("transfer/most_chosen_mappings", mapping_table(self._transfer, self.agent.task.action_names), now)
         self._shown_at = now
-        if self.picture_freq is not None and now > self._drawn_at and (at_end or self._can_afford_pictures()):
+        if self.picture_freq is not None and now > self._drawn_at and (at_end or self._of_pictures.suffices()):
             began = time.perf_counter()
-            self._write_pictures(now)
+            for tag, picture in self._draw(now).items():
+                writer.add_image(tag, picture, now, dataformats="HWC")
             self._drawn_at = now
-            self._last_pictures = time.perf_counter() - began
-            self._spent_on_pictures += self._last_pictures
+            self._of_pictures.spend_since(began)
 
-    def _can_afford_pictures(self) -> bool:
-        affordable = self.picture_share * (time.perf_counter() - self._started)
-        return self.picture_share == 1.0 or self._spent_on_pictures + self._last_pictures <= affordable
-
-    def _write_table(self, transfer: MappingTransfer, step: int) -> None:
-        assert self._writer is not None
-        table = mapping_table(transfer, self.agent.task.action_names)
-        self._writer.add_text("transfer/most_chosen_mappings", table, step)
-
-    def _write_pictures(self, step: int) -> None:
+    def _draw(self, step: int) -> dict[str, np.ndarray]:
         from sb3_combrel.tensorboard import pictures
 
-        for plane in self._planes:
-            over = "_".join(name for name in plane.names if name)
-            self._write_picture(f"value_and_policy/{over}", pictures.value_and_policy(self.agent, plane), step)
-            if self._history is not None:
-                assert self._transfer is not None
-                picture = pictures.source_actions(self.agent, self._transfer, plane)
-                self._write_picture(f"source_action/{over}", picture, step)
-        if self._history is not None:
-            assert self._transfer is not None
+        drawn = pictures.over_planes(self.agent, self._planes)
+        if self._history is not None and self._transfer is not None:
             self._history.note(step, self._transfer.choices())
-            self._write_picture("state_mappings/chosen", pictures.state_mappings(self._history, self._transfer), step)
+            drawn["state_mappings/chosen"] = pictures.state_mappings(self._history, self._transfer)
+        return drawn
 
-    def _write_picture(self, tag: str, picture: np.ndarray, step: int) -> None:
-        assert self._writer is not None
-        self._writer.add_image(tag, picture, step, dataformats="HWC")
+
+class _Allowance:
+    """
+    A share of the time, and what of it is spent.
+
+    :param share: of the time since it was made; 1 for all that is asked for
+    :param next_seconds: what is expected of the next piece of work: what the last one took
+    """
+
+    def __init__(self, share: float, next_seconds: float = 0.0) -> None:
+        self.share, self.next_seconds, self.spent = share, next_seconds, 0.0
+        self.made_at = time.perf_counter()
+
+    def suffices(self) -> bool:
+        """Return whether there is time for the next piece of work."""
+        return self.share == 1.0 or self.spent + self.next_seconds <= self.share * (time.perf_counter() - self.made_at)
+
+    def spend_since(self, began: float) -> None:
+        self.next_seconds = time.perf_counter() - began
+        self.spent += self.next_seconds
 
 
 def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
     """Return the writer of a logger's TensorBoard format; None if it has no such format."""
-    for output in logger.output_formats:
-        if isinstance(output, TensorBoardOutputFormat):
-            return output.writer
-    return None
+    return next((each.writer for each in logger.output_formats if isinstance(each, TensorBoardOutputFormat)), None)
 
 
 def with_dashboard(callback: MaybeCallback, logger: Logger) -> MaybeCallback:
@@ -291,16 +256,13 @@ def with_dashboard(callback: MaybeCallback, logger: Logger) -> MaybeCallback:
     """
     if tensorboard_writer(logger) is None or _has_dashboard(callback):
         return callback
-    picture_freq = DEFAULT_PICTURE_FREQ if find_spec("matplotlib") is not None else None
+    picture_freq = DEFAULT_PICTURE_FREQ if has_matplotlib() else None
     dashboard = DashboardCallback(picture_freq, picture_share=DEFAULT_PICTURE_SHARE)
-    if callback is None:
-        return dashboard
-    given: list[Any] = callback if isinstance(callback, list) else [callback]
-    return CallbackList([*(_as_callback(one) for one in given), dashboard])
-
-
-def _as_callback(callback: BaseCallback | Callable[..., Any]) -> BaseCallback:
-    return callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)
+    if isinstance(callback, list):
+        return [*callback, dashboard]
+    if callback is None or isinstance(callback, BaseCallback):
+        return [dashboard] if callback is None else [callback, dashboard]
+    return [ConvertCallback(callback), dashboard]
 
 
 def _has_dashboard(callback: Any) -> bool:
@@ -311,13 +273,3 @@ def _has_dashboard(callback: Any) -> bool:
     if isinstance(callback, EventCallback) and callback.callback is not None:
         return _has_dashboard(callback.callback)
     return isinstance(callback, DashboardCallback)
-
-
-def _with_mappings(agent: FittedRMaxAgent) -> MappingTransfer | None:
-    """Return the transfer method, if it is one of those whose mappings can be shown."""
-    return agent.transfer if isinstance(agent.transfer, MappingTransfer) else None
-
-
-def _new_history(transfer: MappingTransfer | None) -> ChoiceHistory | None:
-    """Make a history of the choices; None for a method that does not choose one mapping."""
-    return ChoiceHistory() if transfer is not None and transfer.makes_choices else None

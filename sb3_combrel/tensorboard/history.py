@@ -11,9 +11,8 @@ class ChoiceHistory:
     """
     How many pairs of the sample chose each candidate, at times spread over the run so far.
 
-    When there are too many times, every second one is dropped, and from then on half as many are added.
-
     ``steps`` are the times, in environment steps; ``counts`` has for each of them the number of pairs of each candidate.
+    When there are too many times, every second one is dropped, and from then on half as many are added.
     """
 
     def __init__(self) -> None:

@@ -1,14 +1,16 @@
-"""A plane through the grid of states: two variables vary, the others are constant."""
+"""A plane through the grid of states, for pictures: two variables vary, the others are constant."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.planning.grid import StateGrid
 
 VariablePair = tuple[int | str, int | str]
@@ -28,6 +30,33 @@ class Plane(NamedTuple):
     names: tuple[str, str]
     extent: tuple[float, float, float, float]
     held: str
+
+
+def has_matplotlib() -> bool:
+    """Return whether pictures can be drawn."""
+    return find_spec("matplotlib") is not None
+
+
+def check_matplotlib(otherwise: str) -> None:
+    """Raise a ModuleNotFoundError that says what to do ``otherwise``, unless pictures can be drawn."""
+    if not has_matplotlib():
+        raise ModuleNotFoundError(f"pictures need matplotlib: install it, or {otherwise}", name="matplotlib")
+
+
+def planes_of(agent: FittedRMaxAgent, variables: Sequence[VariablePair] | None, at: ArrayLike | None) -> list[Plane]:
+    """
+    Find the planes over which pictures are drawn.
+
+    :param agent: the agent to show
+    :param variables: pairs of state variables, by number or name; None for the first two
+    :param at: a state of the planes, raw units, shape (n_variables,); None for the middle of the state space
+    :raises ValueError: if they do not fit the task
+    """
+    task = agent.task
+    if at is not None and np.shape(at) != (task.n_variables,):
+        raise ValueError(f"at must be {task.n_variables} numbers, one a state variable, got {at!r}")
+    names = task.state_names
+    return [plane_through(agent.grid, task.scaling, names, pair, at) for pair in numbered(variables, names)]
 
 
 def plane_through(
@@ -75,32 +104,17 @@ def _edges(grid: StateGrid, scaling: StateScaling, variable: int) -> tuple[float
 
 
 def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> list[tuple[int, int]]:
-    """
-    Turn pairs of state variables into pairs of numbers.
-
-    :param variables: pairs of names or numbers; None for the first two variables
-    :param names: of all state variables
-    :return: one pair for each of ``variables``
-    :raises ValueError: if an entry is not a pair of two different variables
-    """
+    """Turn pairs of variables, by name or number, into pairs of numbers; None is the first two."""
     if variables is None:
         return [(0, min(1, len(names) - 1))]
+    number: dict[Any, int] = {**{name: k for k, name in enumerate(names)}, **{k: k for k in range(len(names))}}
     pairs = []
     for pair in variables:
-        if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:
+        found = () if isinstance(pair, str) else tuple(number.get(each, -1) for each in pair)
+        if len(found) != 2 or -1 in found or (found[0] == found[1] and len(names) > 1):
             raise ValueError(
-                f'variables must be pairs of state variables, such as [("{names[0]}", "{names[-1]}")], got {pair!r}'
+                f"variables must be pairs of two different state variables, by numbers below {len(names)} or names out of "
+                f"{', '.join(names)}, such as [({names[0]!r}, {names[-1]!r})], got {pair!r}"
             )
-        across, up = (_number(variable, names) for variable in pair)
-        if across == up and len(names) > 1:
-            raise ValueError(f"variables must be pairs of two different state variables, got {pair!r}")
-        pairs.append((across, up))
+        pairs.append((found[0], found[1]))
     return pairs
-
-
-def _number(variable: int | str, names: Sequence[str]) -> int:
-    if isinstance(variable, str) and variable in names:
-        return list(names).index(variable)
-    if isinstance(variable, int) and 0 <= variable < len(names):
-        return variable
-    raise ValueError(f"variables must be numbers below {len(names)} or names out of {', '.join(names)}, got {variable!r}")

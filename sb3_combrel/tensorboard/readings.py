@@ -17,25 +17,23 @@ MAX_PAIRS = 2000
 
 def spread(n: int, max_count: int = MAX_POINTS) -> np.ndarray:
     """
-    Choose at most ``max_count`` of the numbers below ``n``, evenly spread.
+    Choose at most ``max_count`` of the numbers below ``n``, evenly spread, int64.
 
     The distance is not a whole number in general, so points of a regular grid do not all lie on one of its axes.
-
-    :param n: how many numbers there are
-    :param max_count: how many to take
-    :return: int64
     """
     return np.arange(n) if n <= max_count else (np.arange(max_count) * (n / max_count)).astype(np.int64)
 
 
-def pair_values(agent: FittedRMaxAgent, pairs: np.ndarray) -> np.ndarray:
+def action_values(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
     """
-    Compute Q of state-action pairs of the grid, from their rows and the planner's values.
+    Compute Q of every action at grid points, from the rows of the model and the planner's values.
 
-    :param pairs: int64, any shape; pair ``action * n_points + point``
-    :return: float64, same shape; NaN for an optimistic pair
+    :param points: int64, any shape
+    :return: float64, one axis more, the actions in front; NaN for an optimistic pair
     """
-    arrays, flat = agent.mdp.arrays, pairs.reshape(-1)
+    arrays = agent.mdp.arrays
+    pairs = np.add.outer(np.arange(agent.task.n_actions) * agent.grid.n_points, points)
+    flat = pairs.reshape(-1)
     length = arrays.rows.length[flat].astype(np.int64)
     row = np.repeat(np.arange(len(flat)), length)
     # The entries of all rows one after the other: each row's start, and the place within the row.
@@ -46,27 +44,13 @@ def pair_values(agent: FittedRMaxAgent, pairs: np.ndarray) -> np.ndarray:
     return np.where(arrays.modelled[flat], q, np.nan).reshape(pairs.shape)
 
 
-def action_values(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
-    """
-    Compute Q of every action at grid points; NaN for an optimistic one.
-
-    :param points: int64, any shape
-    :return: float64, one axis more, the actions in front
-    """
-    offsets = np.arange(agent.task.n_actions) * agent.grid.n_points
-    return pair_values(agent, np.add.outer(offsets, points))
-
-
-def bellman_residual(agent: FittedRMaxAgent, max_points: int = MAX_POINTS) -> float:
+def bellman_residual(agent: FittedRMaxAgent) -> float:
     """
     Compute by how much a backup would change V at a grid point: the largest change among points spread over the grid.
 
     Points with an optimistic action have their final value and are left out; 0 if there are no others.
-
-    :param agent: the agent
-    :param max_points: how many grid points to use at most
     """
-    points = spread(agent.grid.n_points, max_points)
+    points = spread(agent.grid.n_points)
     points = points[agent.mdp.arrays.n_optimistic[points] == 0]
     if len(points) == 0:
         return 0.0
@@ -74,12 +58,10 @@ def bellman_residual(agent: FittedRMaxAgent, max_points: int = MAX_POINTS) -> fl
     return float(np.abs(backed_up - agent.planner.values[points]).max())
 
 
-def mean_compliance(transfer: Transfer, max_pairs: int = MAX_PAIRS) -> float | None:
+def mean_compliance(transfer: Transfer) -> float | None:
     """
     Compute the mean compliance of the chosen mappings (Eq. 6 of the COMBREL paper) over pairs spread over the sample.
 
-    :param transfer: a transfer method
-    :param max_pairs: how many pairs to use at most
     :return: None if the method computes no compliance, or has not chosen anything yet
     """
     if not isinstance(transfer, COMBREL):
@@ -87,4 +69,4 @@ def mean_compliance(transfer: Transfer, max_pairs: int = MAX_PAIRS) -> float | N
     pairs = np.flatnonzero(transfer.choices() >= 0)
     if len(pairs) == 0:
         return None
-    return float(transfer.chosen_compliance(pairs[spread(len(pairs), max_pairs)]).mean())
+    return float(transfer.chosen_compliance(pairs[spread(len(pairs), MAX_PAIRS)]).mean())

@@ -1,55 +1,105 @@
-"""Records of TensorBoard's event files: several scalars in one, and the settings of a run. This imports TensorBoard."""
+"""What goes into TensorBoard's event files: scalars, the page of custom scalars, settings. This imports TensorBoard."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import inspect
+from collections.abc import Mapping
 from typing import Any
 
-from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
-from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
+from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.summary import hparams
+
+from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+
+Plain = bool | int | float | str
+
+#: What is no setting of the learning, or is shown under another name.
+LEFT_OUT = ("policy", "env", "transfer", "stats_window_size", "tensorboard_log", "verbose", "device")
+MAX_TEXT_LENGTH = 80
+
+
+def _chart(tag: str) -> list[object]:
+    return ["Multiline", [f"^{tag}$"]]
+
+
+#: The Custom Scalars tab. A chart has one curve for each run, so that runs of different methods can be compared.
+LAYOUT: dict[str, dict[str, list[object]]] = {
+    "Learning": {
+        "return of an episode": _chart("rollout/ep_rew_mean"),
+        "steps of an episode": _chart("rollout/ep_len_mean"),
+        "pairs known from own data (share)": _chart("model/known"),
+        "pairs modelled by transfer (share)": _chart("model/transferred"),
+        "pairs still optimistic (share)": _chart("model/optimistic"),
+        "steps per second": _chart("time/fps"),
+    },
+    "Transfer": {
+        "mean compliance of the chosen mappings": _chart("transfer/compliance"),
+        "entropy of the choice (nats)": _chart("transfer/choice_entropy"),
+        "mappings in use": _chart("transfer/distinct_mappings"),
+        "switches of the choice": _chart("transfer/switches"),
+        "transferred instances used": _chart("transfer/instances_used"),
+    },
+    "Planner": {
+        "Bellman residual": _chart("planner/residual"),
+        "backups": _chart("planner/backups"),
+        "share of the time": _chart("planner/time_share"),
+    },
+}
 
 
 def scalars_summary(scalars: Mapping[str, float]) -> Summary:
-    """
-    Make one record of several scalars.
-
-    :param scalars: values by tag
-    """
+    """Make one record of several scalars, given by tag."""
     return Summary(value=[Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()])
 
 
-def settings_summaries(
-    settings: Mapping[str, Any], columns: Mapping[str, Any], shown: Collection[str], metrics: Collection[str]
-) -> list[Summary]:
+def settings_summaries(settings: Mapping[str, Any]) -> list[Summary]:
     """
-    Make the records of the HPARAMS tab.
+    Make the records of the HPARAMS tab: settings of this run, plain values by name.
 
-    :param settings: of this run, plain values by name
-    :param columns: of all runs; a value, or None, to tell the type of each
-    :param shown: names of the settings that the tab shows until the user chooses, five at most
-    :param metrics: tags of the scalars that it shows
+    Not the record of the columns: without it TensorBoard finds them, and those in which runs differ, in all runs.
     """
-    _, start, end = hparams(dict(settings), metric_dict=dict.fromkeys(metrics, 0.0))
-    experiment = api_pb2.Experiment(
-        hparam_infos=[_column(name, value, name in shown) for name, value in columns.items()],
-        metric_infos=[api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag)) for tag in metrics],
-    )
-    content = plugin_data_pb2.HParamsPluginData(experiment=experiment, version=metadata.PLUGIN_DATA_VERSION)
-    plugin_data = SummaryMetadata.PluginData(plugin_name=metadata.PLUGIN_NAME, content=content.SerializeToString())
-    of_experiment = Summary.Value(tag=metadata.EXPERIMENT_TAG, metadata=SummaryMetadata(plugin_data=plugin_data))
-    return [Summary(value=[of_experiment]), start, end]
+    _, *start_and_end = hparams(dict(settings), metric_dict={})
+    return start_and_end
 
 
-def _column(name: str, value: Any, first: bool) -> api_pb2.HParamInfo:
-    column = api_pb2.HParamInfo(name=name, type=_type(value))
-    # The tab sorts by this, which says that runs differ in it; TensorBoard before 2.14 does not know it.
-    if "differs" in column.DESCRIPTOR.fields_by_name:
-        column.differs = first
-    return column
+def hyperparameters(model: FittedRMax) -> dict[str, Plain]:
+    """
+    Collect the settings of the algorithm and, as ``transfer.NAME``, of its transfer method, with the defaults in use.
+
+    :param model: the algorithm, set up
+    :return: values by name
+    """
+    transfer = model.agent.transfer
+    method = "none" if transfer is None else type(transfer).__name__
+    algorithm = type(model).__name__ if transfer is None else f"{type(model).__name__} + {method}"
+    env_id = _env_id(model)
+    return {
+        "algorithm": algorithm,
+        **_given(model),
+        "model_breadth": model.agent.model_settings.model_breadth,
+        "resolution": _plain(model.agent.grid.resolution),
+        "n_envs": model.n_envs,
+        **({} if env_id is None else {"env": env_id}),
+        "transfer": method,
+        **({} if transfer is None else {f"transfer.{name}": value for name, value in _given(transfer).items()}),
+    }
 
 
-def _type(value: Any) -> int:
-    if isinstance(value, bool):
-        return api_pb2.DATA_TYPE_BOOL
-    return api_pb2.DATA_TYPE_FLOAT64 if isinstance(value, int | float) else api_pb2.DATA_TYPE_STRING
+def _given(thing: object) -> dict[str, Plain]:
+    """Return the attributes that have the names of constructor arguments, but for those that are None."""
+    names = [name for name in inspect.signature(type(thing)).parameters if name not in LEFT_OUT and name[0] != "_"]
+    return {name: _plain(getattr(thing, name)) for name in names if getattr(thing, name, None) is not None}
+
+
+def _plain(value: Any) -> Plain:
+    if isinstance(value, bool | int | float | str):
+        return value
+    text = " ".join(str(value).split())
+    return text if len(text) <= MAX_TEXT_LENGTH else text[: MAX_TEXT_LENGTH - 3] + "..."
+
+
+def _env_id(model: FittedRMax) -> str | None:
+    # Environments in other processes are not asked: a specification that cannot be pickled would end the worker.
+    envs = getattr(model.env.unwrapped, "envs", None) if model.env is not None else None
+    spec = getattr(envs[0], "spec", None) if envs else None
+    return None if spec is None else spec.id

@@ -1,8 +1,8 @@
-"""Fitted R-Max as RL-Zoo builds it: from a configuration file, with sources that are learnt if they are missing."""
+"""Fitted R-Max as RL-Zoo builds it, from a configuration file."""
 
 from __future__ import annotations
 
-import inspect
+from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.type_aliases import GymEnv
@@ -12,8 +12,6 @@ from sb3_combrel.fitted_rmax.arguments import check_actions
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.planning.grid import fitting_grid
-from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
-from sb3_combrel.zoo.sources import with_arguments, with_sources
 
 MAX_PAIRS = 2_000_000
 """State-action pairs of the grid beyond which "finer" is not applied: about 1.5 GB."""
@@ -21,10 +19,7 @@ MAX_PAIRS = 2_000_000
 
 class ZooFittedRMax(FittedRMax):
     """
-    :class:`~sb3_combrel.FittedRMax` whose ``transfer`` may name a source task that has yet to be learnt.
-
-    A model that it saves contains the source instances, not the name of their file: it can be loaded on other machines, and
-    with ``FittedRMax.load`` as well.
+    :class:`~sb3_combrel.FittedRMax` with arguments that suit a study of RL-Zoo; ``FittedRMax.load`` loads what it saves.
 
     ``resolution`` may also be "coarser" or "finer": than the one of ``None``, which suits the task and the breadth, by a
     factor of two a variable (if that takes less than about 1.5 GB).
@@ -34,7 +29,7 @@ class ZooFittedRMax(FittedRMax):
     :param transfer_kwargs: arguments of the transfer method that replace those in ``transfer``, so that a study
         or ``--hyperparams`` can change one of them
     :param kwargs: all other arguments of :class:`~sb3_combrel.FittedRMax`
-    :raises ValueError: if ``policy`` is missing, a source can neither be read nor learnt, or an argument is out of range
+    :raises ValueError: if ``policy`` is missing, or an argument is unknown or out of range
     """
 
     def __init__(
@@ -46,21 +41,17 @@ class ZooFittedRMax(FittedRMax):
     ) -> None:
         if policy is None:
             raise ValueError('the configuration has no "policy"; add "policy: FittedRMaxPolicy" to its entry')
-        known = [name for name in inspect.signature(FittedRMax).parameters if not name.startswith("_")]
-        unknown = sorted(set(kwargs) - set(known) - {"_init_setup_model"})
-        if unknown:
-            raise ValueError(f"the configuration has {', '.join(unknown)}, which FittedRMax does not know; it knows {known}")
         self.transfer_kwargs = transfer_kwargs
-        super().__init__(policy, env, **kwargs)
+        try:
+            super().__init__(policy, env, **kwargs)
+        except TypeError as error:
+            raise ValueError(f"the configuration does not fit: {error}") from error
 
     def _setup_model(self) -> None:
         # Not in the constructor: when RL-Zoo resumes, load() sets the arguments after it.
-        self.transfer = with_sources(with_arguments(restore_transfer(self.transfer), self.transfer_kwargs))
+        if self.transfer_kwargs:
+            self.transfer = with_arguments(self.transfer, self.transfer_kwargs)
         self.transfer_kwargs = None
-        try:
-            make_transfer(self.transfer)
-        except TypeError as error:
-            raise ValueError(f"transfer: {error}") from error
         if isinstance(self.resolution, str):
             self.resolution = self._relative_resolution(self.resolution)
         super()._setup_model()
@@ -77,3 +68,20 @@ class ZooFittedRMax(FittedRMax):
             return max(1, suited - 1)
         n_pairs = (2 ** (suited + 1) + 1) ** n_variables * n_actions
         return suited + 1 if n_pairs <= MAX_PAIRS else suited
+
+
+def with_arguments(transfer: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Replace arguments in a description of a transfer method.
+
+    :param transfer: a dict of one entry, from the method's name to its arguments
+    :param changes: new values by name
+    :raises ValueError: if it is something else
+    """
+    if not isinstance(transfer, dict) or len(transfer) != 1:
+        raise ValueError(
+            f"transfer_kwargs={dict(changes)!r} needs a transfer method in the configuration file, such as "
+            f"'transfer: {{sb3_combrel.COMBREL: {{source: file.npz}}}}'; transfer is {transfer!r}"
+        )
+    ((method, given),) = transfer.items()
+    return {method: {**(given or {}), **changes}}

@@ -11,16 +11,13 @@ from collections.abc import Sequence
 from typing import Any
 from unittest import mock
 
+import gymnasium
+
 from sb3_combrel.zoo.plot_checks import check_window, with_evaluations
 
 PROGRAM = "python -m sb3_combrel.zoo"
-NO_NETWORK = "the Hugging Face hub cannot be reached{advice}: {error}"
-ENVIRONMENT_MISSING = "{error}\nIf a package of yours registers it, name that: --gym-packages my_package"
-NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[zoo]'"
-OF_EXTRA = (
-    *("rl_zoo3", "sb3_contrib", "optuna", "seaborn", "pytablewriter", "pandas", "matplotlib", "yaml"),
-    *("huggingface_sb3", "huggingface_hub"),
-)
+# What a configuration or an argument causes.
+USERS_ERRORS = (ValueError, AssertionError, OSError, ImportError, gymnasium.error.Error)
 FUNCTIONS = {
     "train": "rl_zoo3.train",
     "enjoy": "rl_zoo3.enjoy",
@@ -59,7 +56,7 @@ def main(args: Sequence[str] | None = None) -> int:
             rest = CHECKS[command](rest)
         return _run(command, rest)
     except Exception as error:
-        if _is_verbose(rest) or not (is_of_network(error) or isinstance(error, _what_users_cause())):
+        if _is_verbose(rest) or not (isinstance(error, USERS_ERRORS) or _comes_from("yaml", error) or _is_of_network(error)):
             raise
         print(f"sb3_combrel.zoo: {_message_of(error)}", file=sys.stderr)
         return 1
@@ -119,39 +116,30 @@ def _without_gym_packages(args: list[str]) -> tuple[list[str], list[str]]:
     return args[at + 1 : end], args[:at] + args[end:]
 
 
-def _what_users_cause() -> tuple[type[Exception], ...]:
-    from gymnasium.error import Error
-
-    usual = (ValueError, AssertionError, OSError, ImportError, Error)
-
-    try:
-        from yaml import YAMLError
-    except ImportError:
-        return usual
-    return (*usual, YAMLError)
+def _comes_from(package: str, error: BaseException) -> bool:
+    return type(error).__module__.partition(".")[0] == package
 
 
-def is_of_network(error: BaseException) -> bool:
+def _is_of_network(error: BaseException) -> bool:
     """Return whether an error, or one that caused it, says that another machine cannot be reached."""
     seen: BaseException | None = error
     while seen is not None:
-        package = type(seen).__module__.partition(".")[0]
-        if isinstance(seen, ConnectionError) or package in ("requests", "httpx", "httpcore", "urllib3"):
+        if isinstance(seen, ConnectionError):
+            return True
+        if any(_comes_from(package, seen) for package in ("requests", "httpx", "httpcore", "urllib3")):
             return True
         seen = seen.__cause__ or seen.__context__
     return False
 
 
 def _message_of(error: Exception) -> str:
-    from gymnasium.error import NameNotFound, NamespaceNotFound
-
-    if is_of_network(error):
-        advice = " (benchmark does without it by --no-hub)"
-        return NO_NETWORK.format(advice=advice, error=" ".join(str(error).split()) or type(error).__name__)
-    if isinstance(error, NameNotFound | NamespaceNotFound):
-        return ENVIRONMENT_MISSING.format(error=error)
-    if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in OF_EXTRA:
-        return NEEDS_EXTRA.format(missing=error.name)
+    if _is_of_network(error):
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return f"the Hugging Face hub cannot be reached (benchmark does without it by --no-hub): {reason}"
+    if isinstance(error, gymnasium.error.NameNotFound | gymnasium.error.NamespaceNotFound):
+        return f"{error}\nIf a package of yours registers it, name that: --gym-packages my_package"
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}; what RL-Zoo's commands need comes with: pip install 'sb3-combrel[zoo]'"
     return str(error) or type(error).__name__
 
 

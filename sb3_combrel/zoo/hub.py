@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,19 +30,19 @@ def mended() -> Iterator[None]:
     Let RL-Zoo's ``push_to_hub`` and ``load_from_hub`` work while it lasts.
 
     RL-Zoo 2.9 takes a function from huggingface_sb3 that version 3 has under another name, and expects that a file that is
-    missing on the hub is reported by an exception of ``requests``, which huggingface_hub no longer uses. Model cards of this
-    package's algorithms name its own commands. RL-Zoo's commands are scripts, which import these functions by name when they
-    run: they must be replaced where they are defined, before.
+    missing on the hub is reported by an exception of ``requests``, which huggingface_hub no longer uses. RL-Zoo's commands are
+    scripts, which import these functions by name when they run: they must be replaced where they are defined, before.
 
     :raises ConnectionError: if the hub cannot be reached
     """
     import huggingface_sb3
     from huggingface_hub import errors, repocard
 
-    upload = _module_of_upload()
+    # The package has a function of the same name, which hides the module from ``import ... as``.
+    upload = importlib.import_module("huggingface_sb3.push_to_hub")
     with (
-        mock.patch.object(upload, "generate_metadata", _metadata_with_tag(upload), create=True),
-        mock.patch.object(repocard, "metadata_save", _reworded(repocard.metadata_save)),
+        mock.patch.object(upload, "generate_metadata", lambda *args: upload._generate_metadata(*args).to_dict(), create=True),
+        mock.patch.object(repocard, "metadata_save", _with_this_package(repocard.metadata_save)),
         mock.patch.object(huggingface_sb3, "load_from_hub", _as_expected(huggingface_sb3.load_from_hub)),
     ):
         try:
@@ -52,37 +53,19 @@ def mended() -> Iterator[None]:
             raise ConnectionError(f"the Hugging Face hub cannot be reached ({error})") from error
 
 
-def _module_of_upload() -> Any:
-    # Its package has a function of the same name, which hides the module from ``import ... as``.
-    import importlib
-
-    return importlib.import_module("huggingface_sb3.push_to_hub")
-
-
-def _metadata_with_tag(upload: Any) -> Callable[..., dict[str, Any]]:
-    """Return what RL-Zoo calls to make the data of a model card."""
-    generate = getattr(upload, "generate_metadata", None) or upload._generate_metadata
-
-    def generate_metadata(model_name: str, *others: Any) -> dict[str, Any]:
-        ours = model_name == ZooFittedRMax.__name__
-        made = generate(_REWORDED[model_name] if ours else model_name, *others)
-        data: dict[str, Any] = made if isinstance(made, dict) else made.to_dict()
-        return {**data, "tags": [*data["tags"], TAG]} if ours else data
-
-    return generate_metadata
-
-
-def _reworded(metadata_save: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that also puts this package's commands into the card of one of its algorithms."""
+def _with_this_package(metadata_save: Callable[..., None]) -> Callable[..., None]:
+    """Return a function that also puts this package's tag and commands into the card of one of its algorithms."""
 
     def save(local_path: str | Path, data: dict[str, Any]) -> None:
         card = Path(local_path)
+        if not any(f"--algo {name} " in card.read_text(encoding="utf-8") for name in ALGORITHMS):
+            metadata_save(card, data)
+            return
+        metadata_save(card, {**data, "tags": [*data["tags"], TAG]})
         text = card.read_text(encoding="utf-8")
-        if any(f"--algo {name} " in text for name in ALGORITHMS):
-            for theirs, ours in _REWORDED.items():
-                text = text.replace(theirs, ours)
-            card.write_text(text, encoding="utf-8")
-        metadata_save(card, data)
+        for theirs, ours in _REWORDED.items():
+            text = text.replace(theirs, ours)
+        card.write_text(text, encoding="utf-8")
 
     return save
 

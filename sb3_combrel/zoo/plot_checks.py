@@ -7,16 +7,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-WINDOW = 100
-"""RL-Zoo's own, in episodes."""
-
 
 def with_evaluations(args: Sequence[str]) -> list[str]:
     """
     Take algorithms without evaluations out of the arguments of ``all_plots``, which shows zeros for them, and say so.
 
-    :param args: the arguments
-    :return: the arguments without those algorithms
     :raises ValueError: if no algorithm has evaluations
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -27,51 +22,44 @@ def with_evaluations(args: Sequence[str]) -> list[str]:
         return list(args)
     kept = []
     for algo in given.algos:
-        without = [env for env in given.env if not _evaluations(given.exp_folders, algo, env)]
-        for env in without:
-            print(
-                f"sb3_combrel.zoo: {algo} has no evaluations of {env} in {', '.join(given.exp_folders)}: "
-                "train it first, with --eval-freq; it is left out" + ("" if without == given.env else " (0.0 in the table)"),
-                file=sys.stderr,
-            )
-        if without != given.env:
-            kept.append(algo)
+        for env in given.env:
+            if not _has_evaluations(given.exp_folders, algo, env):
+                folders = ", ".join(given.exp_folders)
+                _say(f"{algo} has no evaluations of {env} in {folders}: train it first, with --eval-freq; it is left out")
+            elif algo not in kept:
+                kept.append(algo)
     if not kept:
         raise ValueError("there is nothing to plot: none of the algorithms has evaluations; names take a hyphen, not a slash")
     return ["-a", *kept, "-e", *given.env, "-f", *given.exp_folders, *others]
 
 
-def _evaluations(folders: Sequence[str], algo: str, env: str) -> list[Path]:
-    return [
-        file for folder in folders for file in Path(folder, algo.lower()).glob("*/evaluations.npz") if env in file.parent.name
-    ]
+def _has_evaluations(folders: Sequence[str], algo: str, env: str) -> bool:
+    files = (file for folder in folders for file in Path(folder, algo.lower()).glob("*/evaluations.npz"))
+    return any(env in file.parent.name for file in files)
 
 
 def check_window(args: Sequence[str]) -> list[str]:
     """
     Say which runs have fewer episodes than the window of ``plot_train``, which leaves them out.
 
-    :param args: the arguments
-    :return: the same
+    :return: the arguments, unchanged
     :raises ValueError: if all runs have fewer
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-a", "--algo", default="")
     parser.add_argument("-e", "--env", nargs="+", default=[])
     parser.add_argument("-f", "--exp-folder", default="")
-    parser.add_argument("-w", "--episode-window", type=int, default=WINDOW)
+    parser.add_argument("-w", "--episode-window", type=int, default=100)
     given, _ = parser.parse_known_args(list(args))
-    folders = Path(given.exp_folder, given.algo)
-    runs = [run for env in given.env for run in sorted(folders.glob("*")) if env in run.name and run.is_dir()]
-    n_episodes = {run: _count_episodes(run) for run in runs}
+    folders = sorted(Path(given.exp_folder, given.algo).glob("*"))
+    n_episodes = {run: _count_episodes(run) for env in given.env for run in folders if env in run.name and run.is_dir()}
     short = {run: n for run, n in n_episodes.items() if n < given.episode_window}
     for run, n in short.items():
-        print(
-            f"sb3_combrel.zoo: {run} has {n} episodes, fewer than the window of {given.episode_window}: it is left out; "
-            f"-w {max(1, n // 4)} would show it",
-            file=sys.stderr,
+        _say(
+            f"{run} has {n} episodes, fewer than the window of {given.episode_window}: it is left out; "
+            f"-w {max(1, n // 4)} would show it"
         )
-    if runs and len(short) == len(runs):
+    if short and len(short) == len(n_episodes):
         raise ValueError(f"there is nothing to plot: no run has the {given.episode_window} episodes of the window, see -w")
     return list(args)
 
@@ -79,3 +67,7 @@ def check_window(args: Sequence[str]) -> list[str]:
 def _count_episodes(run: Path) -> int:
     # The first two lines are settings and names of columns.
     return sum(max(0, len(file.read_text().splitlines()) - 2) for file in run.glob("*monitor.csv"))
+
+
+def _say(sentence: str) -> None:
+    print(f"sb3_combrel.zoo: {sentence}", file=sys.stderr)

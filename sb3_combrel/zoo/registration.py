@@ -1,16 +1,73 @@
-"""Registration with RL-Zoo: algorithms, samplers of hyperparameters, environments."""
+"""Registration with RL-Zoo: algorithms, environments, and the hyperparameters that ``-optimize`` searches."""
 
 from __future__ import annotations
 
-from sb3_combrel.zoo.algorithm import ZooFittedRMax
-from sb3_combrel.zoo.sampling import (
-    convert_fitted_rmax_params,
-    sample_combrel_params,
-    sample_fitted_rmax_params,
-    sample_timbrel_params,
-)
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-ALGORITHMS = {
+from sb3_combrel.zoo.algorithm import ZooFittedRMax
+
+if TYPE_CHECKING:
+    from optuna import Trial
+
+OF_TRANSFER = "transfer_"
+"""Prefix of the names of a transfer method's arguments in a study."""
+
+
+def sample_fitted_rmax_params(trial: Trial, *_: Any) -> dict[str, Any]:
+    """
+    Draw arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`; the others are those of the configuration file.
+
+    ``max_value``, ``gamma`` and ``bounds`` belong to the task and are not drawn. The grid is drawn relative to the one
+    that suits task and breadth: a number that is right for two variables would not fit into memory for six, and an
+    error in the constructor ends the whole study.
+    """
+    return convert_fitted_rmax_params(
+        {
+            "model_breadth": trial.suggest_float("model_breadth", 0.05, 0.5, log=True),
+            "min_fraction": trial.suggest_float("min_fraction", 0.01, 0.3, log=True),
+            "exploration_threshold": trial.suggest_float("exploration_threshold", 0.3, 3.0, log=True),
+            "planning_tolerance": trial.suggest_float("planning_tolerance", 1e-4, 0.1, log=True),
+            "max_backups_power": trial.suggest_int("max_backups_power", 3, 10),
+            "resolution": trial.suggest_categorical("resolution", [None, "coarser", "finer"]),
+        }
+    )
+
+
+def sample_timbrel_params(trial: Trial, *_: Any) -> dict[str, Any]:
+    """Draw the same, and the breadth of transferred instances."""
+    return {**sample_fitted_rmax_params(trial), "transfer_kwargs": {"breadth": _transfer_breadth(trial)}}
+
+
+def sample_combrel_params(trial: Trial, *_: Any) -> dict[str, Any]:
+    """Draw the same, and arguments of COMBREL."""
+    sampled = sample_fitted_rmax_params(trial)
+    of_transfer = {
+        "breadth": _transfer_breadth(trial),
+        "n_neighbors": trial.suggest_int(f"{OF_TRANSFER}n_neighbors", 1, 10, log=True),
+        "choice": trial.suggest_categorical(f"{OF_TRANSFER}choice", ["best", "drawn"]),
+        "neighbor_radius": trial.suggest_categorical(f"{OF_TRANSFER}neighbor_radius", [None, 0.2, 0.4, 0.8]),
+        "min_compliance": trial.suggest_float(f"{OF_TRANSFER}min_compliance", 0.0, 1.5),
+        "relevance": trial.suggest_categorical(f"{OF_TRANSFER}relevance", [False, True]),
+    }
+    return {**sampled, "transfer_kwargs": of_transfer}
+
+
+def _transfer_breadth(trial: Trial) -> float:
+    return trial.suggest_float(f"{OF_TRANSFER}breadth", 0.05, 0.8, log=True)
+
+
+def convert_fitted_rmax_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """Convert a trial's parameters, by name, to arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`."""
+    of_transfer = {name: value for name, value in sampled_params.items() if name.startswith(OF_TRANSFER)}
+    converted = {name: value for name, value in sampled_params.items() if name not in of_transfer}
+    converted["max_backups"] = 2 ** converted.pop("max_backups_power")
+    if of_transfer:
+        converted["transfer_kwargs"] = {name.removeprefix(OF_TRANSFER): value for name, value in of_transfer.items()}
+    return converted
+
+
+ALGORITHMS: dict[str, Callable[..., dict[str, Any]]] = {
     "fitted_rmax": sample_fitted_rmax_params,
     "timbrel": sample_timbrel_params,
     "combrel": sample_combrel_params,
@@ -18,11 +75,7 @@ ALGORITHMS = {
     "mapping_experts": sample_fitted_rmax_params,
     "soft_homomorphism": sample_fitted_rmax_params,
 }
-"""
-Names for ``--algo``, and the function that draws hyperparameters for each.
-
-All are Fitted R-Max; each has its own configuration file, log folder and column in tables.
-"""
+"""Names for ``--algo``, each with its own settings, logs and column in tables, and what draws its hyperparameters."""
 
 
 def register() -> None:

@@ -1,16 +1,13 @@
 """Scalars of the dashboard: the event files are read back, and compared with what is computed here."""
 
 import functools
-import time
 
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
 from helpers.dashboard import METHODS, NamedWalk, Witness, events, run_folder, scalars, slow_q, walker
 
-import combrel_envs  # noqa: F401 - registers the environments
-from sb3_combrel import FittedRMax
-from sb3_combrel.tensorboard.callback import DashboardCallback
+from sb3_combrel.callbacks import DashboardCallback
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
 from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 
@@ -111,20 +108,16 @@ def test_entropy_and_number_of_mappings_are_those_of_the_choices(transfers, tmp_
     assert scalars(found, "transfer/distinct_mappings", witness.seen) == {s: n for s, (_, n) in witness.seen.items()}
 
 
-def test_scalars_stay_within_their_share_of_the_time(tmp_path, monkeypatch):
-    from sb3_combrel.tensorboard import readings
-
-    def slowly(agent, max_points=0):
-        time.sleep(0.02)
+def test_scalars_stay_within_their_share_of_the_time(tmp_path, monkeypatch, clock):
+    def slowly(agent):
+        clock[0] += 0.02
         return 0.0
 
-    monkeypatch.setattr(readings, "bellman_residual", slowly)
-    began = time.perf_counter()
-    walker(tmp_path).learn(3000, DashboardCallback(picture_freq=None, scalar_share=0.1), log_interval=1)
-    took = time.perf_counter() - began
+    monkeypatch.setattr("sb3_combrel.tensorboard.readings.bellman_residual", slowly)
+    walker(tmp_path).learn(1500, DashboardCallback(picture_freq=None, scalar_share=0.1), log_interval=1)
     found = events(run_folder(tmp_path))
     # Between logs and with them the first is written before anybody knows how long it takes; the last comes at the end.
-    assert 1 <= len(found.Scalars("planner/residual")) <= 3 + 0.1 * took / 0.02
+    assert 4 <= len(found.Scalars("planner/residual")) <= 3 + 0.1 * clock[0] / 0.02
     assert len(found.Scalars("planner/residual")) == len(found.Scalars("model/known"))
     assert len(found.Scalars("rollout/ep_rew_mean")) > 20
 
@@ -152,15 +145,9 @@ def _at_the_far_end(env, seed=None, options=None):
 
 
 def test_no_step_has_two_points(tmp_path):
-    walker(tmp_path).learn(600, DashboardCallback(scalar_share=1.0), log_interval=1)
+    walker(tmp_path).learn(300, DashboardCallback(scalar_share=1.0), log_interval=1)
     steps = [event.step for event in events(run_folder(tmp_path)).Scalars("planner/residual")]
-    assert len(steps) > 300 and len(set(steps)) == len(steps) and steps == sorted(steps)
-
-
-def test_a_run_of_a_second_has_many_points_by_default(tmp_path):
-    """In MountainCar2D, where a step takes an eighth of a millisecond, points come every 3 to 30 milliseconds."""
-    FittedRMax("combrel/MountainCar2D-v0", seed=0, tensorboard_log=str(tmp_path)).learn(6000)
-    assert len(events(run_folder(tmp_path)).Scalars("model/known")) >= 20
+    assert len(steps) > 150 and len(set(steps)) == len(steps) and steps == sorted(steps)
 
 
 def test_planning_takes_a_share_of_the_time(tmp_path):

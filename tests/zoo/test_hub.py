@@ -19,11 +19,10 @@ import combrel_envs  # noqa: F401 - registers the environments
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
 from sb3_combrel.zoo import commands
 
-pytestmark = pytest.mark.integration
-
-ROOT = Path(__file__).resolve().parents[2]
+PAGE = Path(__file__).resolve().parents[2] / "docs/hub.md"
 CAR, BIG_CAR = "combrel/MountainCar2D-v0", "combrel/MountainCar4D-v0"
 OF_RL_ZOO = "someone/combrel-combrel-MountainCar4D-v0"
+OF_RUN = ("--algo", "combrel", "--env", BIG_CAR)
 
 
 @pytest.fixture
@@ -54,6 +53,10 @@ def call(command, *args):
     return commands.main([command, *map(str, args)])
 
 
+def load(folder="logs"):
+    return call("load_from_hub", *OF_RUN, "-f", folder, "-orga", "someone")
+
+
 class TestBySB3:
     def test_a_model_comes_back_with_its_source_and_learns_on(self, hub, model):
         model.save("car.zip")
@@ -61,8 +64,7 @@ class TestBySB3:
         again = FittedRMax.load(load_from_hub("someone/car", "car.zip"), env=BIG_CAR)
         same_parameters(model, again)
         assert len(again.transfer.sources[0]) == 200
-        again.learn(20, reset_num_timesteps=False)
-        assert again.num_timesteps == 80
+        assert again.learn(20, reset_num_timesteps=False).num_timesteps == 80
 
     def test_a_source_comes_back_as_it_was(self, hub, source):
         source.save("source.npz")
@@ -70,88 +72,64 @@ class TestBySB3:
         again = SourceInstances.load(huggingface_hub.hf_hub_download("someone/sources", "source.npz"))
         assert again.state_names == source.state_names
         np.testing.assert_array_equal(again.states, source.states)
-        np.testing.assert_array_equal(again.next_states, source.next_states)
 
+    @pytest.mark.long
     def test_a_package_has_model_results_and_a_card(self, hub, model):
-        class Short(gymnasium.wrappers.TimeLimit):
-            pass
-
-        env = Short(gymnasium.make(BIG_CAR, render_mode="rgb_array").unwrapped, max_episode_steps=5)
+        env = gymnasium.wrappers.TimeLimit(gymnasium.make(BIG_CAR, render_mode="rgb_array").unwrapped, max_episode_steps=5)
         package_to_hub(model, "car", "FittedRMax", BIG_CAR, env, "someone/package", n_eval_episodes=1, video_length=3)
         folder = hub.folder / "someone/package"
         assert {"car.zip", "results.json", "config.json", "README.md"} <= {path.name for path in folder.iterdir()}
-        assert huggingface_hub.ModelCard.load(folder / "README.md").data.tags[0] == BIG_CAR
         same_parameters(model, FittedRMax.load(folder / "car.zip"))
 
 
 class TestByRLZoo:
-    @pytest.fixture
-    def trained(self, hub, tmp_path, source):
+    @pytest.mark.long
+    def test_a_run_comes_back_with_a_card_that_says_how_it_is_used_here(self, hub, source):
         source.save("source.npz")
-        entry = {
-            "policy": "FittedRMaxPolicy",
-            "n_timesteps": 100,
-            "transfer": {"sb3_combrel.COMBREL": {"source": "source.npz"}},
-        }
+        transfer = {"sb3_combrel.COMBREL": {"source": "source.npz"}}
+        entry = {"policy": "FittedRMaxPolicy", "n_timesteps": 100, "transfer": transfer}
         Path("settings.yml").write_text(yaml.dump({BIG_CAR: entry}))
-        arguments = ("--algo", "combrel", "--env", BIG_CAR, "--conf-file", "settings.yml", "--gym-packages", "combrel_envs")
-        assert (
-            call("train", *arguments, "-f", "logs", "--seed", 1, "--eval-freq", -1, "--env-kwargs", "max_episode_steps:20")
-            == 0
-        )
-        return hub
+        options = ("--gym-packages", "combrel_envs", "--eval-freq", -1, "--env-kwargs", "max_episode_steps:20")
+        assert call("train", *OF_RUN, "--conf-file", "settings.yml", "-f", "logs", *options) == 0
+        assert call("push_to_hub", *OF_RUN, "-f", "logs", "-orga", "someone", "--no-render") == 0
+        assert load("downloaded") == 0
+        name = "combrel-MountainCar4D-v0"
+        same_parameters(*(FittedRMax.load(f"{each}/combrel/{name}_1/{name}.zip") for each in ("logs", "downloaded")))
+        assert call("enjoy", *OF_RUN, "-f", "downloaded", "--no-render", "-n", 20, "--gym-packages", "combrel_envs") == 0
 
-    def test_a_run_comes_back(self, trained, capsys):
-        of_run = ("--algo", "combrel", "--env", BIG_CAR)
-        assert call("push_to_hub", *of_run, "-f", "logs", "-orga", "someone", "--no-render") == 0
-        assert call("load_from_hub", *of_run, "-f", "downloaded", "-orga", "someone") == 0
-        sent, received = (
-            FittedRMax.load(f"{folder}/combrel/combrel-MountainCar4D-v0_1/combrel-MountainCar4D-v0.zip")
-            for folder in ("logs", "downloaded")
-        )
-        same_parameters(sent, received)
-        assert call("enjoy", *of_run, "-f", "downloaded", "--no-render", "-n", 20, "--gym-packages", "combrel_envs") == 0
-
-    def test_the_card_says_how_it_is_used_here(self, trained):
-        assert call("push_to_hub", "--algo", "combrel", "--env", BIG_CAR, "-f", "logs", "-orga", "someone", "--no-render") == 0
-        card = huggingface_hub.ModelCard.load(trained.folder / OF_RL_ZOO / "README.md")
+        card = huggingface_hub.ModelCard.load(hub.folder / OF_RL_ZOO / "README.md")
         assert "python -m sb3_combrel.zoo load_from_hub --algo combrel --env combrel/MountainCar4D-v0" in card.text
         assert "rl_zoo3" not in card.text and "ZooFittedRMax" not in card.content
         assert {"sb3_combrel", "stable-baselines3"} <= set(card.data.tags)
         [result] = card.data.eval_results
         assert card.data.model_name == "FittedRMax" and result.dataset_name == BIG_CAR
 
-    def test_a_repository_that_does_not_exist_gives_a_sentence(self, hub, capsys):
-        assert call("load_from_hub", "--algo", "combrel", "--env", BIG_CAR, "-f", "logs", "-orga", "nobody") == 1
-        assert capsys.readouterr().err == "sb3_combrel.zoo: 404: no repository nobody/combrel-combrel-MountainCar4D-v0\n"
-
-    def test_a_model_that_is_missing_gives_a_sentence(self, hub, capsys):
+    def test_what_is_missing_on_the_hub_gives_a_sentence(self, hub, capsys):
+        assert load() == 1
+        assert capsys.readouterr().err == f"sb3_combrel.zoo: 404: no repository {OF_RL_ZOO}\n"
         (hub.folder / OF_RL_ZOO).mkdir(parents=True)
-        assert call("load_from_hub", "--algo", "combrel", "--env", BIG_CAR, "-f", "logs", "-orga", "someone") == 1
+        assert load() == 1
         assert "has no file combrel-combrel-MountainCar4D-v0.zip" in capsys.readouterr().err
 
-    @pytest.mark.parametrize(
-        "broken", [LocalEntryNotFoundError("no connection"), huggingface_hub.errors.HTTPError("no connection")]
-    )
-    def test_no_network_gives_a_sentence(self, hub, monkeypatch, capsys, broken):
+    @pytest.mark.parametrize("error", [LocalEntryNotFoundError, huggingface_hub.errors.HTTPError])
+    def test_no_network_gives_a_sentence(self, hub, monkeypatch, capsys, error):
         def no_network(**_):
-            raise broken
+            raise error("no connection")
 
         monkeypatch.setattr(huggingface_hub, "hf_hub_download", no_network)
-        assert call("load_from_hub", "--algo", "combrel", "--env", BIG_CAR, "-f", "logs", "-orga", "someone") == 1
+        assert load() == 1
         assert re.fullmatch(r"sb3_combrel\.zoo: .*no connection.*\n", capsys.readouterr().err)
 
     def test_without_trust_nothing_is_downloaded(self, hub, monkeypatch, capsys):
         monkeypatch.delenv("TRUST_REMOTE_CODE")
-        assert call("load_from_hub", "--algo", "combrel", "--env", BIG_CAR, "-f", "logs", "-orga", "someone") == 1
+        assert load() == 1
         assert "TRUST_REMOTE_CODE" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_examples_of_the_page_run(hub):
-    page = (ROOT / "docs/hub.md").read_text()
-    for example in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+    for example in re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL):
         short = re.sub(r"((?:total_timesteps=|learn\())5_000", r"\g<1>100", example)
         exec(compile(short, "hub.md", "exec"), {"__name__": "example"})
-    assert {path.name for path in (hub.folder / "your-name/combrel-MountainCar4D").iterdir()} == {
-        *("combrel-MountainCar4D.zip", "source.npz"),
-    }
+    files = {path.name for path in (hub.folder / "your-name/combrel-MountainCar4D").iterdir()}
+    assert files == {"combrel-MountainCar4D.zip", "source.npz"}
