@@ -1,11 +1,24 @@
-"""Pages of the documentation with tables of results in them, between marks."""
+"""Takes results into the documentation: ``python -m sb3_combrel.experiments.pages`` (``make results``)."""
 
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 from sb3_combrel.common.files import write_whole
+from sb3_combrel.experiments.benchmark.command import OUTPUT as BENCHMARK
+from sb3_combrel.experiments.paper.domains import SETTINGS
+from sb3_combrel.experiments.paper.reproduce import OUTPUT as REPRODUCTION
+
+#: What is copied of a folder of results, by the folder. Runs, sources and SVG figures stay where they are.
+COPIED = {Path(REPRODUCTION) / setting: ("*.md", "*.csv", "*.png") for setting in SETTINGS} | {
+    # Its page has the tables of the other Markdown files.
+    Path(BENCHMARK): ("benchmark.md", "*.csv", "*.png")
+}
+DOCS = Path("docs/results")
+#: Pages with marks.
+PAGES = (Path("README.md"), Path("docs/results.md"), Path("docs/benchmark.md"))
 
 # <!-- table: path, number --> ... <!-- end of table -->; the number is that of the table in the file, from 1 on.
 _MARKED = re.compile(r"(<!-- table: (?P<path>[^,>]+), (?P<number>\d+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -15,12 +28,41 @@ _INCLUDED = re.compile(r"(<!-- results: (?P<path>[^>]+?) -->\n).*?(<!-- end of r
 _PICTURE = re.compile(r"(!\[[^\]]*\]\()(?![a-z]+://)([^)]+\))")
 
 
+def main(folder: Path = Path()) -> None:
+    """
+    Copy what results there are, and fill the pages in.
+
+    :param folder: the repository, with the results in it
+    """
+    for output, patterns in COPIED.items():
+        made = copy(folder / output, folder / DOCS / output.name, patterns)
+        print(f"{output}: {len(made)} files copied to {DOCS / output.name}")
+    for page in PAGES:
+        print(f"{page}: {fill_in(folder / page)} filled in")
+
+
+def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
+    """
+    Copy the files of a folder that match; none if it does not exist.
+
+    :param output: the folder
+    :param docs: folder to copy to
+    :param patterns: of their names
+    :return: the copies
+    """
+    made = []
+    for file in sorted(file for pattern in patterns for file in output.glob(pattern)):
+        docs.mkdir(parents=True, exist_ok=True)
+        made.append(Path(shutil.copyfile(file, docs / file.name)))
+    return made
+
+
 def fill_in(page: Path) -> int:
     """
-    Replace what stands between the marks of each table in a page by the table of the file that is named there.
+    Replace what stands between marks in a page: by a table of a file, or by a whole Markdown file.
 
-    :param page: a Markdown file; paths in it are relative to its folder
-    :return: how many tables were filled in
+    :param page: a Markdown file; paths in it are relative to its folder, and those of pictures in a file to that file's
+    :return: how many tables and files were filled in
     :raises ValueError: if a file has no such table
     """
 
@@ -31,9 +73,16 @@ def fill_in(page: Path) -> int:
             raise ValueError(f"{page}: {match['path']} has tables 1 to {len(tables)}, and number {number} is asked for")
         return f"{match[1]}{tables[number - 1]}\n{match[4]}"
 
-    text, n = _MARKED.subn(table_of, page.read_text())
+    def content_of(match: re.Match[str]) -> str:
+        file = Path(match["path"])
+        text = (page.parent / file).read_text().strip("\n")
+        moved = _PICTURE.sub(lambda picture: f"{picture[1]}{file.parent.as_posix()}/{picture[2]}", text)
+        return f"{match[1]}{moved}\n{match[3]}"
+
+    text, n_tables = _MARKED.subn(table_of, page.read_text())
+    text, n_files = _INCLUDED.subn(content_of, text)
     write_whole(page, text.encode())
-    return n
+    return n_tables + n_files
 
 
 def tables_in(text: str) -> list[str]:
@@ -41,20 +90,5 @@ def tables_in(text: str) -> list[str]:
     return [match.group(0).rstrip("\n") for match in re.finditer(r"(?:^\|.*\n?)+", text, re.MULTILINE)]
 
 
-def include(page: Path) -> int:
-    """
-    Replace what stands between the marks of results in a page by the Markdown file that is named there.
-
-    :param page: a Markdown file; paths in it are relative to its folder, and those of pictures in the file to that file's
-    :return: how many files were included
-    """
-
-    def content_of(match: re.Match[str]) -> str:
-        file = Path(match["path"])
-        text = (page.parent / file).read_text().strip("\n")
-        moved = _PICTURE.sub(lambda picture: f"{picture[1]}{file.parent.as_posix()}/{picture[2]}", text)
-        return f"{match[1]}{moved}\n{match[3]}"
-
-    text, n = _INCLUDED.subn(content_of, page.read_text())
-    write_whole(page, text.encode())
-    return n
+if __name__ == "__main__":
+    main()
