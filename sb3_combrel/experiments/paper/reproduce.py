@@ -76,7 +76,7 @@ def reproduce(
     check_all_succeeded(results)
     for domain in domains:
         if m.TIMBREL_FREQUENT in methods_of(targets, domain, setting):
-            with_frequent = replace(sources[domain.name], frequent=_frequent(results, domain, sources[domain.name]))
+            with_frequent = replace(sources[domain.name], frequent=frequent_mapping(results, domain, sources[domain.name]))
             console.print(f"{m.TIMBREL_FREQUENT}: {with_frequent.frequent!r}", markup=False)
             jobs = [*jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, *counts[domain.name])]
             results += run_missing(jobs, output, backend, console)
@@ -95,7 +95,7 @@ def _check_folder(output: Path, domain: str, setting: str, n_episodes: int) -> N
             )
 
 
-def _frequent(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:
+def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:
     """The mapping that COMBREL used most, over all its runs (Section 5.2)."""
     of_combrel = [each for each in results if (each.group, each.method) == (domain.name, m.COMBREL_PLAIN)]
     uses = [use for result in of_combrel for use in result.more["uses"]]
