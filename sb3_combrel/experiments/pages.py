@@ -1,19 +1,61 @@
-"""Pages of the documentation with tables of results in them, between marks."""
+"""Takes results into the documentation: ``python -m sb3_combrel.experiments.pages`` (``make results``)."""
 
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 from sb3_combrel.common.files import write_whole
+from sb3_combrel.experiments.benchmark.command import OUTPUT as BENCHMARK
+from sb3_combrel.experiments.paper.domains import SETTINGS
+from sb3_combrel.experiments.paper.reproduce import OUTPUT as REPRODUCTION
+
+#: What is copied of a folder of results, by the folder. Runs, sources and SVG figures stay where they are.
+COPIED = {Path(REPRODUCTION) / setting: ("*.md", "*.csv", "*.png") for setting in SETTINGS} | {
+    # Its page has the tables of the other Markdown files.
+    Path(BENCHMARK): ("benchmark.md", "*.csv", "*.png")
+}
+DOCS = Path("docs/results")
+#: Pages with marks.
+PAGES = (Path("docs/results.md"), Path("docs/benchmark.md"))
 
 # <!-- table: path, number --> ... <!-- end of table -->; the number is that of the table in the file, from 1 on.
 _MARKED = re.compile(r"(<!-- table: (?P<path>[^,>]+), (?P<number>\d+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
+def main(folder: Path = Path()) -> None:
+    """
+    Copy what results there are, and fill the pages in.
+
+    :param folder: the repository, with the results in it
+    """
+    for output, patterns in COPIED.items():
+        made = copy(folder / output, folder / DOCS / output.name, patterns)
+        print(f"{output}: {len(made)} files copied to {DOCS / output.name}")
+    for page in PAGES:
+        print(f"{page}: {fill_in(folder / page)} filled in")
+
+
+def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
+    """
+    Copy the files of a folder that match; none if it does not exist.
+
+    :param output: the folder
+    :param docs: folder to copy to
+    :param patterns: of their names
+    :return: the copies
+    """
+    made = []
+    for file in sorted(file for pattern in patterns for file in output.glob(pattern)):
+        docs.mkdir(parents=True, exist_ok=True)
+        made.append(Path(shutil.copyfile(file, docs / file.name)))
+    return made
+
+
 def fill_in(page: Path) -> int:
     """
-    Replace what stands between the marks of each table in a page by the table of the file that is named there.
+    Replace what stands between marks in a page by the tables of files.
 
     :param page: a Markdown file; paths in it are relative to its folder
     :return: how many tables were filled in
@@ -35,3 +77,7 @@ def fill_in(page: Path) -> int:
 def tables_in(text: str) -> list[str]:
     """Return the tables of a Markdown text, without their titles."""
     return [match.group(0).rstrip("\n") for match in re.finditer(r"(?:^\|.*\n?)+", text, re.MULTILINE)]
+
+
+if __name__ == "__main__":
+    main()

@@ -46,28 +46,38 @@ class Domain:
 
     :param name: in file names
     :param title: in figures
-    :param source_id: id of the source task
     :param target_id: id of the target task
     :param learn_source: learns the source and returns its instances; a function of the seed
     :param n_runs: runs of each method, by default
     :param n_episodes: episodes of each run, by default
     :param first_seed: seed of the first run; no setting was chosen with this seed or those after it
     :param thresholds: steps of an episode; the training needed to get there is reported for each
+    :param goal_reward: what the last step of an episode that reaches the goal earns besides the cost of a step, 1
     :param unit: what a step is called
     :param settings: by name
     """
 
     name: str
     title: str
-    source_id: str
     target_id: str
     learn_source: Callable[[int], SourceInstances]
     n_runs: int
     n_episodes: int
     first_seed: int
     thresholds: tuple[int, ...]
+    goal_reward: float
     unit: str
     settings: Mapping[str, Setting]
+
+    def target_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names of the target's state variables and actions."""
+        if self.name == ICUB.name:
+            from combrel_envs.icub_tasks import TASKS
+
+            return TASKS["arm_strike"].state_names, TASKS["arm_strike"].action_names
+        from combrel_envs.mountain_car_dynamics import ACTION_NAMES, STATE_NAMES
+
+        return STATE_NAMES[2], ACTION_NAMES[2]
 
 
 # Table 1 of the paper. It names no breadth for transferred instances: the only one that it names is taken for both.
@@ -80,10 +90,7 @@ _CAR_PAPER = Setting(
     paper=True,
 )
 _CAR_EXPLORE = Setting(
-    learner={"degree": 0, "model_breadth": 0.1},
-    max_episode_steps=2000,
-    mappings="injective",
-    combrel={"use": "instances"},
+    learner={"degree": 0, "model_breadth": 0.1}, max_episode_steps=2000, mappings="injective", combrel={"use": "instances"}
 )
 _CAR_BEST = Setting(learner={}, max_episode_steps=2000, mappings="factored", timbrel={"use": "prior"})
 
@@ -96,9 +103,8 @@ _ICUB_PAPER = Setting(
     timbrel={"breadth": 0.1, "breadth_decay": 1.0},
     paper=True,
 )
-# The paper's breadth of the model is 0.1; with 0.2 the arm is learnt in fewer steps. Of all signed injective mappings many
-# have about the same compliance. If only the best is used, its errors determine all predictions and are corrected slowly;
-# drawn mappings do not have that drawback, and may be used farther from transitions.
+# Of all signed injective mappings many have about the same compliance. If only the best is used, its errors determine all
+# predictions and are corrected slowly; drawn mappings do not have that drawback, and may be used farther from transitions.
 _ICUB_EXPLORE = Setting(
     learner={"degree": 0, "model_breadth": 0.2, **icub_arm.LEARNER},
     max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
@@ -107,35 +113,32 @@ _ICUB_EXPLORE = Setting(
     timbrel={"breadth": 0.5, "breadth_decay": 1.0},
 )
 _ICUB_BEST = Setting(
-    learner=icub_arm.LEARNER,
-    max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
-    mappings="factored",
-    timbrel={"use": "prior"},
+    learner=icub_arm.LEARNER, max_episode_steps=icub_arm.MAX_EPISODE_STEPS, mappings="factored", timbrel={"use": "prior"}
 )
 
 MOUNTAIN_CAR = Domain(
     name="mountain_car",
     title="Mountain Car 4D",
-    source_id=mountain_car.SOURCE_ID,
     target_id=mountain_car.TARGET_ID,
     learn_source=mountain_car.learn_source,
     n_runs=15,
     n_episodes=200,
     first_seed=5000,
     thresholds=(400, 300, 250),
+    goal_reward=0.0,
     unit="steps",
     settings={PAPER: _CAR_PAPER, EXPLORE: _CAR_EXPLORE, BEST: _CAR_BEST},
 )
 ICUB = Domain(
     name="icub",
     title="iCub, arm",
-    source_id=icub_arm.SOURCE_ID,
     target_id=icub_arm.TARGET_ID,
     learn_source=icub_arm.learn_source,
     n_runs=10,
     n_episodes=300,
     first_seed=5000,
     thresholds=(200, 150, 100, 75, 50, 40),
+    goal_reward=100.0,
     unit="commands",
     settings={PAPER: _ICUB_PAPER, EXPLORE: _ICUB_EXPLORE, BEST: _ICUB_BEST},
 )

@@ -1,33 +1,57 @@
-"""The methods that are compared, by name: those of the paper, and controls."""
+"""The methods that are compared, by name: those of the paper, and controls; and what they transfer."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
-from sb3_combrel.experiments.paper.domains import BEST, ICUB, MOUNTAIN_CAR, Domain, Setting
-from sb3_combrel.experiments.paper.oracle import best_mappings
+from sb3_combrel.experiments.paper.domains import BEST, DOMAINS, ICUB, MOUNTAIN_CAR, PAPER, Domain, Setting
+from sb3_combrel.experiments.paper.mappings import best_mappings
 from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.mappings.named_sets import resolve
+from sb3_combrel.runs.source_files import FOLDER, load_or_learn
 from sb3_combrel.transfer.base import Transfer
 
 NO_TRANSFER = "no transfer"
+#: The mapping that a person would choose.
 TIMBREL_INTUITIVE = "TIMBREL"
 COMBREL_PLAIN = "COMBREL"
 COMBREL_RELEVANCE = "COMBREL with relevance"
 TIMBREL_RELEVANCE = "TIMBREL with relevance"
-TIMBREL_RANDOM = "TIMBREL random"
-TIMBREL_FREQUENT = "TIMBREL frequent"
 #: The reading of compliance in which whole action mappings differ, as they do in Table 2.
 COMBREL_WHOLE = "COMBREL whole mappings"
+#: A mapping of COMBREL's set, drawn state by state; and one drawn once for the run.
+TIMBREL_RANDOM = "TIMBREL random"
 ONE_RANDOM = "one random mapping"
+#: The mapping that COMBREL used most.
+TIMBREL_FREQUENT = "TIMBREL frequent"
+#: For each action the mapping of COMBREL's set that predicts the target's transitions best.
 ORACLE = "oracle mapping"
+#: COMBREL from the source of the other domain.
 UNRELATED = "unrelated source"
+#: Fitted R-Max with its default arguments.
 NO_TRANSFER_BEST = "no transfer, best setting"
+
+#: All methods, in the order of tables.
+METHODS = (
+    *(NO_TRANSFER, TIMBREL_INTUITIVE, COMBREL_PLAIN, COMBREL_RELEVANCE, TIMBREL_RELEVANCE, COMBREL_WHOLE, TIMBREL_RANDOM),
+    *(ONE_RANDOM, TIMBREL_FREQUENT, ORACLE, UNRELATED, NO_TRANSFER_BEST),
+)
+# Those that exist with ``use="prior"`` too, and those that exist in one domain alone.
+_WITH_PRIOR = (NO_TRANSFER, TIMBREL_INTUITIVE, COMBREL_PLAIN, ONE_RANDOM, UNRELATED)
+_ONLY_IN = dict.fromkeys((TIMBREL_INTUITIVE, COMBREL_RELEVANCE, TIMBREL_RELEVANCE, COMBREL_WHOLE), MOUNTAIN_CAR.name)
+_ONLY_IN |= dict.fromkeys((TIMBREL_FREQUENT, ORACLE), ICUB.name)
+
+SOURCE_SEED = 0
+#: Seed of the learner whose transitions of the arm's task the oracle has; no run has it.
+TARGET_SEED = 1
+N_TARGET_TRANSITIONS = 4000
 
 
 @dataclass(frozen=True)
@@ -47,152 +71,88 @@ class Sources:
     frequent: InterTaskMapping | None = None
 
 
-Make = Callable[[Domain, Setting, Sources, int], Transfer]
+def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
+    """Learn the source tasks of a domain, or load what was learned before from the output folder."""
 
+    def instances_of(each: Domain) -> SourceInstances:
+        return load_or_learn(output / FOLDER / f"{each.name}.npz", lambda: each.learn_source(SOURCE_SEED), console)
 
-@dataclass(frozen=True)
-class Method:
-    """
-    A method that is compared.
+    def record_target() -> SourceInstances:
+        max_value = domain.settings[PAPER].learner["max_value"]
+        return SourceInstances.from_fitted_rmax(domain.target_id, N_TARGET_TRANSITIONS, TARGET_SEED, max_value=max_value)
 
-    :param name: in tables and figures
-    :param description: in tables of documentation
-    :param make: makes the transfer method for a domain, a setting, sources and a seed; None: no transfer
-    :param with_prior: whether it exists with ``use="prior"`` too
-    :param domains: names of the domains that it exists in; () for all
-    :param learner: arguments of the learner instead of the setting's; None for the setting's
-    """
-
-    name: str
-    description: str
-    make: Make | None
-    with_prior: bool = True
-    domains: tuple[str, ...] = ()
-    learner: Mapping[str, Any] | None = field(default=None)
-
-    def exists_in(self, domain: Domain, setting: Setting) -> bool:
-        """Whether the method exists in a domain with a setting."""
-        return (not self.domains or domain.name in self.domains) and (self.with_prior or setting.use == "instances")
-
-    def transfer(self, domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer | None:
-        """Make the transfer method, not bound to a task; None for no transfer."""
-        return None if self.make is None else self.make(domain, setting, sources, seed)
-
-    def learner_in(self, domain: Domain, setting: Setting) -> Mapping[str, Any]:
-        """Return the learner's arguments."""
-        if self.name == NO_TRANSFER_BEST:
-            return domain.settings[BEST].learner
-        return setting.learner
-
-
-def combrel(setting: Setting, source: SourceInstances, mappings: str | None = None, **arguments: Any) -> COMBREL:
-    """Make COMBREL as the setting says; ``mappings`` and ``arguments`` come before the setting's own."""
-    make = COMBREL.paper if setting.paper else COMBREL
-    return make(source, mappings or setting.mappings, **{**setting.combrel, **arguments})
-
-
-def _one_random(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    """A mapping of the set that COMBREL chooses from, drawn once for the run."""
-    if setting.use == "prior":
-        return TIMBREL(sources.own, "random", mappings=setting.mappings, **setting.timbrel)
-    chosen = resolve(setting.mappings, **_sizes(domain, sources.own))
-    number = int(np.random.default_rng([seed, len(chosen)]).integers(len(chosen)))
-    return TIMBREL(sources.own, chosen[number], **setting.timbrel)
-
-
-def _oracle(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    assert sources.target is not None
-    mappings = best_mappings(sources.own, sources.target, resolve(setting.mappings, **_sizes(domain, sources.own)))
-    return TIMBREL(sources.own, mappings, **setting.timbrel)
-
-
-def _intuitive(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    mapping = factored_mapping(2) if setting.use == "prior" else intuitive_mapping()
-    return TIMBREL(sources.own, mapping, **setting.timbrel)
-
-
-def _frequent(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    assert sources.frequent is not None
-    return TIMBREL(sources.own, sources.frequent, **setting.timbrel)
-
-
-def _unrelated(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    # The paper's sets are made for the domain's own source.
-    mappings = "injective" if setting.mappings.startswith("paper") else setting.mappings
-    return combrel(setting, sources.unrelated, mappings)
-
-
-def _random(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    return TIMBREL(sources.own, "random", mappings=setting.mappings, **setting.timbrel)
-
-
-def _pooled(domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer:
-    return TIMBREL(sources.own, "pool", mappings=setting.mappings, relevance=True, **setting.timbrel)
-
-
-_CAR, _ROBOT = (MOUNTAIN_CAR.name,), (ICUB.name,)
-_METHODS: Sequence[Method] = (
-    Method(NO_TRANSFER, "Fitted R-Max alone", None),
-    Method(TIMBREL_INTUITIVE, "TIMBREL with the mapping that a person would choose, the oracle", _intuitive, domains=_CAR),
-    Method(COMBREL_PLAIN, "COMBREL without relevance", lambda d, s, sources, seed: combrel(s, sources.own)),
-    Method(
-        COMBREL_RELEVANCE,
-        "COMBREL, instances ordered by relevance",
-        lambda d, s, sources, seed: combrel(s, sources.own, relevance=True),
-        with_prior=False,
-        domains=_CAR,
-    ),
-    Method(
-        TIMBREL_RELEVANCE,
-        "TIMBREL with relevance on the pooled translations by all mappings",
-        _pooled,
-        with_prior=False,
-        domains=_CAR,
-    ),
-    Method(
-        COMBREL_WHOLE,
-        "COMBREL, its neighbours over states and actions",
-        lambda d, s, sources, seed: combrel(s, sources.own, neighbors="state_action"),
-        with_prior=False,
-        domains=_CAR,
-    ),
-    Method(TIMBREL_RANDOM, "a random mapping of COMBREL's set, drawn state by state", _random, with_prior=False),
-    Method(ONE_RANDOM, "a random mapping of COMBREL's set, one for the run", _one_random),
-    Method(TIMBREL_FREQUENT, "TIMBREL with the mapping that COMBREL used most", _frequent, with_prior=False, domains=_ROBOT),
-    Method(
-        ORACLE,
-        "for each action the mapping of COMBREL's set that predicts the target's transitions best",
-        _oracle,
-        with_prior=False,
-        domains=_ROBOT,
-    ),
-    Method(UNRELATED, "COMBREL from the source of the other domain", _unrelated),
-    Method(NO_TRANSFER_BEST, "Fitted R-Max alone, local linear model (default arguments)", None, with_prior=False),
-)
-METHODS: Mapping[str, Method] = {method.name: method for method in _METHODS}
-
-
-def methods_in(domain: Domain, setting: Setting) -> list[Method]:
-    """Return the methods that exist in a domain with a setting, in the order of tables."""
-    return [method for method in METHODS.values() if method.exists_in(domain, setting)]
-
-
-def _sizes(domain: Domain, source: SourceInstances) -> dict[str, int]:
-    names = target_names(domain)
-    return {
-        "n_source_variables": source.n_variables,
-        "n_target_variables": len(names[0]),
-        "n_source_actions": source.n_actions,
-        "n_target_actions": len(names[1]),
-    }
-
-
-def target_names(domain: Domain) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the target's state variables and actions."""
+    (other,) = (each for each in DOMAINS.values() if each.name != domain.name)
+    target = None
     if domain.name == ICUB.name:
-        from combrel_envs.icub_tasks import TASKS
+        target = load_or_learn(output / FOLDER / f"{domain.name}_target.npz", record_target, console)
+    return Sources(instances_of(domain), instances_of(other), target)
 
-        return TASKS["arm_strike"].state_names, TASKS["arm_strike"].action_names
-    from combrel_envs.mountain_car_dynamics import ACTION_NAMES, STATE_NAMES
 
-    return STATE_NAMES[2], ACTION_NAMES[2]
+def methods_in(domain: Domain, setting: Setting) -> list[str]:
+    """Return the methods that exist in a domain with a setting, in the order of tables."""
+    return [
+        name
+        for name in METHODS
+        if _ONLY_IN.get(name, domain.name) == domain.name and (name in _WITH_PRIOR or setting.use == "instances")
+    ]
+
+
+def learner_of(method: str, domain: Domain, setting: Setting) -> Mapping[str, Any]:
+    """Return the learner's arguments of a method."""
+    return domain.settings[BEST].learner if method == NO_TRANSFER_BEST else setting.learner
+
+
+def transfer_of(method: str, domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer | None:
+    """
+    Make the transfer method of a method, not bound to a task; None for no transfer.
+
+    :param method: one that exists in the domain with the setting
+    :param domain: the domain
+    :param setting: the setting
+    :param sources: what is transferred
+    :param seed: of the run, for a mapping that is drawn once for it
+    """
+    own, with_prior = sources.own, setting.use == "prior"
+
+    def combrel(source: SourceInstances = own, mappings: str = setting.mappings, **arguments: Any) -> Transfer:
+        make = COMBREL.paper if setting.paper else COMBREL
+        return make(source, mappings, **{**setting.combrel, **arguments})
+
+    def timbrel(mapping: Any, **arguments: Any) -> Transfer:
+        return TIMBREL(own, mapping, **arguments, **setting.timbrel)
+
+    def of_set(mapping: str, **arguments: Any) -> Transfer:
+        return timbrel(mapping, mappings=setting.mappings, **arguments)
+
+    def all_mappings() -> Any:
+        variables, actions = domain.target_names()
+        return resolve(
+            setting.mappings,
+            n_source_variables=own.n_variables,
+            n_target_variables=len(variables),
+            n_source_actions=own.n_actions,
+            n_target_actions=len(actions),
+        )
+
+    def one_random() -> Transfer:
+        mappings = all_mappings()
+        return timbrel(mappings[int(np.random.default_rng([seed, len(mappings)]).integers(len(mappings)))])
+
+    # The paper's sets are made for the domain's own source.
+    any_source = "injective" if setting.mappings.startswith("paper") else setting.mappings
+    make: Mapping[str, Callable[[], Transfer | None]] = {
+        NO_TRANSFER: lambda: None,
+        TIMBREL_INTUITIVE: lambda: timbrel(factored_mapping(2) if with_prior else intuitive_mapping()),
+        COMBREL_PLAIN: combrel,
+        COMBREL_RELEVANCE: lambda: combrel(relevance=True),
+        # On the translations by all mappings together.
+        TIMBREL_RELEVANCE: lambda: of_set("pool", relevance=True),
+        COMBREL_WHOLE: lambda: combrel(neighbors="state_action"),
+        TIMBREL_RANDOM: lambda: of_set("random"),
+        ONE_RANDOM: lambda: of_set("random") if with_prior else one_random(),
+        TIMBREL_FREQUENT: lambda: timbrel(sources.frequent),
+        ORACLE: lambda: timbrel(best_mappings(own, sources.target, all_mappings())),
+        UNRELATED: lambda: combrel(sources.unrelated, any_source),
+        NO_TRANSFER_BEST: lambda: None,
+    }
+    return make[method]()

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from sb3_combrel import __version__
+from sb3_combrel import InterTaskMapping, __version__
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.experiments.carrying_out import LOCAL, Engine, carry_out_missing
-from sb3_combrel.experiments.output_folder import prepare_folder
 from sb3_combrel.experiments.paper import methods as m
-from sb3_combrel.experiments.paper.baseline_runs import baseline_runs, carry_out_baseline
-from sb3_combrel.experiments.paper.diagnosis import diagnosis_jobs
+from sb3_combrel.experiments.paper.baselines import baseline_jobs
 from sb3_combrel.experiments.paper.domains import DOMAINS, SETTINGS, Domain
-from sb3_combrel.experiments.paper.plan import BASELINES, DIAGNOSIS, frequent_mapping, jobs_of, methods_of, targets_of
+from sb3_combrel.experiments.paper.jobs import diagnosis_jobs, jobs_of, results_in
+from sb3_combrel.experiments.paper.mappings import most_frequent_mapping
 from sb3_combrel.experiments.paper.report import write_report
-from sb3_combrel.experiments.paper.runs import Result, ResultFiles, carry_out
-from sb3_combrel.experiments.paper.sources import prepare_sources
+from sb3_combrel.experiments.paper.targets import BASELINES, DIAGNOSIS, methods_of, targets_of
+from sb3_combrel.runs.job import Job, Result
+from sb3_combrel.runs.runner import LOCAL, Backend, check_all_succeeded, run_missing
 
 OUTPUT = "reproduction"
 
@@ -33,7 +30,7 @@ def reproduce(
     runs: int | None = None,
     episodes: int | None = None,
     output: Path | None = None,
-    engine: Engine = LOCAL,
+    backend: Backend = LOCAL,
     console: Console | None = None,
 ) -> list[Path]:
     """
@@ -44,72 +41,67 @@ def reproduce(
     :param runs: of each method; None: as many as in the paper
     :param episodes: of each run; None: 200 for Mountain Car, 300 for the iCub
     :param output: folder for all results; None: ``reproduction/<setting>``
-    :param engine: where the runs are carried out
+    :param backend: where the runs are carried out
     :param console: where to write; None for the standard output
     :return: the files made
     :raises ValueError: if an argument is unknown or out of range, or the folder has results of other settings
-    :raises ConnectionError: if no cluster answers at the engine's address
+    :raises ConnectionError: if no cluster answers at the backend's address
     :raises JobError: if a run raises an exception, or its workers died too often
     """
     if setting not in SETTINGS:
         raise ValueError(f"setting must be one of {', '.join(SETTINGS)}, got {setting!r}")
-    for name, number in (("runs", runs), ("episodes", episodes), ("jobs", engine.n_jobs)):
+    for name, number in (("runs", runs), ("episodes", episodes)):
         check_count(name, number, none_allowed=True)
     targets = targets_of(target, setting)
-    engine.check()
+    backend.check()
     console = console or Console()
     output = output or Path(OUTPUT) / setting
     domains = [domain for domain in DOMAINS.values() if any(domain.name in each.methods for each in targets)]
-    prepare_folder(output, _settings(setting, {domain.name: episodes or domain.n_episodes for domain in domains}))
-    files = ResultFiles(output)
-    results: dict[str, list[Result]] = {}
+    # Checks the folder, before sources are written to it.
+    run_missing([], output)
+    jobs: list[Job] = []
+    sources, counts = {}, {}
     for domain in domains:
-        methods = methods_of(targets, domain, setting)
-        counts = runs or domain.n_runs, episodes or domain.n_episodes
-        results[domain.name] = _results_of(domain, setting, methods, counts, files, engine, console)
+        counts[domain.name] = n_runs, n_episodes = runs or domain.n_runs, episodes or domain.n_episodes
+        _check_folder(output, domain.name, setting, n_episodes)
+        sources[domain.name] = own = m.prepare_sources(domain, output, console)
+        methods = [name for name in methods_of(targets, domain, setting) if name != m.TIMBREL_FREQUENT]
         wanted = {each.name for each in targets if domain.name in each.methods}
+        jobs += jobs_of(domain, setting, methods, own, n_runs, n_episodes)
         if DIAGNOSIS in wanted:
-            jobs = diagnosis_jobs(domain, setting, prepare_sources(domain, output, console), *counts)
-            carry_out_missing(jobs, files, engine, console, carry_out)
-            results[domain.name] += files.read_all(jobs)
+            jobs += diagnosis_jobs(domain, setting, own, n_runs, n_episodes)
         if BASELINES in wanted:
-            others = baseline_runs(domain, setting, prepare_sources(domain, output, console), runs, counts[1])
-            carry_out_missing(others, files, engine, console, carry_out_baseline)
-            results[domain.name] += files.read_all(others)
+            jobs += baseline_jobs(domain, setting, own.own, runs, n_episodes)
+    results = run_missing(jobs, output, backend, console)
+    check_all_succeeded(results)
+    for domain in domains:
+        if m.TIMBREL_FREQUENT in methods_of(targets, domain, setting):
+            with_frequent = replace(sources[domain.name], frequent=frequent_mapping(results, domain, sources[domain.name]))
+            console.print(f"{m.TIMBREL_FREQUENT}: {with_frequent.frequent!r}", markup=False)
+            jobs = [*jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, *counts[domain.name])]
+            results += run_missing(jobs, output, backend, console)
+            check_all_succeeded(results)
     return write_report(targets, setting, results, output, console)
 
 
-def _results_of(
-    domain: Domain,
-    setting: str,
-    methods: Sequence[str],
-    counts: tuple[int, int],
-    files: ResultFiles,
-    engine: Engine,
-    console: Console,
-) -> list[Result]:
-    """Carry out what is missing of a domain's runs and return the results of all."""
-    sources = prepare_sources(domain, files.folder, console)
-    first = [name for name in methods if name != m.TIMBREL_FREQUENT]
-    jobs = jobs_of(domain, setting, first, sources, *counts)
-    carry_out_missing(jobs, files, engine, console, carry_out)
-    if m.TIMBREL_FREQUENT in methods:
-        # It takes the mapping that COMBREL used most in all of its runs.
-        sources = replace(sources, frequent=frequent_mapping(files.read_all(jobs), domain, sources))
-        console.print(f"{m.TIMBREL_FREQUENT}: {sources.frequent!r}", markup=False)
-        more = jobs_of(domain, setting, [m.TIMBREL_FREQUENT], sources, *counts)
-        carry_out_missing(more, files, engine, console, carry_out)
-        jobs = jobs + more
-    return files.read_all(jobs)
+def _check_folder(output: Path, domain: str, setting: str, n_episodes: int) -> None:
+    """Raise an error if the folder has runs of a domain's methods that belong into other figures and tables."""
+    now = {"version": __version__, "setting": setting, "n_episodes": n_episodes}
+    for before, result in results_in(output, domain):
+        other = [f"{key} was {before.get(key)!r} and is {now[key]!r}" for key in now if before.get(key) != now[key]]
+        if result.method in m.METHODS and other:
+            raise ValueError(
+                f"{output} has results of other settings ({result.name}: {'; '.join(other)}); use another --output"
+            )
 
 
-def _settings(setting: str, episodes: dict[str, int]) -> dict[str, Any]:
-    """What the results in a folder depend on; ``episodes`` of each run, by domain."""
-    now: dict[str, Any] = {"version": __version__, "setting": setting}
-    now |= {f"episodes of {name}": n for name, n in episodes.items()}
-    return now | {f"arguments in {name}": _plain(DOMAINS[name], setting) for name in episodes}
-
-
-def _plain(domain: Domain, setting: str) -> dict[str, Any]:
-    """What the results of a domain depend on, as JSON represents it."""
-    return dict(json.loads(json.dumps({**vars(domain.settings[setting]), "first_seed": domain.first_seed})))
+def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:
+    """The mapping that COMBREL used most, over all its runs (Section 5.2)."""
+    of_combrel = [each for each in results if (each.group, each.method) == (domain.name, m.COMBREL_PLAIN)]
+    uses = [use for result in of_combrel for use in result.more["uses"]]
+    if not uses:
+        raise ValueError(
+            f"{m.COMBREL_PLAIN} has used no mapping within episodes={len(of_combrel[0].steps)}, so {m.TIMBREL_FREQUENT} has "
+            "no mapping; use more --episodes"
+        )
+    return most_frequent_mapping(uses, (sources.own.state_names, sources.own.action_names), domain.target_names())

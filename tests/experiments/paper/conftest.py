@@ -1,65 +1,40 @@
-"""What the tests of the paper's experiments share: sources that are learned once, and domains of short episodes."""
+"""What the tests of the paper's experiments share: domains of short episodes, and sources that are not learned."""
 
-import json
-import shutil
 from dataclasses import replace
 
 import pytest
 from helpers.paper_results import quiet
-from sb3_combrel.experiments.output_folder import SETTINGS_FILE
-from sb3_combrel.experiments.source_files import FOLDER
 
-from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
-from sb3_combrel.experiments.paper.sources import prepare_sources
+import combrel_envs  # noqa: F401 - registers the tasks
+from sb3_combrel import SourceInstances
+from sb3_combrel.experiments.paper import methods
+from sb3_combrel.experiments.paper.domains import DOMAINS
+from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 
 #: Enough for COMBREL to select mappings in the second episode, too few to reach a goal.
 SHORT = 60
 
 
-@pytest.fixture(scope="session")
-def sources_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sources")
-    for domain in DOMAINS.values():
-        prepare_sources(domain, folder, quiet())
-    return folder
-
-
-@pytest.fixture(scope="session")
-def sources(sources_folder):
-    """What the methods transfer, by domain."""
-    return {name: prepare_sources(domain, sources_folder, quiet()) for name, domain in DOMAINS.items()}
-
-
-@pytest.fixture(scope="session")
-def prepare(sources_folder):
-    """Make a folder for results in which the sources have been learned."""
-
-    def made(folder):
-        shutil.copytree(sources_folder / FOLDER, folder / FOLDER)
-        (folder / SETTINGS_FILE).write_text(json.dumps({}))
-        return folder
-
-    return made
-
-
-@pytest.fixture
-def output(prepare, tmp_path):
-    return prepare(tmp_path / "output")
-
-
-@pytest.fixture
-def full_episodes(monkeypatch):
-    """Both domains as they are, whatever other tests of the module do."""
-    for domain in (MOUNTAIN_CAR, ICUB):
-        monkeypatch.setitem(DOMAINS, domain.name, domain)
+def recorded_from(env_id):
+    """Instead of learning a source: random actions in it."""
+    return lambda seed: SourceInstances.record(None, env_id, 400, seed)
 
 
 @pytest.fixture(scope="module")
-def short_episodes():
-    """Both domains with episodes of so few steps that runs take a second."""
-    before = dict(DOMAINS)
-    for name, domain in before.items():
-        settings = {key: replace(setting, max_episode_steps=SHORT) for key, setting in domain.settings.items()}
-        DOMAINS[name] = replace(domain, settings=settings)
-    yield DOMAINS
-    DOMAINS.update(before)
+def short():
+    """Both domains with episodes of few steps and sources of few instances."""
+    sources = {"mountain_car": mountain_car.SOURCE_ID, "icub": icub_arm.SOURCE_ID}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(methods, "N_TARGET_TRANSITIONS", 150)
+        for name, domain in list(DOMAINS.items()):
+            settings = {key: replace(setting, max_episode_steps=SHORT) for key, setting in domain.settings.items()}
+            changed = replace(domain, settings=settings, learn_source=recorded_from(sources[name]))
+            patch.setitem(DOMAINS, name, changed)
+        yield DOMAINS
+
+
+@pytest.fixture(scope="module")
+def sources(short, tmp_path_factory):
+    """What the methods transfer, by domain."""
+    folder = tmp_path_factory.mktemp("sources")
+    return {name: methods.prepare_sources(domain, folder, quiet()) for name, domain in short.items()}

@@ -1,21 +1,25 @@
 """Tables 2 and 4 of made-up results, counted by hand; the tests of dependence against SciPy, and on planted dependence."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from helpers.paper_results import made_up
 from scipy import stats
 
+from sb3_combrel.comparison.tables import p_text
 from sb3_combrel.experiments.paper.selections import (
+    ACTION,
     FEWEST,
+    MAPPING,
     N_SHOWN,
     THINNED,
-    Selection,
     action_mapping_table,
     dependence_table,
     joint_action_table,
+    selections_of,
     state_mapping_table,
+    thin,
 )
-from sb3_combrel.experiments.paper.verdicts import p_text
 
 ACTIONS = ("Neutral", "West", "East")
 NOTHING = [made_up("mountain_car", "COMBREL", seed, [5, 5]) for seed in range(2)]
@@ -79,50 +83,46 @@ class TestTables:
         ]
         assert joint_action_table(NOTHING, ACTIONS).rows == [("selections", "0", "0", "0")]
         assert state_mapping_table(NOTHING).rows == []
-        table = dependence_table(Selection.of_results(NOTHING), ("x", "vx"))
+        table = dependence_table(selections_of(NOTHING, ("x", "vx")))
         assert [row[0] for row in table.rows] == [
             "x (Kruskal & Wallis)",
             "vx (Kruskal & Wallis)",
             "target action (chi-square)",
         ]
         assert {cell for row in table.rows for cell in row[1:]} == {"-"}
-        assert dependence_table(Selection.of_results([]), ("x", "vx")).rows == table.rows
+        assert dependence_table(selections_of([], ("x", "vx"))).rows == table.rows
 
 
-class TestSelection:
-    def test_it_has_states_actions_and_mappings_of_all_runs(self):
+class TestSelections:
+    def test_they_have_states_actions_and_mappings_of_all_runs(self):
         uses = [["West", "Left", "x<-x", "Neutral, Left", 2], ["East", "Right", "x<-x", "", 1]]
         results = [
             made_up("mountain_car", "COMBREL", 0, [3], uses=uses, selections=[[0, 1.0, 2.0], [1, 3.0, 4.0], [0, 5.0, 6.0]]),
             made_up("mountain_car", "COMBREL", 1, [3], uses=uses[::-1], selections=[[0, 7.0, 8.0]]),
         ]
-        selection = Selection.of_results(results)
-        np.testing.assert_array_equal(selection.state, [[1, 2], [3, 4], [5, 6], [7, 8]])
-        assert selection.action.tolist() == ["West", "East", "West", "East"]
-        assert selection.mapping.tolist() == ["Neutral, Left", "Right", "Neutral, Left", "Right"]
+        found = selections_of(results, ("x", "vx"))
+        np.testing.assert_array_equal(found[["x", "vx"]], [[1, 2], [3, 4], [5, 6], [7, 8]])
+        assert found[ACTION].tolist() == ["West", "East", "West", "East"]
+        assert found[MAPPING].tolist() == ["Neutral, Left", "Right", "Neutral, Left", "Right"]
 
     def test_thinned_selections_are_of_all_actions_and_of_different_steps(self):
-        n_steps, n_actions = 500, 5
-        step = np.repeat(np.arange(n_steps), n_actions)
-        action = np.tile(np.array(list("abcde")), n_steps)
-        thinned = Selection(step[:, None].astype(float), action, action).thinned(THINNED)
-        assert len(thinned.action) == n_steps * n_actions / THINNED
-        assert dict(zip(*np.unique(thinned.action, return_counts=True), strict=True)) == dict.fromkeys(
-            "abcde", n_steps // THINNED
-        )
-        assert np.diff(thinned.state[:, 0]).min() == 5
-        for name in "abcde":
-            assert set(np.diff(thinned.state[thinned.action == name, 0])) == {THINNED}
+        n_steps, actions = 500, list("abcde")
+        step = np.repeat(np.arange(n_steps), len(actions))
+        thinned = thin(pd.DataFrame({"step": step, ACTION: np.tile(actions, n_steps), MAPPING: "any"}), THINNED)
+        assert thinned[ACTION].value_counts().to_dict() == dict.fromkeys(actions, n_steps // THINNED)
+        assert np.diff(thinned["step"]).min() == 5
+        for _, steps in thinned.groupby(ACTION)["step"]:
+            assert set(np.diff(steps)) == {THINNED}
 
 
 def selection_of(rng, n, mapping, action=None):
     """Selections at states of two variables, drawn at random."""
     action = rng.choice(["West", "East"], size=n) if action is None else action
-    return Selection(rng.normal(size=(n, 2)), action, np.asarray(mapping))
+    return pd.DataFrame(rng.normal(size=(n, 2)), columns=["x", "vx"]).assign(**{ACTION: action, MAPPING: mapping})
 
 
-def cells_of(selection):
-    return {row[0].split(" (")[0]: row[1:] for row in dependence_table(selection, ("x", "vx")).rows}
+def cells_of(selections):
+    return {row[0].split(" (")[0]: row[1:] for row in dependence_table(selections).rows}
 
 
 class TestDependence:
@@ -131,15 +131,16 @@ class TestDependence:
         n = 60
         mapping = rng.choice(["one", "two", "three"], size=n, p=[0.5, 0.3, 0.2])
         selection = selection_of(rng, n, mapping)
-        selection.state[:, 0] += 1.5 * (mapping == "one")
+        selection["x"] += 1.5 * (mapping == "one")
         cells = cells_of(selection)
-        for k, name in enumerate(("x", "vx")):
-            groups = [selection.state[mapping == each, k] for each in ("one", "two", "three")]
+        for name in ("x", "vx"):
+            groups = [selection[name][mapping == each] for each in ("one", "two", "three")]
             test = stats.kruskal(*groups)
             epsilon_squared = test.statistic / ((n**2 - 1) / (n + 1))
             assert cells[name][:3] == (f"{test.statistic:,.0f}", f"{epsilon_squared:.2f}", p_text(test.pvalue))
         table = [
-            [np.sum((selection.action == a) & (mapping == each)) for each in ("one", "two", "three")] for a in ("West", "East")
+            [np.sum((selection[ACTION] == a) & (mapping == each)) for each in ("one", "two", "three")]
+            for a in ("West", "East")
         ]
         test = stats.chi2_contingency(np.array(table))
         cramers_v = np.sqrt(test.statistic / n)
@@ -147,8 +148,8 @@ class TestDependence:
 
     def test_a_dependence_on_one_variable_is_found_and_none_on_the_other(self):
         rng = np.random.default_rng(1)
-        selection = selection_of(rng, 3000, np.zeros(3000))
-        selection = selection._replace(mapping=np.where(selection.state[:, 0] + 0.3 * rng.normal(size=3000) > 0, "one", "two"))
+        selection = selection_of(rng, 3000, "")
+        selection[MAPPING] = np.where(selection["x"] + 0.3 * rng.normal(size=3000) > 0, "one", "two")
         cells = cells_of(selection)
         assert float(cells["x"][1]) > 0.5 and float(cells["x"][2]) < 1e-10
         assert float(cells["x"][4]) > 0.5 and float(cells["x"][5]) < 1e-10
@@ -167,16 +168,16 @@ class TestDependence:
     def test_rates_of_false_findings_are_those_of_the_level(self):
         rng = np.random.default_rng(3)
         found = []
-        for _ in range(200):
+        for _ in range(60):
             cells = cells_of(selection_of(rng, 1250, rng.choice(["one", "two", "three"], size=1250)))
             found.append([float(cells[name][k]) < 0.05 for name in ("x", "vx", "target action") for k in (2, 5)])
-        assert np.all(np.mean(found, axis=0) < 0.1)
+        assert np.all(np.mean(found, axis=0) < 0.15)
 
     def test_the_thinned_test_sees_several_actions_where_every_step_has_one_selection_of_each(self):
         rng = np.random.default_rng(4)
         action = np.tile(np.array(list("abcde")), 400)
         mapping = np.where(np.isin(action, ["a", "b"]), "one", "two")
-        selection = Selection(rng.normal(size=(2000, 2)), action, mapping)
+        selection = selection_of(rng, 2000, mapping, action)
         assert float(cells_of(selection)["target action"][5]) < 1e-6
 
     def test_rare_mappings_have_no_say(self):
@@ -196,5 +197,5 @@ class TestDependence:
     def test_a_variable_that_never_changes_is_not_tested(self):
         rng = np.random.default_rng(6)
         selection = selection_of(rng, 100, rng.choice(["one", "two"], size=100))
-        selection.state[:, 1] = 0.5
+        selection["vx"] = 0.5
         assert cells_of(selection)["vx"] == ("-",) * 6

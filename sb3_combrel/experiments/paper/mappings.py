@@ -1,6 +1,10 @@
-"""The mappings that predict best: a control that no learner could have, as it needs the target's transitions beforehand."""
+"""Mappings that TIMBREL is given: the one that COMBREL used most, and those that predict best."""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,17 +16,48 @@ BREADTH = 0.1
 _CHUNK = 500
 
 
+def most_frequent_mapping(
+    uses: Iterable[Sequence[Any]], source_names: Sequence[Sequence[str]], target_names: Sequence[Sequence[str]]
+) -> InterTaskMapping:
+    """
+    Find the state mapping used most, with the source action to which each target action was mapped most often with it.
+
+    :param uses: of all runs, at least one: target action, source action, state mapping as text (``target<-source, ...``),
+        action mapping, number of times
+    :param source_names: of the source's state variables, and of its actions
+    :param target_names: likewise
+    """
+    states: Counter[str] = Counter()
+    # (target action, source action, state mapping); and with any state mapping.
+    times: Counter[tuple[str, ...]] = Counter()
+    for target_action, source_action, state_mapping, _, n in uses:
+        states[state_mapping] += n
+        times[target_action, source_action, state_mapping] += n
+        times[target_action, source_action] += n
+    ((variables, _),) = states.most_common(1)
+    (source_variables, source_actions), (target_variables, target_actions) = source_names, target_names
+    action = []
+    for target in target_actions:
+        with_these = [times[target, source, variables] for source in source_actions]
+        # Never used with this state mapping: counted over all state mappings.
+        counts = with_these if any(with_these) else [times[target, source] for source in source_actions]
+        action.append(int(np.argmax(counts)))
+    pairs = dict(pair.split("<-", 1) for pair in variables.split(", "))
+    state = [source_variables.index(pairs[name].strip("()-")) if name in pairs else None for name in target_variables]
+    sign = [-1 if pairs.get(name, "").startswith("(-") else 1 for name in target_variables]
+    return InterTaskMapping(state=tuple(state), action=tuple(action), sign=tuple(sign))
+
+
 def best_mappings(source: SourceInstances, target: SourceInstances, mappings: MappingSet) -> list[InterTaskMapping]:
     """
     Find for each target action the mapping of a set through which the source predicts the target's effects best.
+
+    A control that no learner could have: it needs the target's transitions beforehand.
 
     Predicted is the kernel average of the translated effects, breadth :data:`BREADTH`; a variable that is not mapped keeps its
     value. The error is the mean over transitions and variables of the squared error in parts of the variable's mean squared
     effect, so that a variable counts as much as another.
 
-    :param source: instances of the source task
-    :param target: transitions of the target task
-    :param mappings: the set
     :return: one mapping for each target action; where the source predicts equally well through several, the first
     """
     found = []
