@@ -161,8 +161,8 @@ def test_periodic_variables_are_taken():
     after = np.column_stack([(states[:, 0] + 0.05 * (2.0 * speed - 1.0)) % 1.0, speed])
     raw = [low + (high - low) * each for each in (states, after)]
     source = SourceInstances(raw[0], actions, -np.ones(300), raw[1], np.zeros(300, bool), low, high, 2, periodic=(True, False))
-    transfer = SoftHomomorphism(source, n_starts=1)
-    model = FittedRMax(env, transfer=transfer, periodic=[True, False], resolution=4, seed=0).learn(120)
+    method = SoftHomomorphism(source, n_starts=1)
+    model = FittedRMax(env, transfer=method, periodic=[True, False], resolution=4, seed=0).learn(120)
     assert model.policy.transfer.statistics()["transfer/prediction_error"] < 0.2
 
 

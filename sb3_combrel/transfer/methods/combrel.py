@@ -33,9 +33,8 @@ class COMBREL(MappingTransfer):
     missing. Because compliance with transitions of that action depends only on the state mapping and on the one source
     action that the target action maps to, any number of action mappings costs nothing.
 
-    That is one reading of the paper: compliance is computed "only to the target task instances that apply action a"
-    (Section 5.1). Its Table 2 contradicts it, where two mappings with the same source action for an action have different
-    shares. ``neighbors="state_action"`` is the other reading.
+    That is one reading of the paper (Section 5.1). Its Table 2 contradicts it, where two mappings with the same source action
+    for an action have different shares: ``neighbors="state_action"`` is the other reading.
 
     With ``use="prior"`` compliance is that of the predictions of the source's model with the target's transitions, and one
     mapping is chosen for all states, or with sets that are not factored one for each target action: after 10 transitions, and
@@ -61,11 +60,9 @@ class COMBREL(MappingTransfer):
         nearest whatever their action, each judged by the source action that the mapping has for *its* action. So whole
         mappings differ; they must be at most 20,000
     :param choice: "best": the mapping with the highest mean compliance is selected, as in the paper; or "drawn": one is
-        drawn, each with a probability in proportion to its mean compliance. Where many mappings comply about equally
-        well none of them then determines all predictions alone
-    :param neighbor_radius: how far, in unit coordinates, a target transition may be and still count as a neighbour. Without
-        any nothing is transferred: regions without transitions stay optimistic, and in the others not every action has to
-        be tried. None: the nearest count however far they are, as in the paper
+        drawn, each with a probability in proportion to its mean compliance
+    :param neighbor_radius: how far, in unit coordinates, a target transition may be and still count as a neighbour; without
+        any nothing is transferred. None: the nearest count however far they are, as in the paper
     :param measured: which transitions are recorded: "online": those of all episodes, used from the first step on; or
         "first_episode": those of the first episode, used after its end, as in the paper
     :param max_transitions: target transitions that are recorded, at most
@@ -74,9 +71,8 @@ class COMBREL(MappingTransfer):
         wrongly, but none of small random effects: these ``breadth_decay`` ends. 0: any mapping that has evidence may transfer,
         as in the paper
     :param min_evidence: a mapping's compliance with a transition counts as 0 where the start kernels of its instances (Eq. 2,
-        before they are normalized) add up to less: with weights that are normalized, a mapping whose instances are all far
-        away could look as good as one with near ones. 0.1 is one instance at 1.5 times the square root of the bandwidth.
-        0: every mapping counts, as in the paper
+        before they are normalized) add up to less: all are far away. 0.1 is one instance at 1.5 times the square root of the
+        bandwidth. 0: every mapping counts, as in the paper
     :param use: as there; of the arguments after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and
         ``source_breadth`` have a meaning for a prior. None: "prior" with factored ``mappings``; "instances" with others, and
         where an argument that has a meaning for instances only differs from its default; else "prior" where the target's model

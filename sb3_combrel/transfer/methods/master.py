@@ -40,8 +40,7 @@ class MASTER(MappingTransfer):
     What differs from the paper:
 
     - The paper fits a model to the few transitions of the target and tests it on the many of the source. Here the model is
-      the source's, a local linear one (:class:`~sb3_combrel.transfer.source_model.SourceModel`), and is tested on the
-      target's transitions: it has more data, and predicts in the same way as ``use="prior"`` does.
+      the source's (:class:`~sb3_combrel.transfer.source_model.SourceModel`), and is tested on the target's transitions.
     - The paper's mappings give every target variable a source variable, as ``mappings="surjective"`` does. By default the
       variables that a mapping leaves out stay as they are, as in COMBREL.
     - The learner is Fitted R-Max, and what is transferred is what TIMBREL transfers through a mapping that is given.
@@ -168,7 +167,6 @@ def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySum
     Choose the mapping with the least mean squared error of the predicted effects, of all sources.
 
     :param copies: the state mappings of all sets, one below the other
-    :param sets: the mappings to each source
     :param sums: over the target's transitions
     """
     errors, first, found = squared_errors(copies, sums), 0, []

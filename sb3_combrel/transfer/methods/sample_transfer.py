@@ -41,8 +41,8 @@ class SampleTransfer(MappingTransfer):
       equally likely beforehand, and all mappings to one source. There are thousands, whose compliances are never listed: those
       of all tasks with the same state mapping and source action for a target action are added up.
     - Instances are drawn for each target action, the same number for all, without replacement.
-    - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice: the
-      nearest first, until the threshold is reached, as in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
+    - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice, as
+      in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
     - The paper draws once, after a batch of transitions of the target. Here instances are drawn after ``min_transitions``, and
       again whenever there are 1.2 times as many, with the same random numbers, so that more of those drawn stay. With
       ``min_transitions`` and ``max_transitions`` equal they are drawn once.
@@ -234,8 +234,8 @@ def draw_instances(
     """
     Draw translated instances for each target action, without replacement.
 
-    Each time one is drawn, a candidate is drawn in proportion to its compliance, and of it an instance in proportion to its
-    relevance, of those that are left. Drawn as the n largest of log-probabilities with Gumbel noise, which is the same.
+    Each time, a candidate is drawn in proportion to its compliance, and of it an instance in proportion to its relevance, of
+    those that are left: the n largest of log-probabilities with Gumbel noise, which is the same.
 
     :param compliances: of each candidate, shape (n_candidates,)
     :param relevances: of each candidate's instances, shape (n_candidates, most instances of an action)

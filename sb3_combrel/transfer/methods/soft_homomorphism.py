@@ -33,8 +33,7 @@ class SoftHomomorphism(Transfer):
     The source's model, seen through a stochastic mapping of states that is fitted to the target, is the prior of its model.
 
     Paper: Sorg & Singh, "Transfer via soft homomorphisms" (AAMAS 2009). A soft homomorphism maps a target state to a
-    distribution over source states, such that the expected model of the source is that of the target; it is found online by
-    fitting its parameters to the target's transitions.
+    distribution over source states, such that the expected model of the source is that of the target.
 
     Here the mapping is a mixture of deterministic ones: every source variable reads one target variable, as it is or mirrored,
     no two the same; the parameters are logits of what each variable reads, and of the source action for each target
@@ -202,7 +201,7 @@ class SoftHomomorphism(Transfer):
     def _judge(self, predicted: soft.Predicted) -> None:
         """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
         assert self.task is not None
-        effects, actions = self._transitions.effects[: self._transitions.n], self._transitions.actions[: self._transitions.n]
+        effects, actions = (column[: self._transitions.n] for column in (self._transitions.effects, self._transitions.actions))
         effect, _, _, weight = predicted
         taken = np.arange(self.task.n_actions)[:, None] == actions
         size = (taken @ np.abs(effects) / np.maximum(taken.sum(axis=1), 1)[:, None]).max(axis=0)

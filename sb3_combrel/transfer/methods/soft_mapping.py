@@ -116,11 +116,9 @@ def _log_probabilities(state: th.Tensor, action: th.Tensor, number: np.ndarray) 
 
 class FitData(NamedTuple):
     """
-    Target transitions, and what every deterministic mapping predicts of them.
+    Target transitions, actions and effects, and what every deterministic mapping predicts of them.
 
     :param predicted: float64, shape (n, n_mappings, n_source_actions, n_target_variables): effects, target coordinates
-    :param action: int64, shape (n,)
-    :param effect: float64, shape (n, n_target_variables)
     :param scale: float64, shape (n_target_variables,), above 0: errors are measured in it
     """
 
@@ -181,8 +179,7 @@ class Terms(NamedTuple):
     The most probable parts of the mixture, listed by target action and copy.
 
     :param first: int64, shape (n_target_actions + 1,): those of action a are ``first[a]`` to ``first[a + 1]``
-    :param copy: int64, shape (n_terms,)
-    :param mapping: int64, same shape: row of :class:`Readings`; ``action``: the same, source action
+    :param copy: int64, shape (n_terms,); ``mapping`` (row of :class:`Readings`) and source ``action``: the same
     :param share: float64, same shape: probability; those of a copy under an action add up to 1
     """
 
@@ -242,13 +239,7 @@ class MixturePredictions:
         self.n_copies = 1 + int(terms.copy.max())
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
-        """
-        Predict pairs of the target.
-
-        :param states: unit coordinates, shape (n, n_target_variables)
-        :param actions: int64, shape (n,)
-        :return: effects, shape (n, n_target_variables); rewards, probabilities of termination, and weights, shape (n,)
-        """
+        """Return effects, shape (n, n_target_variables); rewards, probabilities of termination, and weights, shape (n,)."""
         n, d = states.shape
         if n == len(self.sample) and n > 1 and (actions == actions[0]).all() and np.array_equal(states, self.sample):
             return self._predict_sample(int(actions[0]))
