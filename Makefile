@@ -69,8 +69,7 @@ tutorials: $(VENV)/.installed-all gl
 
 # Takes what was reproduced, and the results of the benchmark, into README.md and docs/.
 results:
-	$(BIN)/python -m sb3_combrel.experiments.paper.page
-	$(BIN)/python -m sb3_combrel.experiments.benchmark.page
+	$(BIN)/python -m sb3_combrel.experiments.pages
 
 # A later call goes on with what is there. ICUB_ARGS="--runs 3 --episodes 100", for instance.
 icub: $(VENV)/.installed-demo

@@ -14,10 +14,8 @@ from imageio.v3 import imread
 
 from sb3_combrel.experiments import carrying_out
 from sb3_combrel.experiments.benchmark.methods import METHODS
-from sb3_combrel.experiments.benchmark.page import main as take_into_docs
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
-from sb3_combrel.experiments.pages import include
 from sb3_combrel.experiments.result_files import RESULTS, TIMES
 
 FAILING = '''
@@ -143,21 +141,6 @@ class TestThePage:
         assert performance["oracle"] > performance["none"]
         assert rows["oracle"]["jumpstart"].startswith("+") and rows["oracle"]["transfer ratio"].startswith("+")
         assert float(rows["oracle"]["rank"]) < float(rows["none"]["rank"])
-
-    def test_results_are_taken_into_the_documentation(self, made, tmp_path):
-        page = tmp_path / "benchmark.md"
-        page.write_text("before\n<!-- results: results/b/benchmark.md -->\nformer\n<!-- end of results -->\nafter\n")
-        for _ in range(2):
-            take_into_docs(made[0], tmp_path / "results" / "b", page)
-            text = page.read_text()
-            assert text.startswith("before\n") and text.endswith("<!-- end of results -->\nafter\n") and "former" not in text
-            assert "![two-walks](results/b/two-walks.png)" in text
-            copied = {path.name for path in (tmp_path / "results" / "b").iterdir()}
-            assert {"benchmark.md", "two-walks.png", "two-walks.csv"} <= copied
-            # The page has it.
-            assert "two-walks.md" not in copied
-        assert include(page) == 1
-        assert not (tmp_path / "results" / "b" / RESULTS).exists()
 
     def test_the_documentation_has_a_place_for_results(self, tmp_path):
         text = (PAGE.parent / "benchmark.md").read_text()
