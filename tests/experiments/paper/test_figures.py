@@ -38,25 +38,18 @@ def steps(n_runs, n_episodes):
 @pytest.mark.parametrize(("n_runs", "n_episodes", "domain"), [(1, 1, ICUB), (4, 40, MOUNTAIN_CAR)])
 def test_few_and_many_runs_and_episodes(draw, n_runs, n_episodes, domain, tmp_path):
     panels = {"methods": steps(n_runs, n_episodes), "controls": steps(n_runs, n_episodes)}
-    for folder in ("one", "two"):
-        draw(panels, domain, "some title", tmp_path / folder / "fig")
-    drawing = check_figure(tmp_path / "one", "fig", "some title", "controls", "oracle mapping")
+    files = draw(panels, domain, "some title", tmp_path / "made" / "fig")
+    drawing = check_figure(tmp_path / "made", "fig", "some title", "controls", "oracle mapping")
     assert f"({n_runs} runs)" in drawing or draw is draw_times
-    for name in ("fig.png", "fig.svg"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    if n_runs > 1:
+        before = [file.read_bytes() for file in files]
+        assert [file.read_bytes() for file in draw(panels, domain, "some title", tmp_path / "fig")] == before
 
 
 @pytest.mark.parametrize("draw", [draw_curves, draw_times])
 def test_steps_that_never_change_and_thresholds_never_reached(draw, tmp_path):
     draw({"methods": {m.NO_TRANSFER: np.full((3, 20), 4000)}}, MOUNTAIN_CAR, "title", tmp_path / "fig")
     assert ("no threshold was reached" in check_figure(tmp_path, "fig")) == (draw is draw_times)
-
-
-def test_thresholds_that_some_runs_reach(tmp_path):
-    some = np.array([[900] * 8 + [240] * 8, [900] * 16, [900] * 8 + [350] * 8])
-    panels = {"methods": {m.NO_TRANSFER: some, m.COMBREL_PLAIN: np.full((3, 16), 200)}, "controls": {m.ORACLE: some + 900}}
-    draw_times(panels, MOUNTAIN_CAR, "title", tmp_path / "fig")
-    assert "no threshold was reached" not in check_figure(tmp_path, "fig")
 
 
 def test_a_method_that_never_reaches_a_threshold_has_no_point_there(tmp_path):
