@@ -7,15 +7,12 @@ import shutil
 from pathlib import Path
 
 from sb3_combrel.common.files import write_whole
-from sb3_combrel.experiments.benchmark.command import OUTPUT as BENCHMARK
 from sb3_combrel.experiments.paper.domains import SETTINGS
-from sb3_combrel.experiments.paper.reproduce import OUTPUT as REPRODUCTION
 
-#: What is copied of a folder of results, by the folder. Runs, sources and SVG figures stay where they are.
-COPIED = {Path(REPRODUCTION) / setting: ("*.md", "*.csv", "*.png") for setting in SETTINGS} | {
-    # Its page has the tables of the other Markdown files.
-    Path(BENCHMARK): ("benchmark.md", "*.csv", "*.png")
-}
+#: What is copied of the folders that ``reproduce`` and ``benchmark`` write. Runs, sources and SVG figures stay where they are,
+#: and the benchmark's other Markdown files: its page has their tables.
+COPIED = {Path("reproduction") / setting: ("*.md", "*.csv", "*.png") for setting in SETTINGS}
+COPIED[Path("benchmark")] = ("benchmark.md", "*.csv", "*.png")
 DOCS = Path("docs/results")
 #: Pages with marks.
 PAGES = (Path("docs/results.md"), Path("docs/benchmark.md"))

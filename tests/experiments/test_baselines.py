@@ -9,57 +9,57 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from sb3_combrel.experiments.runs import make_task
 from stable_baselines3 import DQN
 
 from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.experiments import baselines, icub_arm, mountain_car
+from sb3_combrel.experiments.paper import baselines
 from sb3_combrel.experiments.paper.baselines import (
     ALGORITHMS,
     HYPERPARAMETERS,
+    OF_SOURCE,
     OWN,
     PLAIN,
     PREFILLED,
     QUANTILE,
     BaselineJob,
-    Evaluations,
     GreedyEvaluator,
+    always_reached_from,
     evaluation_steps,
     fill,
-    learn,
-    make_env,
     make_model,
     prefill,
     translate,
 )
+from sb3_combrel.experiments.tasks import icub_arm, mountain_car
+from sb3_combrel.runs.job import make_env
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import TargetTask
 
 CAR, ARM = mountain_car.TARGET_ID, icub_arm.TARGET_ID
 CONFIGURATIONS = Path(__file__).resolve().parents[2] / "zoo_configs"
 # Long enough for some updates of the network, which begin after 1000 steps.
-SHORT = BaselineJob(PLAIN, CAR, seed=3, total_timesteps=1200, max_episode_steps=50)
+SHORT = BaselineJob(group="car", method=PLAIN, env=CAR, seed=3, n_steps=1200, max_episode_steps=50)
 
 
 @pytest.fixture(scope="module")
 def source():
-    make_task(mountain_car.SOURCE_ID).close()
+    make_env(mountain_car.SOURCE_ID).close()
     return SourceInstances.from_q_learning(mountain_car.SOURCE_ID, n_instances=300, seed=0, total_timesteps=3000)
 
 
 @pytest.fixture(scope="module")
 def prefilled_job(source):
-    return BaselineJob(PREFILLED, CAR, seed=1, total_timesteps=400, max_episode_steps=50, source=source)
+    return replace(SHORT, method=PREFILLED, seed=1, n_steps=400, source=source)
 
 
-def learnt_models(job, monkeypatch):
+def learnt(job, monkeypatch):
     """The result of a job, and the model after it."""
     made = []
     with monkeypatch.context() as patch:
         patch.setattr(baselines, "make_model", lambda *given: made.append(make_model(*given)) or made[-1])
-        result = learn(job)
-    return result, made[0]
+        result = job.carry_out()
+    return replace(result, seconds=0.0), made[0]
 
 
 def same(first, second):
@@ -83,11 +83,9 @@ def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     first_rate = float(settings.pop("learning_rate").removeprefix("lin_"))
     network = eval(settings.pop("policy_kwargs"))
     # Nothing of the file is left out, and nothing is added.
-    ours = dict(HYPERPARAMETERS[env_id])
-    assert ours.pop("learning_rate") == first_rate
-    assert ours == settings
-    job = BaselineJob(name, env_id, 0, 100, 50)
-    env = make_env(job)
+    assert HYPERPARAMETERS[env_id] == {**settings, "learning_rate": first_rate}
+    job = replace(SHORT, method=name, env=env_id)
+    env = job.make_env()
     assert np.all(env.observation_space.low == -1.0) and np.all(env.observation_space.high == 1.0)
     model = make_model(job, env)
     frequency = settings.pop("train_freq")
@@ -102,46 +100,39 @@ def test_hyperparameters_are_those_of_the_zoo(name, env_id):
 def test_the_same_job_has_the_same_result(algorithm, source, monkeypatch):
     if algorithm == QUANTILE:
         pytest.importorskip("sb3_contrib")
-    job = replace(SHORT, algorithm=algorithm, source=source if algorithm in (PREFILLED, OWN) else None)
-    first, model = learnt_models(job, monkeypatch)
+    job = replace(SHORT, method=algorithm, source=source if algorithm in OF_SOURCE else None)
+    first, model = learnt(job, monkeypatch)
     np.random.seed(7)
-    again, other = learnt_models(pickle.loads(pickle.dumps(job)), monkeypatch)
-    assert same(first.episodes, again.episodes) and same(first.evaluations, again.evaluations)
+    again, other = learnt(pickle.loads(pickle.dumps(job)), monkeypatch)
+    assert first == again and sum(first.steps) <= first.n_steps == 1200
     # Most episodes are cut off, so what they have in common says little; the networks say more.
     assert same(weights_of(model), weights_of(other))
     assert np.array_equal(model.replay_buffer.observations, other.replay_buffer.observations)
-    _, of_other_seed = learnt_models(replace(job, seed=4), monkeypatch)
-    assert not same(weights_of(model), weights_of(of_other_seed))
-    assert not np.array_equal(model.replay_buffer.observations, of_other_seed.replay_buffer.observations)
+    with job.make_env() as env:
+        assert not same(weights_of(model), weights_of(make_model(job, env)))
 
 
-def test_the_network_learns_and_evaluation_does_not_interfere(monkeypatch):
-    result, model = learnt_models(SHORT, monkeypatch)
-    with make_env(SHORT) as env:
-        assert not same(weights_of(model), weights_of(make_model(SHORT, env)))
-    assert len(result.evaluations.steps) == 10
+def test_evaluation_does_not_interfere(monkeypatch):
+    result, model = learnt(SHORT, monkeypatch)
+    assert len(result.more["evaluations"]) == 10
     monkeypatch.setattr(baselines, "evaluation_steps", lambda total: [])
-    without, other = learnt_models(SHORT, monkeypatch)
-    assert same(weights_of(model), weights_of(other)) and same(result.episodes, without.episodes)
-    assert len(without.evaluations.steps) == 0
+    without, other = learnt(SHORT, monkeypatch)
+    assert same(weights_of(model), weights_of(other)) and result.steps == without.steps
+    assert without.more["evaluations"] == []
 
 
 def test_episodes_are_those_of_the_task():
-    result = learn(BaselineJob(PLAIN, ARM, 0, 130, 30))
-    assert result.episodes.steps.tolist() == [30] * 4 and result.prefilled is None
-    assert result.episodes.returns.tolist() == [-30.0] * 4 and not result.episodes.terminated.any()
-    assert result.evaluations.steps[-1] == 130 and result.evaluations.returns[-1] == -30.0
+    result = replace(SHORT, env=ARM, n_steps=130, max_episode_steps=30).carry_out()
+    assert (result.steps, result.returns, result.terminated) == ([30] * 4, [-30.0] * 4, [False] * 4)
+    assert result.more["evaluations"][-1] == [130, -30.0, 0.0]
 
 
-def test_steps_of_prefilling_count(prefilled_job):
-    result = learn(prefilled_job)
-    episodes, _ = prefill(prefilled_job)
-    n_first = len(episodes.steps)
-    assert n_first == baselines.PREFILLINGS[CAR].n_episodes
-    assert same((column[:n_first] for column in result.episodes), episodes)
-    n_before = episodes.steps.sum()
-    assert result.episodes.steps.sum() == 400
-    assert result.evaluations.steps.tolist() == [steps for steps in evaluation_steps(400) if steps > n_before]
+def test_settings_tell_hyperparameters_and_sources_apart(prefilled_job, monkeypatch):
+    before = prefilled_job.settings()
+    assert before == prefilled_job.settings()
+    assert replace(prefilled_job, source=prefilled_job.source.subset(200, seed=0)).settings()["source"] != before["source"]
+    monkeypatch.setitem(HYPERPARAMETERS, CAR, {**HYPERPARAMETERS[CAR], "gamma": 0.5})
+    assert prefilled_job.settings() != before
 
 
 def target_task(low, high, threshold=0.5):
@@ -211,7 +202,7 @@ def test_what_is_translated_stays_within_the_bounds():
 
 def test_combrels_translations_are_source_instances_seen_through_some_mapping(prefilled_job, source):
     _, found = prefill(prefilled_job)
-    own = prefill(replace(prefilled_job, algorithm=OWN))[1]
+    own = prefill(replace(prefilled_job, method=OWN))[1]
     assert len(found.states) > len(own.states) / 2
     assert {tuple(state) for state in found.states} <= {tuple(state) for state in own.states}
     scaling = StateScaling(found.low, found.high)
@@ -230,9 +221,9 @@ def test_combrels_translations_are_source_instances_seen_through_some_mapping(pr
 
 
 def test_the_control_is_what_really_happened(prefilled_job):
-    episodes, own = prefill(replace(prefilled_job, algorithm=OWN))
+    episodes, own = prefill(replace(prefilled_job, method=OWN))
     assert len(own.states) == episodes.steps.sum()
-    with make_task(CAR) as env:
+    with make_env(CAR) as env:
         for start, action, end, reward in zip(own.states[:40], own.actions, own.next_states, own.rewards, strict=False):
             env.reset(options={"state": start})
             state, now, *_ = env.step(int(action))
@@ -240,36 +231,36 @@ def test_the_control_is_what_really_happened(prefilled_job):
             assert now == reward
 
 
-@pytest.mark.parametrize("algorithm", (PREFILLED, OWN))
-def test_the_buffer_holds_them_before_learning(algorithm, prefilled_job, monkeypatch):
-    job = replace(prefilled_job, algorithm=algorithm)
+@pytest.mark.parametrize("algorithm", OF_SOURCE)
+def test_the_buffer_holds_them_before_learning_and_their_steps_count(algorithm, prefilled_job, monkeypatch):
+    job = replace(prefilled_job, method=algorithm)
     seen = {}
+    learn = DQN.learn
 
     def watched(model, *arguments, **others):
         buffer = model.replay_buffer
         seen.update(size=buffer.size(), starts=buffer.observations[: buffer.size(), 0].copy())
-        return DQN_LEARN(model, *arguments, **others)
+        return learn(model, *arguments, **others)
 
-    DQN_LEARN = DQN.learn
     monkeypatch.setattr(DQN, "learn", watched)
-    result = learn(job)
-    found = prefill(job)[1]
-    assert same(result.prefilled[:5], found[:5])
+    result = job.carry_out()
+    episodes, found = prefill(job)
     assert seen["size"] == len(found.states) > 0
-    scaled = 2.0 * (found.states - found.low) / (found.high - found.low) - 1.0
-    np.testing.assert_allclose(seen["starts"], scaled, atol=1e-6)
+    np.testing.assert_allclose(seen["starts"], 2.0 * (found.states - found.low) / (found.high - found.low) - 1.0, atol=1e-6)
+    assert result.steps[:2] == episodes.steps.tolist() and result.returns[:2] == episodes.returns.tolist()
+    assert sum(result.steps) == result.n_steps == 400
+    assert [row[0] for row in result.more["evaluations"]] == [n for n in evaluation_steps(400) if n > episodes.steps.sum()]
 
 
 def test_each_is_learnt_from_on_its_own():
     """Returns over five steps would otherwise add up rewards of transitions that have nothing to do with one another."""
-    job = replace(SHORT, total_timesteps=10)
     rng = np.random.default_rng(0)
-    with make_env(job) as env:
+    with SHORT.make_env() as env:
         low, high = env.unwrapped.observation_space.low, env.unwrapped.observation_space.high
         states, ends = (rng.uniform(low, high, (50, 4)) for _ in range(2))
         rewards, terminated = np.arange(50.0), rng.random(50) < 0.3
         given = Transitions(states, rng.integers(5, size=50), rewards, ends, terminated, low, high, 5, (), (), {})
-        model = make_model(job, env)
+        model = make_model(SHORT, env)
         fill(model.replay_buffer, given, env)
         batch = model.replay_buffer.sample(400)
     assert model.replay_buffer.size() == 50
@@ -298,10 +289,8 @@ def test_the_greedy_policy_is_what_is_evaluated():
                 returns[-1] += float(reward)
                 ended = terminated or truncated
     assert len(set(returns)) > 1
-    found = evaluator.evaluations
     # The first was before this learning.
-    assert found.steps.tolist() == [50, 70]
-    assert found.returns.tolist() == [np.mean(returns)] * 2 and found.reached.tolist() == [1.0, 1.0]
+    assert evaluator.evaluations == [[50, np.mean(returns), 1.0], [70, np.mean(returns), 1.0]]
 
 
 @pytest.mark.parametrize("total", (1, 7, 400, 300_000))
@@ -314,57 +303,24 @@ def test_evaluations_are_evenly_spaced_on_a_logarithmic_axis(total):
 
 
 @pytest.mark.parametrize(
-    "reached, expected",
-    (
-        ([1.0, 0.8, 1.0, 1.0], 40.0),
-        ([1.0, 1.0, 1.0, 1.0], 10.0),
-        ([0.0, 1.0, 1.0, 0.8], np.inf),
-        ([0.0, 0.0, 0.0, 1.0], 80.0),
-        ([], np.inf),
-    ),
+    ("reached", "expected"),
+    [((1.0, 0.8, 1.0, 1.0), 40), ((1.0, 1.0, 1.0, 1.0), 10), ((0.0, 1.0, 1.0, 0.8), np.inf), ((), np.inf)],
 )
 def test_steps_from_which_on_the_goal_is_always_reached(reached, expected):
-    steps = np.array([10, 20, 40, 80])[: len(reached)]
-    assert Evaluations(steps, -np.ones(len(steps)), np.array(reached)).always_reached_from() == expected
+    assert always_reached_from(list(zip((10, 20, 40, 80), (-1.0,) * 4, reached, strict=False))) == expected
 
 
-@pytest.mark.parametrize(
-    "wrong, message",
-    (
-        ({"algorithm": "SAC"}, "algorithm must be one of DQN, QR-DQN, .*got 'SAC'"),
-        ({"env_id": "CartPole-v1"}, f"env_id must be one of {CAR}, {ARM}, got 'CartPole-v1'"),
-        ({"seed": -1}, "seed must be .*got -1"),
-        ({"total_timesteps": 0}, "total_timesteps must be .*got 0"),
-        ({"max_episode_steps": 2.5}, "max_episode_steps must be .*got 2.5"),
-        ({"algorithm": PREFILLED}, "source must be SourceInstances with algorithm='DQN prefilled', got None"),
-    ),
-)
-def test_wrong_jobs_are_refused(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        replace(SHORT, **wrong)
+class TestBadInput:
+    @pytest.mark.parametrize("wrong", [{"method": "SAC"}, {"method": PREFILLED}, {"source": "any"}])
+    def test_unknown_algorithms_and_sources_that_are_missing_or_given_in_vain(self, wrong):
+        with pytest.raises(ValueError, match=r"method must be one of DQN, QR-DQN, .*, with a source for .* only, got"):
+            replace(SHORT, **wrong)
 
+    def test_prefilling_must_leave_steps(self, prefilled_job):
+        with pytest.raises(ValueError, match=r"n_steps must be more than the 100 steps .*got 60"):
+            replace(prefilled_job, n_steps=60).carry_out()
 
-def test_a_source_that_would_not_be_used_is_refused(source):
-    with pytest.raises(ValueError, match="source must be None with algorithm='DQN'"):
-        replace(SHORT, source=source)
-
-
-def test_prefilling_must_leave_steps(prefilled_job):
-    with pytest.raises(ValueError, match=r"total_timesteps must be more than the 100 steps .*got 60"):
-        learn(replace(prefilled_job, total_timesteps=60))
-
-
-def test_without_a_source_there_is_nothing_to_fill_in():
-    with pytest.raises(ValueError, match="algorithm must be one of DQN prefilled, DQN prefilled with own, got 'DQN'"):
-        prefill(SHORT)
-
-
-def test_there_is_no_source_for_other_tasks():
-    with pytest.raises(ValueError, match=r"env_id must be one of .*got 'CartPole-v1'"):
-        baselines.learn_source("CartPole-v1")
-
-
-def test_without_sb3_contrib_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
-    with pytest.raises(ImportError, match=r"pip install 'sb3-combrel\[experiments\]'"):
-        learn(replace(SHORT, algorithm=QUANTILE))
+    def test_without_sb3_contrib_the_extra_is_named(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+        with pytest.raises(ImportError, match=r"pip install 'sb3-combrel\[experiments\]'"):
+            replace(SHORT, method=QUANTILE).carry_out()

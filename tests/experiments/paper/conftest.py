@@ -9,27 +9,20 @@ import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.paper import methods
 from sb3_combrel.experiments.paper.domains import DOMAINS
-from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 
 #: Enough for COMBREL to select mappings in the second episode, too few to reach a goal.
 SHORT = 60
 
 
-def recorded_from(env_id):
-    """Instead of learning a source: random actions in it."""
-    return lambda seed: SourceInstances.record(None, env_id, 400, seed)
-
-
 @pytest.fixture(scope="module")
 def short():
-    """Both domains with episodes of few steps and sources of few instances."""
-    sources = {"mountain_car": mountain_car.SOURCE_ID, "icub": icub_arm.SOURCE_ID}
+    """Both domains with episodes of few steps; random actions in the sources instead of learning them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "N_TARGET_TRANSITIONS", 150)
+        for name in ("from_fitted_rmax", "from_q_learning"):
+            patch.setattr(SourceInstances, name, lambda env_id, *_, **__: SourceInstances.record(None, env_id, 400, 0))
         for name, domain in list(DOMAINS.items()):
             settings = {key: replace(setting, max_episode_steps=SHORT) for key, setting in domain.settings.items()}
-            changed = replace(domain, settings=settings, learn_source=recorded_from(sources[name]))
-            patch.setitem(DOMAINS, name, changed)
+            patch.setitem(DOMAINS, name, replace(domain, settings=settings))
         yield DOMAINS
 
 

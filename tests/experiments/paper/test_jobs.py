@@ -18,7 +18,8 @@ METHODS = [("mountain_car", m.COMBREL_WHOLE), ("icub", m.COMBREL_PLAIN)]
 
 def job_of(short, domain, method, sources):
     (job,) = jobs_of(short[domain], PAPER, [method], sources[domain], 1, N_EPISODES)
-    return replace(job, max_episode_steps=250)
+    # COMBREL chooses from many more mappings on the iCub, and its steps take longer.
+    return replace(job, max_episode_steps=60 if domain == "icub" else 250)
 
 
 class Replay(BaseCallback):
@@ -112,18 +113,11 @@ def test_the_selection_at_the_sample_is_that_of_the_transfer_method(run):
         assert result.more["at_sample"][names[action]][point] == expected
 
 
-def test_the_same_run_has_the_same_result(run):
-    job, result, *_ = run
-
-    def without_times(result):
-        return replace(result, seconds=0.0, more={**result.more, "first_episode_seconds": 0.0})
-
-    assert without_times(job.carry_out()) == without_times(result)
-
-
-def test_without_transfer_nothing_is_recorded(short, sources):
-    more = job_of(short, "mountain_car", m.NO_TRANSFER, sources).carry_out().more
-    assert more["uses"] == [] and not {"selections", "at_sample"} & set(more)
+def test_without_transfer_nothing_is_recorded_and_the_same_run_has_the_same_result(short, sources):
+    job = replace(job_of(short, "mountain_car", m.NO_TRANSFER, sources), n_episodes=1)
+    result, again = job.carry_out(), job.carry_out()
+    assert result.more["uses"] == [] and not {"selections", "at_sample"} & set(result.more)
+    assert (result.steps, result.returns, result.n_steps) == (again.steps, again.returns, again.n_steps)
 
 
 def test_the_jobs_of_the_diagnosis_differ_in_breadth_alone(short, sources):

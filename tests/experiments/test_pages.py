@@ -1,0 +1,59 @@
+"""Results are copied into the documentation, and tables and files filled in between their marks."""
+
+import pytest
+
+from sb3_combrel.experiments import pages
+from sb3_combrel.experiments.pages import fill_in, tables_in
+
+TABLES = "**First**\n\n| a | b |\n| --- | ---: |\n| 1 | 2 |\n\n**Second**\n\n| c |\n| --- |\n| 3 |\n"
+FIRST, SECOND = "| a | b |\n| --- | ---: |\n| 1 | 2 |", "| c |\n| --- |\n| 3 |"
+MARKS = "<!-- table: results/t.md, {} -->\n{}<!-- end of table -->"
+
+
+def test_tables_are_found_without_their_titles():
+    assert tables_in(TABLES) == [FIRST, SECOND]
+    assert tables_in("no table | here") == []
+
+
+def test_tables_and_files_are_filled_in_and_what_is_around_stays(tmp_path):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "t.md").write_text(TABLES)
+    (tmp_path / "results" / "all.md").write_text("text ![one](one.png) ![two](https://a.org/two.png)\n")
+    page = tmp_path / "page.md"
+    file = "<!-- results: results/all.md -->\n{}<!-- end of results -->"
+    page.write_text(f"before\n\n{MARKS.format(2, 'old')}\n\nbetween\n\n{MARKS.format(1, '')}\n{file.format('old')}\n\nafter\n")
+    content = "text ![one](results/one.png) ![two](https://a.org/two.png)\n"
+    for _ in range(2):
+        assert fill_in(page) == 3
+        filled = MARKS.format(2, SECOND + "\n"), MARKS.format(1, FIRST + "\n"), file.format(content)
+        assert page.read_text() == "before\n\n{}\n\nbetween\n\n{}\n{}\n\nafter\n".format(*filled)
+
+
+def test_a_table_that_is_not_there_is_named(tmp_path):
+    (tmp_path / "t.md").write_text(TABLES)
+    page = tmp_path / "page.md"
+    text = "<!-- table: t.md, 3 -->\n<!-- end of table -->\n"
+    page.write_text(text)
+    with pytest.raises(ValueError, match=r"page.md: t.md has tables 1 to 2, and number 3 is asked for"):
+        fill_in(page)
+    assert page.read_text() == text
+
+
+def test_results_are_copied_but_runs_are_not(tmp_path):
+    names = ("table6.md", "icub.csv", "fig2.png", "fig2.svg", "benchmark.md", "runs/a.json", "sources/a.npz")
+    for folder in ("reproduction/paper", "reproduction/best", "benchmark"):
+        for name in names:
+            file = tmp_path / folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(f"{folder} {name}")
+    for page in pages.PAGES:
+        (tmp_path / page).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / page).write_text(f"{page}\n")
+    pages.main(tmp_path)
+    docs = tmp_path / pages.DOCS
+    made = {str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file()}
+    of_setting = ("table6.md", "benchmark.md", "icub.csv", "fig2.png")
+    expected = {f"{setting}/{name}" for setting in ("paper", "best") for name in of_setting}
+    # The tables of a page of the benchmark are in it.
+    assert made == expected | {f"benchmark/{name}" for name in of_setting[1:]}
+    assert (docs / "best" / "icub.csv").read_text() == "reproduction/best icub.csv"
