@@ -241,12 +241,8 @@ def test_steps_to_reach_counts_up_to_the_end_of_the_first_good_window():
     ("text", "message"),
     [
         ("", "JSON"),
-        ("r,l,t\n1,10,1.0\n", "JSON"),
-        ('#{"env_id": "a"}\nr,l,t\n1,10,1.0\n', "t_start"),
         ('#{"t_start": 1.0}\nreward,l,t\n1,10,1.0\n', "'r'"),
-        ('#{"t_start": 1.0}\nr,l,t\n1,10,1.0\n2,1', "got"),
         ('#{"t_start": 1.0}\nr,l,t\n1,10,1.0\n2,11,1.', "last line has no end"),
-        ('#{"t_start": 1.0}\nr,l,t\n1,10,1.0\nx,11,1.0\n', "x"),
         ('#{"t_start": 1.0}\nr,l,t\n', "has no episode"),
         ('#{"t_start": 1.0}\nr,l,t\nnan,10,1.0\n', "not finite"),
     ],

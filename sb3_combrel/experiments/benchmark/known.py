@@ -12,7 +12,6 @@ from sb3_combrel.common.periodic import differences, flag_array
 from sb3_combrel.experiments.benchmark.methods import METHODS, DoesNotFit, Sources
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.runs.job import chosen_on_purpose
-from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 
 class Errors(NamedTuple):
@@ -46,7 +45,7 @@ def errors_of(pair: Pair, sources: tuple[SourceInstances, ...], transitions: Sou
     combrel = COMBREL(given, pair.mappings, use="prior", max_transitions=len(transitions))
     with closing(pair.make_target()) as env, chosen_on_purpose():
         agents = [FittedRMax(env, transfer=each, seed=0, **pair.learner).agent for each in (oracle, combrel)]
-    known, chosen = (cast(MappingTransfer, agent.transfer) for agent in agents)
+    known, chosen = (cast(Any, agent.transfer) for agent in agents)
     scaling = agents[0].task.scaling
     states, after = scaling.to_unit(transitions.states), scaling.to_unit(transitions.next_states)
     rest: list[Any] = [each.tolist() for each in (transitions.actions, transitions.rewards, transitions.terminated)]
