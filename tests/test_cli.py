@@ -47,8 +47,6 @@ class TestCommandLine:
         status, written = call_for_all_output("--help")
         assert status == 0
         assert all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
-
-    def test_an_unknown_command_is_refused(self):
         assert call_for_all_output("dance")[0] == 2
 
     def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):

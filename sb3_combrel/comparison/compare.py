@@ -117,13 +117,7 @@ def _try_out(run: ComparedRun) -> None:
 
 
 def check_methods(methods: Any, baseline: Any) -> str:
-    """
-    Return the baseline's name.
-
-    :param methods: should be a dict from names to transfer methods or None
-    :param baseline: one of its names; None: the one without transfer
-    :raises ValueError: if they are not
-    """
+    """Check the methods of :func:`compare`, and return the baseline's name."""
     if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
         raise ValueError(f"methods must be a dict from names to transfer methods, got {methods!r}")
     if len(methods) < 2:
@@ -133,8 +127,8 @@ def check_methods(methods: Any, baseline: Any) -> str:
     for name, transfer in methods.items():
         if not (transfer is None or isinstance(transfer, Transfer | dict | str)):
             raise ValueError(f"methods must be transfer methods or None for no transfer, got {transfer!r} for {name!r}")
-    without = [name for name, transfer in methods.items() if transfer is None]
     if baseline is None:
+        without = [name for name, transfer in methods.items() if transfer is None]
         if len(without) != 1:
             raise ValueError(f"baseline must be one of {', '.join(methods)}, as {len(without)} methods are without transfer")
         return without[0]
@@ -144,12 +138,7 @@ def check_methods(methods: Any, baseline: Any) -> str:
 
 
 def check_seeds(seeds: Any) -> list[int]:
-    """
-    Return the seeds.
-
-    :param seeds: their number, or the seeds themselves
-    :raises ValueError: if they are neither
-    """
+    """Return the seeds."""
     if isinstance(seeds, Sequence) and not isinstance(seeds, str):
         numbers = [as_count("seeds", seed, min=0, max=MAX_SEED) for seed in seeds]
         if not numbers or len(set(numbers)) < len(numbers):
@@ -159,12 +148,7 @@ def check_seeds(seeds: Any) -> list[int]:
 
 
 def check_learner(learner: Any) -> dict[str, Any]:
-    """
-    Return further arguments of the learner.
-
-    :param learner: should be a dict of them, or None
-    :raises ValueError: if it is not, or has others
-    """
+    """Return the further arguments of the learner."""
     if learner is None:
         return {}
     known = [name for name in inspect.signature(FittedRMax).parameters if name not in _TAKEN]
@@ -177,12 +161,7 @@ def check_learner(learner: Any) -> dict[str, Any]:
 
 
 def task_of(env: Any) -> Task:
-    """
-    Return what makes the environment of each run.
-
-    :param env: id of an environment, or a function that makes one
-    :raises ValueError: if it is neither
-    """
+    """Return what makes the environment of each run."""
     if isinstance(env, str):
         spec = task_spec(env)
         if spec is None:

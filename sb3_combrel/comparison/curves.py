@@ -55,7 +55,7 @@ class LearningCurves:
 
         :param returns: for each run, the return of each episode
         :param steps: for each run, the environment steps of each episode
-        :raises ValueError: if the numbers of runs or of episodes differ, a run has no episode, or values are not allowed
+        :raises ValueError: if numbers of runs or episodes differ, a run has no episode, or values are not allowed
         """
         lengths = [len(row) for row in returns]
         if lengths != [len(row) for row in steps]:
@@ -89,25 +89,13 @@ class LearningCurves:
 
 
 def curves_of(runs: Iterable[Result]) -> LearningCurves:
-    """
-    Return the learning curves of some runs, in their order.
-
-    :param runs: the results of the runs
-    :raises ValueError: if there is no run, or one without an episode
-    """
+    """Return the learning curves of some runs, at least one, in their order."""
     runs = list(runs)
     return LearningCurves.from_rows([run.returns for run in runs], [run.steps for run in runs])
 
 
 def episodes_of_all(name: str, n: int | None, curves: LearningCurves) -> int:
-    """
-    Return a number of episodes that every run has.
-
-    :param name: of the argument, for messages
-    :param n: the number; None: as many as the shortest run has
-    :param curves: the runs
-    :raises ValueError: if a run has fewer
-    """
+    """Return a number of episodes that every run has: ``n``, or that of the shortest run."""
     shortest = int(curves.n_episodes.min())
     if n is None:
         return shortest
@@ -119,7 +107,6 @@ def returns_over_steps(curves: LearningCurves, at: np.ndarray) -> np.ndarray:
     """
     Return, for each run, the return of the episode that was under way after so many environment steps.
 
-    :param curves: the runs
     :param at: environment steps, each fewer than the shortest run has, shape (n_points,)
     :return: shape (n_runs, n_points)
     """
@@ -133,7 +120,6 @@ def moving_average(samples: np.ndarray, window: int) -> np.ndarray:
     Compute the mean of ``window`` successive episodes, or of all where there are fewer.
 
     :param samples: one run a row, shape (n_runs, n_episodes)
-    :param window: number of episodes
     :return: shape (n_runs, n_episodes - window + 1)
     """
     window = min(window, samples.shape[1])

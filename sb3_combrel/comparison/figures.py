@@ -17,11 +17,7 @@ MARKERS = ("s", "^", "o", "D", "v")
 
 
 def figure_of(width: float, height: float) -> Figure:
-    """
-    Make a figure.
-
-    :param width: in inches; ``height``: likewise
-    """
+    """Make a figure; sizes in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -43,14 +39,7 @@ def draw_band(
     label: str | None = None,
     **style: Any,
 ) -> None:
-    """
-    Draw a curve with its band.
-
-    :param axes: of matplotlib
-    :param where: shape (n_points,)
-    :param band: the curve and the ends of its band, such as of :func:`~sb3_combrel.comparison.statistics.bootstrap_band`
-    :param colour: of both; ``line``, ``label`` and ``style``: of the curve
-    """
+    """Draw a curve with its band: ``band`` holds the curve and both ends, each of the shape of ``where``, (n_points,)."""
     axes.plot(where, band[0], line, color=colour, label=label, **style)
     axes.fill_between(where, band[1], band[2], color=colour, alpha=0.17, linewidth=0)
 
@@ -63,12 +52,7 @@ def readable_ticks(axis: Any) -> None:
 
 
 def save(figure: Figure, path: Path) -> list[Path]:
-    """
-    Save as PNG and SVG; without the date and random names, which would make every file differ.
-
-    :param path: file to write, without its suffix; its folder is made if need be
-    :return: both files
-    """
+    """Save as PNG and SVG, without the date and random names, which would make every file differ; ``path`` has no suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
     figure.savefig(png, dpi=110)

@@ -103,11 +103,7 @@ def time_to_threshold(curves: LearningCurves, threshold: float, window: int = WI
 
 
 def counts_within(n_episodes: int) -> dict[str, int]:
-    """
-    Return ``n_first`` and ``n_last`` of :func:`compare_learning`: the usual ones, or all episodes where there are fewer.
-
-    :param n_episodes: episodes of the shortest run
-    """
+    """Return ``n_first`` and ``n_last`` of :func:`compare_learning` where the shortest run has so many episodes."""
     return {"n_first": min(N_FIRST, n_episodes), "n_last": min(N_LAST, n_episodes)}
 
 
@@ -125,11 +121,7 @@ def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.nd
 
 
 def steps_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
-    """
-    Count the steps of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
-
-    :param steps: steps of each episode, shape (n_runs, n_episodes)
-    """
+    """Count the steps of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never."""
     return _steps_of(steps, episodes_to_reach(steps, threshold, window))
 
 
@@ -142,11 +134,9 @@ class Comparison(NamedTuple):
     """
     A measure of runs with transfer against runs without.
 
-    :param with_transfer: the measure of each run with transfer, shape (n_with,)
-    :param without: of each run without, shape (n_without,)
+    :param with_transfer: the measure of each run with transfer, shape (n_with,); ``without``: likewise, shape (n_without,)
     :param effect: what transfer adds: below 0 if it lowers the measure
-    :param low: lower bound of the effect's 95% bootstrap interval; NaN where there is none
-    :param high: upper bound
+    :param low: lower bound of the effect's 95% bootstrap interval, NaN where there is none; ``high``: upper bound
     :param p_value: two-sided; NaN with fewer than two runs of either
     :param higher_is_better: whether an effect above 0 is a gain
     """
@@ -231,8 +221,8 @@ def compare_learning(
 
     def compare(measure: Callable[[LearningCurves], np.ndarray], difference: Any = bootstrap_difference) -> Comparison:
         first, second = (measure(curves) for curves in both)
-        estimate = difference(first, second, n_resamples=n_resamples, seed=seed)
-        return Comparison(first, second, *estimate, p_value_of_difference(first, second, "permutation", seed), True)
+        effect, low, high = difference(first, second, n_resamples=n_resamples, seed=seed)
+        return Comparison(first, second, effect, low, high, p_value_of_difference(first, second, "permutation", seed))
 
     def ratio(area: Callable[[LearningCurves], np.ndarray], width: int) -> Comparison:
         # Rounding may leave a run that never rose above the floor just below it.
@@ -247,9 +237,9 @@ def compare_learning(
     times = None
     if threshold is not None:
         first, second = (time_to_threshold(curves, threshold, window) for curves in both)
-        estimate = bootstrap_difference(first, second, "median", n_resamples, seed)
+        effect, low, high = bootstrap_difference(first, second, "median", n_resamples, seed)
         p_value = p_value_of_difference(first, second, "mann-whitney")
-        times = Comparison(first, second, *estimate, p_value, False)
+        times = Comparison(first, second, effect, low, high, p_value, higher_is_better=False)
     return TransferMeasures(
         jumpstart=compare(lambda curves: initial_return(curves, n_first)),
         asymptotic_performance=compare(lambda curves: asymptotic_return(curves, n_last)),

@@ -122,14 +122,7 @@ class CompareResult:
 
 
 def evaluate(results: Mapping[str, Sequence[Result]], baseline: str, threshold: float | None) -> CompareResult:
-    """
-    Compare methods with one of them.
-
-    :param results: for each method its runs, by the order of the seeds
-    :param baseline: name of the method that the others are compared with
-    :param threshold: return of the time to threshold; None: the median, over the baseline's runs, of the mean return of their
-        last episodes
-    """
+    """Compare methods with one of them, the baseline, given the runs of each by the order of the seeds."""
     curves = {method: curves_of(runs) for method, runs in results.items()}
     shortest = min(int(each.n_episodes.min()) for each in curves.values())
     counts = counts_within(shortest)

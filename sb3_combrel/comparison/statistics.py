@@ -42,8 +42,7 @@ class Difference(NamedTuple):
     What one sample of runs has more than another.
 
     :param value: the difference
-    :param low: lower bound of its 95% interval, NaN where there is none
-    :param high: upper bound
+    :param low: lower bound of its 95% interval, NaN where there is none; ``high``: upper bound
     """
 
     value: float
@@ -56,8 +55,7 @@ class Saving(NamedTuple):
     Steps that a method saves over another.
 
     :param steps: difference of the means
-    :param low: lower bound of its 95% confidence interval, NaN with fewer than two runs of each
-    :param high: upper bound
+    :param low: lower bound of its 95% confidence interval, NaN with fewer than two runs of each; ``high``: upper bound
     :param share: the difference as a fraction of the other's mean
     :param p_value: of Welch's t-test that both need equally many steps
     """
@@ -70,11 +68,7 @@ class Saving(NamedTuple):
 
 
 def mean_of_runs(samples: np.ndarray) -> Estimate:
-    """
-    Compute the mean over runs, with the interval of Student's t.
-
-    :param samples: one run a row, shape (n_runs, ...)
-    """
+    """Compute the mean over runs, one a row, with the interval of Student's t."""
     samples = np.asarray(samples, dtype=np.float64)
     mean = samples.mean(axis=0)
     if len(samples) < 2:
@@ -85,10 +79,7 @@ def mean_of_runs(samples: np.ndarray) -> Estimate:
 
 def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
     """
-    Compute what transfer saves, by Welch's t-test: the runs are independent and their variances differ.
-
-    :param without: steps of each run without transfer, shape (n_runs,)
-    :param with_transfer: steps of each run with transfer, shape (n_runs,)
+    Compute what transfer saves of the steps of each run, by Welch's t-test: runs are independent, their variances differ.
     """
     without, with_transfer = (np.asarray(steps, dtype=np.float64) for steps in (without, with_transfer))
     steps = float(without.mean() - with_transfer.mean())
@@ -102,10 +93,7 @@ def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
 
 def interquartile_mean(samples: np.ndarray, axis: int = 0) -> np.ndarray:
     """
-    Compute the mean without the lowest and the highest quarter of the runs, each rounded down.
-
-    :param samples: one run a row, shape (n_runs, ...)
-    :param axis: the axis of the runs
+    Compute the mean without the lowest and the highest quarter of the runs, each rounded down; ``axis`` is that of the runs.
     """
     return stats.trim_mean(np.asarray(samples, dtype=np.float64), 0.25, axis=axis)
 
@@ -123,8 +111,7 @@ def bootstrap_band(samples: np.ndarray, statistic: str = "mean", n_resamples: in
 
     :param samples: one run a row, shape (n_runs, n_points) or (n_runs,); inf is allowed
     :param statistic: ``"mean"``, ``"median"`` or ``"iqm"``, the interquartile mean
-    :param n_resamples: number of draws
-    :param seed: of the draws; the same seed gives the same band
+    :param n_resamples: number of draws; ``seed``: of them
     :return: the statistic, in the field ``mean``, and the band, each of shape (n_points,) or (); the band is NaN with a single
         run and where the statistic is not finite
     :raises ValueError: if samples have another shape, are empty or have NaN, the statistic is unknown, or draws are too few
@@ -153,11 +140,9 @@ def bootstrap_difference(
     With infinite values take ``"median"``: while fewer than half of each sample are infinite, the medians are finite. The
     interval may still end at -inf or inf: the runs do not bound the difference on that side.
 
-    :param first: one value for each run, shape (n_first,)
-    :param second: those of the other method, shape (n_second,)
-    :param statistic: ``"mean"``, ``"median"`` or ``"iqm"``, the interquartile mean
-    :param n_resamples: number of draws from each sample
-    :param seed: of the draws
+    :param first: one value for each run, shape (n_first,); ``second``: those of the other method, shape (n_second,)
+    :param statistic: ``"mean"``, ``"median"`` or ``"iqm"``
+    :param n_resamples: number of draws from each sample; ``seed``: of them
     :return: first minus second; the interval is NaN with a single run of either, or where the difference is not finite
     :raises ValueError: if a sample has another shape, is empty or has NaN, the statistic is unknown, or draws are too few
     """
@@ -171,10 +156,8 @@ def bootstrap_relative_difference(first: np.ndarray, second: np.ndarray, n_resam
     """
     Compute (mean of first - mean of second) / mean of second, with its 95% bootstrap interval.
 
-    :param first: one value for each run, none below 0, shape (n_first,)
-    :param second: those of the other method, shape (n_second,)
-    :param n_resamples: number of draws from each sample
-    :param seed: of the draws
+    The parameters are those of :func:`bootstrap_difference`; no value may be below 0.
+
     :return: the interval is NaN with a single run of either and where the mean of second is 0
     :raises ValueError: if a sample has another shape, is empty, has NaN or a value below 0, or there are too few draws
     """
@@ -195,8 +178,6 @@ def resampled(samples: tuple[np.ndarray, ...], compute: Any, n_resamples: int, r
 
     :param samples: each with one run a row, shape (n_runs, ...)
     :param compute: the statistic of the samples along an axis
-    :param n_resamples: number of draws
-    :param rng: where they come from
     :return: shape (..., n_resamples); of a single run its own statistic
     """
     if min(map(len, samples)) < 2:
@@ -247,12 +228,7 @@ def as_sample(name: str, values: np.ndarray) -> np.ndarray:
 
 def cliffs_delta(first: np.ndarray, second: np.ndarray) -> float:
     """
-    Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993).
-
-    :param first: one value for each run, inf allowed, shape (n_first,)
-    :param second: those of the other method, shape (n_second,)
-    :return: from -1, every value of the first is lower, to 1, every one is higher
-    :raises ValueError: if a sample has another shape, is empty or has NaN
+    Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993): -1 to 1.
     """
     first, second = as_sample("first", first), as_sample("second", second)
     return float((first[:, None] > second).mean() - (first[:, None] < second).mean())
@@ -262,8 +238,7 @@ def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "we
     """
     Compute the two-sided p-value that two samples have the same mean, or the same distribution.
 
-    :param first: one sample, shape (n,); inf is allowed
-    :param second: the other
+    :param first: one sample, shape (n,), inf is allowed; ``second``: the other
     :param test: ``"welch"``, Welch's t-test, ``"permutation"``, the permutation test of the difference of means, or
         ``"mann-whitney"``, which is also used where a value is infinite and means do not exist
     :param seed: of the permutation test, where there are more than :data:`N_PERMUTATIONS` regroupings
@@ -315,7 +290,7 @@ def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
     """
     Correct p-values for their number by Holm's method ("A simple sequentially rejective multiple test procedure", 1979).
 
-    :param p_values: by name; NaN stays NaN and does not count
+    NaN stays NaN and does not count.
     """
     tested = sorted((name for name, p in p_values.items() if not np.isnan(p)), key=lambda name: p_values[name])
     factors = range(len(tested), 0, -1)
@@ -326,9 +301,6 @@ def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
 def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
     """
     Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run.
-
-    :param n_first: runs of a method; ``n_second``: of the other
-    :param n_methods: number of tests
     """
     if min(n_first, n_second) < 2:
         return 1.0
@@ -340,7 +312,5 @@ def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
 def fewest_runs(n_methods: int) -> int:
     """
     Compute how many runs of each method a permutation test needs for a p-value below :data:`ALPHA`, after Holm's correction.
-
-    :param n_methods: number of tests
     """
     return next(n for n in itertools.count(2) if smallest_p_value(n, n, n_methods) < ALPHA)

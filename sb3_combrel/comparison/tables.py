@@ -37,25 +37,14 @@ class Table(NamedTuple):
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], n_names: int = 1) -> str:
     """
-    Return a table in GitHub's Markdown, without a line's end after it.
-
-    :param header: names of the columns
-    :param rows: their cells; bars in them are escaped
-    :param n_names: so many columns at the left hold names; the others hold numbers, which are aligned at the right
+    Return a table in GitHub's Markdown; the first ``n_names`` columns hold names, the others numbers, aligned at the right.
     """
     lines = [header, ["---"] * n_names + ["---:"] * (len(header) - n_names), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[Path]:
-    """
-    Write tables as Markdown, into one file, and as CSV, one file each; and show them.
-
-    :param tables: the tables
-    :param path: file to write, without its suffix
-    :param console: where to show them
-    :return: the files
-    """
+    """Show tables, and write them to ``path`` as Markdown, into one file, and as CSV, one file each; the files."""
     made = [path.with_suffix(".md")]
     write_whole(made[0], "\n".join(table.as_markdown() for table in tables).encode())
     for number, table in enumerate(tables, 1):
@@ -66,12 +55,7 @@ def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[
 
 
 def write_csv(frame: pd.DataFrame, path: Path) -> Path:
-    """
-    Write a CSV file at once.
-
-    :param frame: its rows
-    :param path: the file
-    """
+    """Write a CSV file at once."""
     write_whole(path, frame.to_csv(index=False, lineterminator="\n").encode())
     return path
 

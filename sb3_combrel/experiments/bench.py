@@ -14,15 +14,7 @@ from typing import Any, NamedTuple
 
 
 class Case(NamedTuple):
-    """One line of the table.
-
-    :param name: its text
-    :param env_id: the environment
-    :param env_kwargs: its arguments
-    :param kwargs: arguments of FittedRMax
-    :param n_episodes: how many to learn
-    :param transfers: whether with COMBREL, from Mountain Car 2D
-    """
+    """One line of the table: text, environment with arguments, arguments of FittedRMax, episodes, whether with COMBREL."""
 
     name: str
     env_id: str
@@ -32,31 +24,22 @@ class Case(NamedTuple):
     transfers: bool = False
 
 
-_BROAD: dict[str, Any] = dict(degree=0, model_breadth=0.4, resolution=3, min_fraction=0.1)
-_NARROW: dict[str, Any] = dict(_BROAD, model_breadth=0.1)
+def _kernel(breadth: float, resolution: int = 3, min_fraction: float = 0.1) -> dict[str, Any]:
+    return dict(degree=0, model_breadth=breadth, resolution=resolution, min_fraction=min_fraction)
+
+
+_CAR_2D, _CAR_4D, _CAR_6D = (f"combrel/MountainCar{n}D-v0" for n in (2, 4, 6))
 _SHORT: dict[str, Any] = dict(max_episode_steps=2000)
 CASES = (
-    Case(
-        "Mountain Car 2D, breadth 1/16, resolution 4",
-        "combrel/MountainCar2D-v0",
-        dict(start="fixed"),
-        dict(degree=0, model_breadth=1 / 16, resolution=4, min_fraction=0.01),
-        50,
-    ),
-    Case("Mountain Car 4D, breadth 0.4, resolution 3", "combrel/MountainCar4D-v0", {}, _BROAD, 200),
-    Case("the same with COMBREL", "combrel/MountainCar4D-v0", {}, _BROAD, 200, transfers=True),
-    Case(
-        "Mountain Car 4D, breadth 0.2, resolution 3",
-        "combrel/MountainCar4D-v0",
-        {},
-        dict(degree=0, model_breadth=0.2, resolution=3, min_fraction=0.1),
-        60,
-    ),
-    Case("Mountain Car 4D, breadth 0.1, resolution 3", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12),
-    Case("the same with COMBREL", "combrel/MountainCar4D-v0", _SHORT, _NARROW, 12, transfers=True),
-    Case("Mountain Car 4D, local linear, resolution 3", "combrel/MountainCar4D-v0", _SHORT, {}, 12),
-    Case("the same with COMBREL as prior", "combrel/MountainCar4D-v0", _SHORT, {}, 12, transfers=True),
-    Case("Mountain Car 6D, local linear, resolution 2", "combrel/MountainCar6D-v0", _SHORT, {}, 8),
+    Case("Mountain Car 2D, breadth 1/16, resolution 4", _CAR_2D, dict(start="fixed"), _kernel(1 / 16, 4, 0.01), 50),
+    Case("Mountain Car 4D, breadth 0.4, resolution 3", _CAR_4D, {}, _kernel(0.4), 200),
+    Case("the same with COMBREL", _CAR_4D, {}, _kernel(0.4), 200, transfers=True),
+    Case("Mountain Car 4D, breadth 0.2, resolution 3", _CAR_4D, {}, _kernel(0.2), 60),
+    Case("Mountain Car 4D, breadth 0.1, resolution 3", _CAR_4D, _SHORT, _kernel(0.1), 12),
+    Case("the same with COMBREL", _CAR_4D, _SHORT, _kernel(0.1), 12, transfers=True),
+    Case("Mountain Car 4D, local linear, resolution 3", _CAR_4D, _SHORT, {}, 12),
+    Case("the same with COMBREL as prior", _CAR_4D, _SHORT, {}, 12, transfers=True),
+    Case("Mountain Car 6D, local linear, resolution 2", _CAR_6D, _SHORT, {}, 8),
 )
 COMPARED_EPISODES = 200
 
@@ -92,21 +75,24 @@ def resident_memory() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
+def _printed(code: str, **environment: str) -> list[str]:
+    """The words that a fresh process prints."""
+    variables = {**os.environ, **environment}
+    done = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
 def import_seconds() -> float:
     """Measure the seconds that the import takes on top of that of Stable-Baselines3, in a fresh process."""
-    done = subprocess.run([sys.executable, "-c", _IMPORT], capture_output=True, text=True, check=True)
-    return float(done.stdout)
+    return float(_printed(_IMPORT)[0])
 
 
 def first_use_seconds() -> tuple[float, float]:
-    """Measure the seconds until the first steps and the first prediction are done, in a fresh process with nothing compiled.
-
-    :return: without transfer, and after that with COMBREL
+    """
+    Measure the seconds until first steps and prediction in a fresh process, nothing compiled: without transfer, then with.
     """
     with tempfile.TemporaryDirectory() as empty:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": empty}
-        done = subprocess.run([sys.executable, "-c", _FIRST_USE], env=environment, capture_output=True, text=True, check=True)
-    without, transferring = done.stdout.split()
+        without, transferring = _printed(_FIRST_USE, NUMBA_CACHE_DIR=empty)
     return float(without), float(transferring)
 
 
@@ -139,8 +125,7 @@ def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, flo
         f"steps, seconds = bench.learn(case, max(1, round({fraction} * case.n_episodes)), {seed})\n"
         "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    steps, milliseconds, memory = done.stdout.split()[-3:]
+    steps, milliseconds, memory = _printed(code)[-3:]
     return int(steps), float(milliseconds), float(memory)
 
 

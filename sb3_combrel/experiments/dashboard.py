@@ -33,9 +33,7 @@ def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TAB
     Start TensorBoard, take screenshots of it, and stop it.
 
     :param logs: folder with one folder a run
-    :param output: folder for PNG files, one a tab
-    :param tabs: names out of :data:`TABS`
-    :return: the files
+    :param output: folder for PNG files, one a tab of :data:`TABS`
     :raises FileNotFoundError: if there is no Chromium
     """
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -88,12 +86,7 @@ def _photograph(browser: str, address: str, path: Path, size: tuple[int, int]) -
 
 
 def learn_with_each_method(logs: Path, total_timesteps: int) -> None:
-    """
-    Learn with each method of the demo, and log the runs in one folder.
-
-    :param logs: folder for the logs
-    :param total_timesteps: environment steps of each run
-    """
+    """Learn with each method of the demo for so many steps, and log the runs in one folder."""
     from sb3_combrel import FittedRMax
     from sb3_combrel.experiments.tasks import mountain_car
     from sb3_combrel.runs.job import chosen_on_purpose, make_env

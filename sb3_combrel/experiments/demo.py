@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
 from rich.console import Console
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.checks import check_count, check_positive
@@ -25,7 +24,7 @@ from sb3_combrel.comparison.tables import Table
 from sb3_combrel.experiments.film import film, greedy_episode
 from sb3_combrel.experiments.tasks import mountain_car
 from sb3_combrel.experiments.warm_up import warm_up
-from sb3_combrel.runs.episodes import EVALUATION_SEED
+from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder
 from sb3_combrel.runs.job import Job, Result, chosen_on_purpose, make_env
 from sb3_combrel.runs.runner import FOLDER, Backend, check_all_succeeded, prepare_folder, run_missing
 from sb3_combrel.runs.source_files import load_or_learn
@@ -41,11 +40,7 @@ FILMED = "COMBREL"
 
 @dataclass(frozen=True, kw_only=True)
 class DemoRun(Job):
-    """
-    A run that leaves its model and TensorBoard logs in the output folder, and counts the mappings used.
-
-    :param folder: the output folder
-    """
+    """A run that leaves its model and TensorBoard logs in the output folder, and counts the mappings used."""
 
     folder: Path
 
@@ -64,46 +59,36 @@ class DemoRun(Job):
         for earlier in logs.glob(f"{self.name}_[0-9]*"):
             shutil.rmtree(earlier, ignore_errors=True)
         assert self.n_episodes is not None and self.max_episode_steps is not None
-        episodes = EpisodeLog(self.n_episodes)
+        log = EpisodeLog(self.n_episodes)
         with closing(self.make_env()) as env, chosen_on_purpose():
             model = FittedRMax(env, transfer=self.transfer, seed=self.seed, tensorboard_log=str(logs), **self.learner)
             start = time.process_time()
-            model.learn(self.n_episodes * self.max_episode_steps, episodes, log_interval=1, tb_log_name=self.name)
+            model.learn(self.n_episodes * self.max_episode_steps, log, log_interval=1, tb_log_name=self.name)
             seconds = time.process_time() - start
         transfer: Any = model.agent.transfer
         counts = {} if transfer is None else {str(mapping): count for mapping, count in transfer.mapping_counts()}
         model.save(self.model_file)
-        more = {"mappings": counts, "wall_seconds": episodes.wall_seconds}
-        return self.result(episodes.steps, episodes.returns, episodes.terminated, model.num_timesteps, more, seconds)
+        more = {"mappings": counts, "wall_seconds": log.wall_seconds}
+        return self.result(*(column.tolist() for column in log.episodes), model.num_timesteps, more, seconds)
 
 
-class EpisodeLog(BaseCallback):
-    """
-    Keeps and logs every episode, and stops the learning after the last.
-
-    :param n_episodes: episodes to learn
-    """
+class EpisodeLog(EpisodeRecorder):
+    """Keeps and logs every episode, and stops the learning after the last of ``n_episodes``."""
 
     def __init__(self, n_episodes: int):
-        super().__init__()
-        self.n_episodes = n_episodes
-        self.steps: list[int] = []
-        self.returns: list[float] = []
-        self.terminated: list[bool] = []
+        super().__init__(n_episodes)
         self.wall_seconds: list[float] = []
 
     def _on_step(self) -> bool:
         # One step later: the algorithm plans and logs at the end of an episode only after it has asked the callbacks.
-        if len(self.steps) >= self.n_episodes:
+        if len(self.wall_seconds) >= self.n_episodes:  # type: ignore[operator]
             return False
+        super()._on_step()
         for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
             if done:
-                self.steps.append(int(info["episode"]["l"]))
-                self.returns.append(float(info["episode"]["r"]))
-                self.terminated.append(not info.get("TimeLimit.truncated", False))
                 self.wall_seconds.append(float(info["episode"]["t"]))
-                self.logger.record("rollout/ep_len", self.steps[-1])
-                self.logger.record("rollout/episode", len(self.steps))
+                self.logger.record("rollout/ep_len", int(info["episode"]["l"]))
+                self.logger.record("rollout/episode", len(self.wall_seconds))
         return True
 
 
@@ -120,16 +105,10 @@ def run_demo(
     """
     Learn the target task without transfer, with a random mapping, with TIMBREL and with COMBREL, and report the results.
 
-    Runs that an earlier call has completed in the same folder are kept.
+    Runs that an earlier call has completed in the same folder are kept; ``fresh`` deletes them first, and nothing else.
 
-    :param output: folder for all results
-    :param n_seeds: runs of each method
-    :param n_episodes: episodes of each run
-    :param max_episode_steps: steps after which an episode is cut off
     :param model_breadth: breadth of the learner's kernel; None for the learner's own
     :param workers: processes at a time; None for one a core
-    :param fresh: delete the results of the demonstration in the folder first; nothing else is ever deleted
-    :param console: where to write; None for the standard output
     :raises ValueError: if a number is below 1, or the folder has results of other settings or other files
     """
     check_count("seeds", n_seeds)
@@ -174,9 +153,8 @@ def run_demo(
 
 
 def _report(results: Sequence[Result], cap: int, output: Path, console: Console) -> None:
-    by_method: dict[str, list[Result]] = {}
-    for result in results:
-        by_method.setdefault(result.method, []).append(result)
+    methods = dict.fromkeys(result.method for result in results)
+    by_method = {method: [result for result in results if result.method == method] for method in methods}
     steps = {method: np.array([result.steps for result in its_own]) for method, its_own in by_method.items()}
     draw_learning_curves(steps, output / FIGURE, "Mountain Car 4D, learned with 1000 instances of Mountain Car 2D", cap)
     results_frame(results).to_csv(output / RESULTS, index=False, lineterminator="\r\n")
@@ -209,11 +187,9 @@ def results_frame(results: Sequence[Result]) -> pd.DataFrame:
 
 def draw_learning_curves(steps: dict[str, np.ndarray], path: Path, title: str, cap: int) -> None:
     """
-    Draw the steps of each episode, mean of the runs, with bands of 95% confidence.
+    Draw the steps of each episode, mean of the runs, with bands of 95% confidence, into a PNG file.
 
     :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
-    :param path: PNG file to write
-    :param title: title of the figure
     :param cap: steps after which an episode was cut off
     """
     figure = figure_of(7.0, 4.2)
@@ -240,8 +216,6 @@ def draw_learning_curves(steps: dict[str, np.ndarray], path: Path, title: str, c
 def episodes_table(steps: dict[str, np.ndarray]) -> Table:
     """
     Make a table of the steps of each episode and of all, mean of the runs and half the width of its 95% confidence interval.
-
-    :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
     """
     n_runs, n_episodes = next(iter(steps.values())).shape
     columns = [
@@ -254,12 +228,7 @@ def episodes_table(steps: dict[str, np.ndarray]) -> Table:
 
 
 def savings_table(steps: dict[str, np.ndarray], baseline: str) -> Table:
-    """
-    Make a table of the steps saved over all episodes.
-
-    :param steps: as above
-    :param baseline: the method that the others are compared with
-    """
+    """Make a table of the steps saved over all episodes, compared with a baseline."""
     rows = []
     for method, samples in steps.items():
         if method != baseline:
@@ -315,11 +284,7 @@ def _film(output: Path, max_episode_steps: int, console: Console) -> None:
 
 
 def load_car(path: Path) -> FittedRMax:
-    """
-    Load a trained model.
-
-    :param path: a file that a run has left
-    """
+    """Load a trained model that a run has left."""
     with chosen_on_purpose():
         return FittedRMax.load(path)
 

@@ -28,14 +28,7 @@ N_ROLLING = 15
 
 
 def greedy_episode(model: BaseAlgorithm, env: Any, seed: int | None = None) -> Iterator[tuple[int, bool]]:
-    """
-    Drive one episode without exploring.
-
-    :param model: the agent
-    :param env: the environment; it is left open
-    :param seed: seed of the episode
-    :return: after each step its number, from 1 on, and whether the episode is over
-    """
+    """Drive one episode without exploring; after each step its number, from 1 on, and whether the episode is over."""
     observation, _ = env.reset(seed=seed)
     step, over, state = 0, False, None
     while not over:
@@ -51,10 +44,8 @@ def film(
     """
     Film one episode, driven without exploring.
 
-    :param model: the agent
     :param env: an environment with ``render_mode="rgb_array"``; it is left open
     :param path: MP4 file to write
-    :param seed: seed of the episode
     :param every: steps between two frames, as software rendering is slow
     :param most_steps: steps after which the film ends if the episode does not
     :raises combrel_envs.RenderingError: if OpenGL is missing
@@ -69,13 +60,7 @@ def film(
 
 
 def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> None:
-    """
-    Write frames as an MP4 file, completely or not at all.
-
-    :param frames: arrays of shape (height, width, 3), uint8
-    :param path: file to write
-    :param fps: frames a second
-    """
+    """Write frames of shape (height, width, 3), uint8, as an MP4 file, completely or not at all."""
     from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
 
     unfinished = path.with_suffix(".part.mp4")
@@ -85,11 +70,9 @@ def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> No
 
 def learn(task: str, n_episodes: int | None = None, seed: int = 0, **kwargs: Any) -> FittedRMax:
     """
-    Learn a task with the default settings of Fitted R-Max.
+    Learn a task, "torso" or "arm", with the default settings of Fitted R-Max.
 
-    :param task: ``"torso"`` (the source task) or ``"arm"`` (the target task)
     :param n_episodes: how many episodes; None for as many as it takes
-    :param seed: seed of the learner
     :param kwargs: other arguments of FittedRMax
     """
     import combrel_envs  # noqa: F401 - registers the tasks
@@ -104,7 +87,6 @@ def film_strike(model: FittedRMax, env: Any, video: Path, picture: Path) -> int:
     """
     Film one episode, played without exploring, until the ball has rolled away; and picture its last moment.
 
-    :param model: the agent
     :param env: a ball-striking environment with ``render_mode="rgb_array"``; it is left open
     :param video: MP4 file to write
     :param picture: PNG file to write: the robot at the end of the episode, hitting the ball if it does
@@ -129,15 +111,7 @@ def _rolling(env: Any) -> Iterator[Any]:
 
 
 def write_pictures(task: str, look: str, output: Path, n_episodes: int | None = None, seed: int = 0) -> None:
-    """
-    Learn a task and write the model, a video and a picture into a folder.
-
-    :param task: ``"torso"`` or ``"arm"``
-    :param look: ``"primitives"`` or ``"meshes"``
-    :param output: the folder
-    :param n_episodes: episodes to learn; None for as many as it takes
-    :param seed: seed of the learner
-    """
+    """Learn a task and write the model, a video and a picture into a folder; see :func:`icub`."""
     output.mkdir(parents=True, exist_ok=True)
     model = learn(task, n_episodes, seed)
     model.save(output / f"{task}.zip")

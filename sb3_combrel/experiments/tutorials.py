@@ -25,7 +25,8 @@ TIMEOUT = 600
 
 BEGIN, END = "<!-- output -->", "<!-- end of output -->"
 _CELL = re.compile(
-    rf"^```(?P<language>python|bash)\n(?P<code>.*?)^```\n(?P<output>\n{BEGIN}\n.*?{END}\n)?", re.DOTALL | re.MULTILINE
+    rf"^```(?P<language>python|bash)\n(?P<code>.*?)^```\n(?:\n{BEGIN}\n```text\n(?P<output>.*?)\n```\n{END}\n)?",
+    re.DOTALL | re.MULTILINE,
 )
 _FIGURE = re.compile(r"!\[[^\]]*\]\((figures/[^)]+)\)")
 _COLOURS = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
@@ -37,28 +38,19 @@ def tutorial_files(folder: Path = FOLDER) -> list[Path]:
 
 
 def figures_of(text: str) -> list[str]:
-    """
-    Return the figures that a tutorial shows, as paths relative to its folder.
-
-    :param text: the tutorial
-    """
+    """Return the figures that a tutorial shows, as paths relative to its folder."""
     return list(dict.fromkeys(_FIGURE.findall(text)))
 
 
 def recorded_outputs(text: str) -> list[str | None]:
-    """
-    Return what is recorded of each cell's output, None where there is nothing.
-
-    :param text: the tutorial
-    """
-    return [_fenced(cell["output"]) for cell in _CELL.finditer(text)]
+    """Return what is recorded in a tutorial of each cell's output, None where there is nothing."""
+    return [cell["output"] for cell in _CELL.finditer(text)]
 
 
 def execute(file: Path) -> list[str]:
     """
-    Execute all cells of a tutorial in its folder, in a Python of their own.
+    Execute all cells of a tutorial in its folder, in a Python of their own; the file is not changed.
 
-    :param file: the tutorial; it is not changed
     :return: what each cell printed, "" for nothing; what goes to the standard error (progress, warnings) is left out
     :raises nbclient.exceptions.CellExecutionError: if a cell fails; the message has the cell and the traceback
     :raises ValueError: if jupytext finds other cells in the file than this module does
@@ -98,13 +90,7 @@ def _printed(outputs: Sequence[Any]) -> str:
 
 
 def with_outputs(text: str, outputs: Sequence[str]) -> str:
-    """
-    Put the outputs of its cells into a tutorial, in the place of those that are recorded there.
-
-    :param text: the tutorial
-    :param outputs: one for each cell, "" for nothing
-    :raises ValueError: if there are not as many outputs as cells
-    """
+    """Put the outputs of its cells, "" for nothing, into a tutorial, in the place of those that are recorded there."""
     n_cells = len(_CELL.findall(text))
     if len(outputs) != n_cells:
         raise ValueError(f"outputs must have one entry for each of the {n_cells} cells, got {len(outputs)}")
@@ -116,11 +102,6 @@ def with_outputs(text: str, outputs: Sequence[str]) -> str:
         return code if not output else f"{code}\n{BEGIN}\n```text\n{output}\n```\n{END}\n"
 
     return _CELL.sub(renewed, text)
-
-
-def _fenced(block: str | None) -> str | None:
-    """Return what is in the fence between the two comments."""
-    return None if block is None else block.split("```text\n", 1)[1].rsplit("\n```", 1)[0]
 
 
 def tutorials(files: tuple[Path, ...] = (), /) -> None:

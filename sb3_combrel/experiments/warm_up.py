@@ -8,11 +8,7 @@ from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
 
 def warm_up(relevance: bool = False) -> None:
-    """
-    Learn a few steps with each method; Numba stores what it compiles in its cache.
-
-    :param relevance: also compile what only the variants with relevance use
-    """
+    """Learn a few steps with each method, also with relevance; Numba stores what it compiles in its cache."""
     env = make_env(mountain_car.SOURCE_ID)
     source = SourceInstances.from_q_learning(env, n_instances=50, seed=0, total_timesteps=100)
     transfers = list(mountain_car.methods(source).values())

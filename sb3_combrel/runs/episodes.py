@@ -38,11 +38,7 @@ class Episodes(NamedTuple):
 
 
 class EpisodeRecorder(BaseCallback):
-    """
-    Keeps steps, return and end of every episode, and stops the learning after some number of them.
-
-    :param n_episodes: after so many; None for never
-    """
+    """Keeps steps, return and end of every episode, and stops the learning after ``n_episodes``, or never."""
 
     def __init__(self, n_episodes: int | None = None):
         super().__init__()
@@ -68,7 +64,6 @@ def play(model: Any, env: gym.Env, n_episodes: int, seed: int, keeps_state: bool
 
     :param model: anything with the ``predict`` of Stable-Baselines3
     :param env: the environment, which has a time limit
-    :param n_episodes: how many
     :param seed: seed of the environment, at the first reset
     :param keeps_state: whether the state that ``predict`` returns is handed to its next call
     """

@@ -124,13 +124,7 @@ class Job:
         return []
 
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
-        """
-        Measure what the result has in ``more``.
-
-        :param model: after learning
-        :param result: what is known already
-        :param callbacks: those of :meth:`callbacks`
-        """
+        """Measure what the result has in ``more``, after learning; ``callbacks`` are those of :meth:`callbacks`."""
         return {}
 
     def carry_out(self) -> Result:
@@ -173,7 +167,6 @@ def make_env(task: Task, max_episode_steps: int | None = None, **kwargs: Any) ->
     """
     Make an environment; those of this repository are registered if need be.
 
-    :param task: id, specification, or a function without arguments
     :param max_episode_steps: steps after which an episode is cut off, unless a function makes it; None: the task's own
     :param kwargs: further arguments of ``gymnasium.make``
     :raises ValueError: if the function makes something else

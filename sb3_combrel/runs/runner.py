@@ -151,11 +151,7 @@ def run_missing(
 
 
 def check_all_succeeded(results: Sequence[Result]) -> None:
-    """
-    Raise an error if jobs have failed.
-
-    :raises JobError: with the number of failed jobs, and name, exception and traceback of the first
-    """
+    """:raises JobError: if jobs have failed, with their number, and name, exception and traceback of the first"""
     failed = [result for result in results if result.error]
     if failed:
         first = failed[0]
@@ -164,12 +160,7 @@ def check_all_succeeded(results: Sequence[Result]) -> None:
 
 
 def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None:
-    """
-    Read the settings and the result of a job from a folder; None if it has none or a file that is not whole.
-
-    :param output: the folder
-    :param name: of the job
-    """
+    """Read the settings and the result of a job from a folder; None if it has none or a file that is not whole."""
     try:
         content = json.loads((output / FOLDER / f"{name}.json").read_text())
         return dict(content["settings"]), Result(**content["result"])
@@ -181,7 +172,6 @@ def prepare_folder(output: Path) -> None:
     """
     Prepare a folder for results; those that are there are kept.
 
-    :param output: the folder
     :raises ValueError: if it has files that are not results
     """
     if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
@@ -246,14 +236,7 @@ def _pack(job: Job) -> bytes:
 
 
 def perform(packed: bytes, version: str, caller: int) -> bytes:
-    """
-    Carry out a job, in one thread: what runs on the worker. An exception of the job is in its result.
-
-    :param packed: the job, pickled
-    :param version: of this package where the job comes from
-    :param caller: id of the process that the job comes from
-    :return: the result, pickled
-    """
+    """Carry out a pickled job in one thread: what runs on the worker. An exception of the job is in its result."""
     if version != __version__:
         raise RuntimeError(f"the worker has sb3-combrel {__version__}, the caller {version}; install the same on both")
     if os.getpid() != caller and threading.current_thread() is threading.main_thread():

@@ -13,13 +13,7 @@ FOLDER = "sources"
 
 
 def load_or_learn(path: Path, learn: Callable[[], SourceInstances], console: Console) -> SourceInstances:
-    """
-    Load instances from a file, or learn them and write it.
-
-    :param path: the file
-    :param learn: learns them
-    :param console: where to show what is being done
-    """
+    """Load instances from a file, or learn them and write it."""
     if path.exists():
         try:
             return SourceInstances.load(path)

@@ -62,6 +62,22 @@ class TestDemo:
         for method in METHODS:
             for seed in range(2):
                 assert list(folder.glob(f"tensorboard/{method}_seed{seed}_*/events.out.tfevents.*"))
+        tables = (folder / "tables.md").read_text()
+        for text in ("Steps to goal", "steps saved", "no transfer", "East<-Right + Neutral", "(x, vx) + (y, vy)"):
+            assert text in tables and text in written
+        ending = written[written.index("Everything is in") :]
+        assert all(name in ending for name in {str(folder), "What to try next", *OUTPUTS} - {"car.mp4"})
+        model = FittedRMax.load(folder / "car.zip")
+        with gymnasium.make("combrel/MountainCar4D-v0") as env:
+            assert env.action_space.contains(int(model.predict(env.reset(seed=0)[0], deterministic=True)[0]))
+
+    def test_a_second_call_learns_nothing_again_and_mixes_no_settings(self, folder, no_film):
+        before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")}
+        status, written = run_tiny_demo(folder)
+        assert status == 0 and "8 of 8 runs were complete already" in written
+        assert {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")} == before
+        status, written = run_tiny_demo(folder, "--max-episode-steps", "50")
+        assert status == 1 and "max_episode_steps was 60 and is 50" in written
 
     def test_every_episode_of_every_run_is_in_the_results(self, first_call):
         rows = rows_of(first_call[0] / "results.csv")
@@ -73,44 +89,6 @@ class TestDemo:
         ]
         assert {(row["steps"], row["reached_goal"]) for row in rows} == {("60", "0")}
 
-    def test_the_tables_are_shown_and_kept(self, first_call):
-        folder, _, written = first_call
-        tables = (folder / "tables.md").read_text()
-        for text in ("Steps to goal", "steps saved", "no transfer", "East<-Right + Neutral", "(x, vx) + (y, vy)"):
-            assert text in tables
-            assert text in written
-
-    def test_the_model_drives(self, first_call):
-        model = FittedRMax.load(first_call[0] / "car.zip")
-        env = gymnasium.make("combrel/MountainCar4D-v0")
-        action, _ = model.predict(env.reset(seed=0)[0], deterministic=True)
-        assert env.action_space.contains(int(action))
-
-    def test_the_demo_ends_with_the_paths_of_its_outputs_and_further_commands(self, first_call):
-        folder, _, written = first_call
-        ending = written[written.index("Everything is in") :]
-        assert str(folder) in ending
-        assert all(name in ending for name in set(OUTPUTS) - {"car.mp4"})
-        assert "What to try next" in ending
-
-    def test_a_second_call_learns_nothing_again(self, folder, no_film):
-        before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")}
-        status, written = run_tiny_demo(folder)
-        assert status == 0
-        assert "8 of 8 runs were complete already" in written
-        assert {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")} == before
-
-    def test_more_runs_are_added_to_those_that_are_there(self, folder, no_film):
-        status, written = run_tiny_demo(folder, "--seeds", "3")
-        assert status == 0
-        assert "8 of 12 runs were complete already" in written
-        assert len(rows_of(folder / "results.csv")) == 24
-
-    def test_results_of_other_settings_are_not_mixed_with_new_ones(self, folder):
-        status, written = run_tiny_demo(folder, "--max-episode-steps", "50")
-        assert status == 1
-        assert "max_episode_steps was 60 and is 50" in written
-
     def test_fresh_deletes_earlier_results_and_nothing_of_the_users(self, folder, no_film):
         (folder / "notes.txt").write_text("mine")
         status, written = run_tiny_demo(folder, "--fresh", "--max-episode-steps", "50")
@@ -119,20 +97,15 @@ class TestDemo:
         assert {row["steps"] for row in rows_of(folder / "results.csv")} == {"50"}
         assert (folder / "notes.txt").read_text() == "mine"
 
-    @pytest.mark.parametrize("fresh", [(), ("--fresh",)])
-    def test_a_folder_of_other_things_is_left_alone(self, tmp_path, fresh):
+    def test_a_folder_of_other_things_is_left_alone_and_bad_numbers_are_refused(self, tmp_path):
         (tmp_path / "source.npz").write_text("mine")
-        status, written = run_tiny_demo(tmp_path, *fresh)
-        assert status == 1
-        assert "--output" in written
+        for more in ((), ("--fresh",)):
+            status, written = run_tiny_demo(tmp_path, *more)
+            assert status == 1 and "--output" in written
+        for option in ("--seeds", "--episodes", "--max-episode-steps", "--workers"):
+            status, written = call_for_all_output("demo", "--output", tmp_path / "new", option, "0")
+            assert status == 1 and "of at least 1" in written and "got 0" in written
         assert [path.name for path in tmp_path.iterdir()] == ["source.npz"]
-
-    @pytest.mark.parametrize("option", ["--seeds", "--episodes", "--max-episode-steps", "--workers"])
-    def test_numbers_below_one_are_refused(self, tmp_path, option):
-        status, written = call_for_all_output("demo", "--output", tmp_path / "new", option, "0")
-        assert status == 1
-        assert "must be at least 1, got 0" in written
-        assert not (tmp_path / "new").exists()
 
     @pytest.mark.long
     @pytest.mark.parametrize("renderer", ["egl", "disable"])

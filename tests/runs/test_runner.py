@@ -125,10 +125,7 @@ def test_jobs_that_cannot_be_told_apart_or_sent_are_refused(tmp_path):
     with pytest.raises(ValueError, match="locked, seed 0 cannot be sent to a worker, its pickling failed"):
         run_missing([locked], backend=HERE)
     assert run_missing([], backend=HERE) == []
-
-
-def test_a_worker_of_another_version_refuses_its_job():
-    with pytest.raises(RuntimeError, match="the caller 0.0; install the same"):
+    with pytest.raises(RuntimeError, match="install the same on both"):
         perform(b"", "0.0", os.getpid())
 
 
@@ -142,16 +139,12 @@ def test_a_worker_of_another_version_refuses_its_job():
         (Backend("dask"), "address of dask must be a host and a port .*got None. Start one with: dask scheduler"),
         (Backend("ray", address="ray://a:1"), "address of ray must be a host and a port"),
         (Backend("dask", address="tcp://a:none"), "got 'tcp://a:none'"),
+        (Backend("dask", address=f"tcp://{HOST}:{free_port()}"), "no dask cluster answers at .*Start one with"),
     ],
 )
 def test_a_backend_that_cannot_be_used_says_why(backend, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, ConnectionError), match=message):
         backend.check()
-
-
-def test_where_nothing_listens_is_said_at_once():
-    with pytest.raises(ConnectionError, match="no dask cluster answers at .*Start one with"):
-        Backend("dask", address=f"tcp://{HOST}:{free_port()}").check()
     LOCAL.check()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -57,8 +56,8 @@ def benchmark(
     check_count("seeds", seeds)
     check_count("first_seed", first_seed, min=0)
     chosen_pairs, chosen_methods = pairs_of(pairs), methods_of(methods)
-    _check_names("pairs", [pair.name for pair in chosen_pairs])
-    _check_names("methods", [method.name for method in chosen_methods])
+    _check_names("pairs", chosen_pairs)
+    _check_names("methods", chosen_methods)
     _check_sources(chosen_pairs)
     backend.check()
     console = console or Console()
@@ -76,12 +75,7 @@ def benchmark(
 
 
 def pairs_of(names: Sequence[str]) -> list[Pair]:
-    """
-    Return the pairs of some names.
-
-    :param names: of :data:`PAIRS`, files that define ``PAIR``, or "all"
-    :raises ValueError: if there is no such pair
-    """
+    """Return the pairs of some names, see :func:`benchmark`."""
     found: list[Pair] = []
     for name in names:
         if name == ALL:
@@ -98,22 +92,12 @@ def pairs_of(names: Sequence[str]) -> list[Pair]:
                 f"pairs must be of {', '.join(PAIRS)}, or all; a pair of your own is the path of a file that ends in .py and "
                 f"defines PAIR; got {name!r}"
             )
-    if not found:
-        raise ValueError("pairs must name at least one pair, got none")
     return found
 
 
 def methods_of(names: Sequence[str]) -> list[Method]:
-    """
-    Return the methods of some names.
-
-    :param names: see :func:`benchmark`
-    :raises ValueError: if there is no such method
-    """
-    found = [method for name in names for method in (METHODS.values() if name == ALL else [method_of(name)])]
-    if not found:
-        raise ValueError("methods must name at least one method, got none")
-    return found
+    """Return the methods of some names, see :func:`benchmark`."""
+    return [method for name in names for method in (METHODS.values() if name == ALL else [method_of(name)])]
 
 
 def prepare_sources(
@@ -122,9 +106,6 @@ def prepare_sources(
     """
     Learn the source tasks of pairs, or load what was learned before.
 
-    :param pairs: the pairs
-    :param output: the output folder
-    :param console: where to show what is being done
     :return: instances by the name of the pair, () where they could not be learned; and why not, by the name of the pair
     """
     found: dict[str, tuple[SourceInstances, ...]] = {}
@@ -141,17 +122,15 @@ def prepare_sources(
     return found, failed
 
 
-def _check_names(argument: str, names: Sequence[str]) -> None:
-    """Names of files do not tell capital letters, nor some signs, apart."""
-    twice = [name for name, n in Counter(file_name(name, "", 0) for name in names).items() if n > 1]
-    if twice:
-        raise ValueError(f"{argument} must have different names, got {', '.join(names)}")
+def _check_names(argument: str, chosen: Sequence[Pair] | Sequence[Method]) -> None:
+    """There must be some; names of files do not tell capital letters, nor some signs, apart."""
+    names = [each.name for each in chosen]
+    if not names or len({file_name(name, "", 0) for name in names}) < len(names):
+        raise ValueError(f"{argument} must be at least one, with different names, got {', '.join(names) or 'none'}")
 
 
 def _check_sources(pairs: Sequence[Pair]) -> None:
-    """
-    :raises ValueError: if two sources have the same file and are recorded in different ways
-    """
+    """Two sources that have the same file must be recorded in the same way."""
     seen: dict[str, Any] = {}
     for pair in pairs:
         for source in pair.sources:

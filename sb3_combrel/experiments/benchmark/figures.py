@@ -31,9 +31,6 @@ def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Meth
 
     Curves are interquartile means with 95% bootstrap bands. The marker of a method that differs from no transfer is full.
 
-    :param pair: the pair
-    :param cells: by method, in the order of panels
-    :param compared: what was computed of those that have runs
     :param path: file to write, without its suffix
     :return: the PNG and the SVG file
     """

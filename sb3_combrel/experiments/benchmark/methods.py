@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from sb3_combrel import (
@@ -74,23 +75,15 @@ class Method:
 
 
 def run_as(method: Method, methods: Sequence[Method], pair: Pair) -> str:
-    """
-    Name of the method whose runs are those of a method in a pair: its own where the one that makes the same is not chosen.
-
-    :param method: one of those that are chosen
-    :param methods: all that are chosen
-    :param pair: the pair
-    """
+    """Name of the method whose runs are those of one in a pair: its own where the one that makes the same is not chosen."""
     name = method.run_as(pair)
     return name if any(each.name == name for each in methods) else method.name
 
 
 def the_one(sources: Sources, name: str) -> SourceInstances:
     """
-    Return the instances of the only source.
+    Return the instances of the only source, for the method of a name.
 
-    :param sources: of a pair
-    :param name: of the method that takes no more than one
     :raises DoesNotFit: if there are several
     """
     if isinstance(sources, SourceInstances):
@@ -135,6 +128,9 @@ _RBM = (
 )
 _TAYLOR = 'Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning", ECML 2008'
 
+# Takes target steps until it has found a mapping.
+_finding = partial(Method, finds_mapping=True)
+
 #: In the order of tables. Another method of this package is another line.
 _METHODS: Sequence[Method] = (
     Method(NONE, "No transfer: Fitted R-Max alone.", lambda sources, pair: None),
@@ -150,78 +146,67 @@ _METHODS: Sequence[Method] = (
     ),
     Method("oracle", "Control: the source as a prior through the known mapping.", _oracle),
     Method("TIMBREL", f"Instances through the known mapping, by hand ({_TAYLOR}).", _timbrel),
-    Method(
+    _finding(
         "COMBREL-paper",
         f"Instances through the mapping that complies best with the first episode ({_FACHANTIDIS}).",
         lambda sources, pair: COMBREL.paper(sources, pair.instance_mappings),
-        finds_mapping=True,
     ),
-    Method(
+    _finding(
         "COMBREL-instances",
         "COMBREL with instances as this package has it: compliance online, with the guards of its defaults.",
         lambda sources, pair: COMBREL(sources, pair.instance_mappings, use="instances"),
-        finds_mapping=True,
     ),
-    Method(
+    _finding(
         "COMBREL",
         "COMBREL by default: factored mappings as a prior, without mirrored variables.",
         lambda sources, pair: COMBREL(sources),
-        finds_mapping=True,
         same_as=_same_as_factored,
     ),
-    Method(
+    _finding(
         FACTORED,
         "COMBREL with factored mappings as a prior, mirrored ones too where the pair has such.",
         lambda sources, pair: COMBREL(sources, pair.mappings, use="prior"),
-        finds_mapping=True,
     ),
-    Method(
+    _finding(
         "MASTER",
         f"The one mapping that predicts 100 random transitions best, as a prior ({_MASTER}).",
         lambda sources, pair: MASTER(sources, pair.instance_mappings),
-        finds_mapping=True,
         compiled_steps=DEFAULT_RANDOM_STEPS + COMPILED_STEPS,
     ),
-    Method(
+    _finding(
         "experts",
         f"The source's policy seen through mappings, ten at most, and the agent: a bandit chooses who acts ({_TALVITIE}).",
         lambda sources, pair: MappingExperts(sources, pair.instance_mappings),
-        finds_mapping=True,
     ),
-    Method(
+    _finding(
         "sample-transfer",
         f"1000 instances of all sources through all mappings, drawn by the compliance of tasks and by relevance ({_LAZARIC}).",
         lambda sources, pair: SampleTransfer(sources, pair.instance_mappings),
-        finds_mapping=True,
         compiled_steps=2 * COMPILED_STEPS,
     ),
-    Method(
+    _finding(
         "sample-transfer-near",
         "The same with a relevance that does not favour instances far from the target's transitions.",
         lambda sources, pair: SampleTransfer(sources, pair.instance_mappings, relevance="near"),
-        finds_mapping=True,
         compiled_steps=2 * COMPILED_STEPS,
     ),
-    Method(
+    _finding(
         "soft-homomorphism",
         f"The source as a prior through a mixture of mappings that is fitted to the target ({_SORG}).",
         lambda sources, pair: SoftHomomorphism(
             the_one(sources, "SoftHomomorphism"), mirrored=pair.mappings.startswith("signed_")
         ),
-        finds_mapping=True,
     ),
-    Method(
+    _finding(
         "sparse-coding",
         f"All source data through a mapping by sparse coding of 200 random transitions ({_CODING}).",
         _learned(SparseCodingMapping),
-        finds_mapping=True,
         compiled_steps=DEFAULT_SAMPLE_STEPS + COMPILED_STEPS,
     ),
-    Method(
+    _finding(
         "three-way-RBM",
         f"All source data through a three-way restricted Boltzmann machine of 200 random transitions ({_RBM}).",
         _learned(ThreeWayRBM),
-        finds_mapping=True,
         compiled_steps=DEFAULT_SAMPLE_STEPS + COMPILED_STEPS,
     ),
 )
@@ -244,17 +229,14 @@ def method_of(text: str) -> Method:
         raise ValueError(f"methods must be of {', '.join(METHODS)}, or all; {_HOW_TO_NAME}; got {text!r}")
     found, digest = load_attribute("methods", text)
     if isinstance(found, Method):
-        return Method(**{**vars(found), "digest": digest})
+        return replace(found, digest=digest)
     name = text.rpartition(":")[2]
     if inspect.isabstract(found):
         raise ValueError(f"methods: {text} lacks {', '.join(sorted(found.__abstractmethods__))}, which a transfer method has")
+    description = (inspect.getdoc(found) or "").partition("\n")[0]
     if isinstance(found, type) and issubclass(found, Transfer):
         make: Any = found
-        return Method(name, _first_line(found), lambda sources, pair: make(sources), finds_mapping=True, digest=digest)
+        return _finding(name, description, lambda sources, pair: make(sources), digest=digest)
     if callable(found) and not isinstance(found, type):
-        return Method(name, _first_line(found), found, finds_mapping=True, digest=digest)
+        return _finding(name, description, found, digest=digest)
     raise ValueError(f"methods: {text} must be a Method, a subclass of Transfer or a function, got {found!r}")
-
-
-def _first_line(found: Any) -> str:
-    return (inspect.getdoc(found) or "").partition("\n")[0]

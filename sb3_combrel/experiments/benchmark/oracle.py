@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -21,33 +20,26 @@ class KnownCopies(TIMBREL):
 
     :param source: a list of source instances
     :param mapping: one factored mapping for each source; no two have a target variable in common
-    :raises ValueError: if there are not as many mappings as sources; when learning starts, if one does not fit
+    :raises ValueError: when learning starts, if a mapping does not fit
     """
 
     def __init__(self, source: SourceLike, mapping: Sequence[FactoredMapping]):
         super().__init__(source, FactoredMapping(tuple(copy for each in mapping for copy in each.copies)), use="prior")
-        n_sources = len(load_sources(source))
-        if len(mapping) != n_sources:
-            raise ValueError(f"mapping must hold one factored mapping for each of {n_sources} sources, got {len(mapping)}")
         self.by_source = tuple(mapping)
-
-    def arguments(self) -> dict[str, Any]:
-        return {"source": self.source, "mapping": self.by_source}
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         sources = load_sources(self.source)
-        copies = []
-        for number, (source, each) in enumerate(zip(sources, self.by_source, strict=True)):
-            each.check(
+        for source, mapping in zip(sources, self.by_source, strict=True):
+            mapping.check(
                 n_source_variables=source.n_variables,
                 n_target_variables=task.n_variables,
                 n_source_actions=source.n_actions,
                 n_target_actions=task.n_actions,
             )
-            copies += [(number, copy) for copy in each.copies]
-        numbers = np.array([number for number, _ in copies], dtype=np.int64)
-        state, sign = (np.array([getattr(copy, name) for _, copy in copies]) for name in ("state_index", "state_sign"))
-        actions = np.array([copy.action for _, copy in copies], dtype=np.int64).T.copy()
+        copies = [copy for mapping in self.by_source for copy in mapping.copies]
+        numbers = np.repeat(np.arange(len(sources)), [len(mapping.copies) for mapping in self.by_source])
+        state, sign = (np.array([getattr(copy, name) for copy in copies]) for name in ("state_index", "state_sign"))
+        actions = np.array([copy.action for copy in copies], dtype=np.int64).T.copy()
         choice = Choice(np.tile(np.arange(len(copies)), (task.n_actions, 1)), actions)
         made = Copies(sources, numbers, state, sign, float(self.source_breadth), task.exploration_threshold)
         return SourcePrior(

@@ -13,7 +13,7 @@ import gymnasium as gym
 
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.checks import check_count, check_finite
-from sb3_combrel.experiments.suite.tasks import Source
+from sb3_combrel.experiments.suite.tasks import Source, check_budget
 from sb3_combrel.runs.job import Task, chosen_on_purpose, described, make_env
 from sb3_combrel.transfer.candidates import MappedVariables
 
@@ -91,40 +91,26 @@ class Pair:
 
     def __post_init__(self) -> None:
         check_name(self.name)
-        if (self.n_steps is None) == (self.n_episodes is None):
-            raise ValueError(
-                f"{self.name}: either n_steps or n_episodes must be given, got {self.n_steps!r} and {self.n_episodes!r}"
-            )
-        check_count("n_steps", self.n_steps, none_allowed=True)
-        check_count("n_episodes", self.n_episodes, none_allowed=True)
+        check_budget(self.name, self.n_steps, self.n_episodes)
         if self.threshold is not None:
             check_finite("threshold", self.threshold)
-        if not self.sources or not all(isinstance(source, Source) for source in self.sources):
-            raise ValueError(
-                f"{self.name}: sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}"
-            )
-        several = isinstance(self.known, Sequence) and all(isinstance(each, FactoredMapping) for each in self.known)
-        if several and len(self.known) != len(self.sources):  # type: ignore[arg-type]
-            raise ValueError(
-                f"{self.name}: known must have one factored mapping for each of the {len(self.sources)} sources, "
-                f"got {len(self.known)}"  # type: ignore[arg-type]
-            )
-        self._check_sources_by_action()
+        self._check(
+            bool(self.sources) and all(isinstance(source, Source) for source in self.sources),
+            f"sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}",
+        )
+        n, numbers = len(self.sources), self.sources_by_action
+        if isinstance(self.known, Sequence) and all(isinstance(each, FactoredMapping) for each in self.known):
+            right = f"known must have one factored mapping for each of the {n} sources"
+            self._check(len(self.known) == n, f"{right}, got {len(self.known)}")
+        if numbers and isinstance(self.known_by_action, Sequence):
+            right = f"sources_by_action must have one number for each of the {len(self.known_by_action)} mappings"
+            self._check(len(numbers) == len(self.known_by_action), f"{right} of known_by_action, got {len(numbers)}")
+        right = f"sources_by_action must have numbers of the {n} sources, counted from 0"
+        self._check(set(numbers) <= set(range(n)), f"{right}, got {tuple(numbers)!r}")
 
-    def _check_sources_by_action(self) -> None:
-        numbers, known = self.sources_by_action, self.known_by_action
-        if not numbers:
-            return
-        if isinstance(known, Sequence) and len(numbers) != len(known):
-            raise ValueError(
-                f"{self.name}: sources_by_action must have one number for each of the {len(known)} mappings of "
-                f"known_by_action, got {len(numbers)}"
-            )
-        if not set(numbers) <= set(range(len(self.sources))):
-            raise ValueError(
-                f"{self.name}: sources_by_action must have numbers of the {len(self.sources)} sources, counted from 0, "
-                f"got {tuple(numbers)!r}"
-            )
+    def _check(self, is_right: bool, message: str) -> None:
+        if not is_right:
+            raise ValueError(f"{self.name}: {message}")
 
     @property
     def budget(self) -> str:
@@ -136,12 +122,7 @@ class Pair:
         return make_env(self.target)
 
     def agrees(self, mapped: MappedVariables) -> bool:
-        """
-        Whether what a method makes of a target action is what the known mapping makes of it.
-
-        :param mapped: what it makes of each target variable
-        :return: whether it is the same for all variables that ``known_by_action`` maps under that action
-        """
+        """Whether what a method makes of a target action is what the known mapping makes of the variables that it moves."""
         assert self.known_by_action is not None
         one = isinstance(self.known_by_action, InterTaskMapping)
         a = mapped.target_action

@@ -26,24 +26,18 @@ from sb3_combrel.experiments.benchmark.scores import (
     compare,
     mean_ranks,
     measure_name,
+    performance_of,
     ranks,
 )
 from sb3_combrel.runs.job import Result
 
 OVERVIEW, PAGE, RUNS = "overview", "benchmark", "runs.csv"
+#: By pair and method; scores only where there are runs.
+Cells = Mapping[str, Mapping[str, Cell]]
+Scores = Mapping[str, Mapping[str, MethodScores]]
 _EMPTY = "-"
-_HEADER = (
-    "method",
-    "runs",
-    "performance",
-    "p",
-    "rank",
-    *(measure.replace("_", " ") for measure in MEASURES),
-    "known mapping",
-    "steps to a mapping",
-    "seconds",
-    "note",
-)
+_MEASURES = tuple(measure.replace("_", " ") for measure in MEASURES)
+_HEADER = ("method", "runs", "performance", "p", "rank", *_MEASURES, "known mapping", "steps to a mapping", "seconds", "note")
 
 
 def write_report(
@@ -58,13 +52,9 @@ def write_report(
     """
     Make a table (Markdown, CSV) and a picture (PNG, SVG) for each pair, an overview, a CSV of all runs, and the page.
 
-    :param pairs: the pairs
-    :param methods: the methods, in the order of tables
-    :param seeds: seeds that count
-    :param outcomes: results of all runs
-    :param output: folder to write to
-    :param command: the command that made them, for the page
-    :param console: where to show the tables
+    :param methods: in the order of tables
+    :param seeds: those that count
+    :param command: the command that made the results, for the page
     :return: the files
     """
     cells = {pair.name: cells_of(pair, methods, outcomes, seeds) for pair in pairs}
@@ -85,22 +75,18 @@ def write_report(
 
 
 def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, MethodScores]) -> Table:
-    """
-    Make the table of a pair: a row for each method.
-
-    :param pair: the pair
-    :param cells: by method
-    :param compared: what was computed of those that have runs
-    """
-    places = ranks({name: each.performance for name, each in compared.items()}, cells)
+    """Make the table of a pair: a row for each method."""
+    places = ranks(performance_of(compared), cells)
     rows = []
     for name, cell in cells.items():
         found = compared.get(name)
         if found is None:
             rows.append((name, *[""] * (len(_HEADER) - 2), note_of(name, cell)))
             continue
-        shares = _known(cell, "known_share")
-        steps = _known(cell, "mapping_steps")
+        shares, steps = (
+            [each.more[name] for each in cell.outcomes if each.more[name] is not None]
+            for name in ("known_share", "mapping_steps")
+        )
         row = (
             name,
             str(len(cell.outcomes)),
@@ -164,18 +150,11 @@ def _measure_text(pair: Pair, found: MethodScores, measure: str) -> str:
     return text if np.isnan(p_value) else f"{text} ({p_text(p_value)})"
 
 
-def rank_table(
-    methods: Sequence[Method], cells: Mapping[str, Mapping[str, Cell]], compared: Mapping[str, Mapping[str, MethodScores]]
-) -> Table:
+def rank_table(methods: Sequence[Method], cells: Cells, compared: Scores) -> Table:
     """
     Make the table of mean ranks: and in how many pairs a method is better and worse than no transfer, by the corrected tests.
-
-    :param methods: the methods
-    :param cells: by pair and method
-    :param compared: by pair and method, of those that have runs
     """
-    performance = {pair: {name: each.performance for name, each in found.items()} for pair, found in compared.items()}
-    found = mean_ranks(performance, cells)
+    found = mean_ranks({pair: performance_of(scores) for pair, scores in compared.items()}, cells)
     rows = []
     for name in sorted(found, key=lambda each: found[each].rank):
         rank = found[name]
@@ -189,24 +168,11 @@ def rank_table(
     return Table(f"Mean rank over pairs, and in how many a method differs from none (p < {ALPHA:g})", header, rows)
 
 
-def performance_table(
-    pairs: Sequence[Pair],
-    methods: Sequence[Method],
-    cells: Mapping[str, Mapping[str, Cell]],
-    compared: Mapping[str, Mapping[str, MethodScores]],
-) -> Table:
+def performance_table(pairs: Sequence[Pair], methods: Sequence[Method], cells: Cells, compared: Scores) -> Table:
     """
     Make the table of performance: interquartile means, and ranks in brackets; a row for each method, a column for each pair.
-
-    :param pairs: the pairs
-    :param methods: the methods
-    :param cells: by pair and method
-    :param compared: by pair and method, of those that have runs
     """
-    places = {
-        name: ranks({method: each.performance for method, each in found.items()}, cells[name])
-        for name, found in compared.items()
-    }
+    places = {name: ranks(performance_of(scores), cells[name]) for name, scores in compared.items()}
     rows = []
     for method in methods:
         row = [method.name]
@@ -252,11 +218,6 @@ def few_runs(n_seeds: int) -> str:
         f"seeds={n_seeds} is too few for intervals and tests, which need at least {FEWEST_RUNS} runs of each method: tables "
         "have means alone"
     )
-
-
-def _known(cell: Cell, name: str) -> list[float]:
-    """What the runs of a method have measured, where they have."""
-    return [each.more[name] for each in cell.outcomes if each.more[name] is not None]
 
 
 def _write_runs(results: Sequence[Result], path: Path) -> Path:

@@ -110,8 +110,6 @@ def known_share(pair: Pair, transfer: Any) -> float | None:
     A decision is a use of a candidate, as ``uses`` counts them: with instances a state and action of the agent for which
     instances were transferred, with a prior a transition of the target while a mapping was chosen.
 
-    :param pair: the pair
-    :param transfer: the transfer method after learning, or None
     :return: None if nobody knows the mapping, nothing was decided, or the method has no ``uses`` and ``mapped_variables``
     """
     if pair.known_by_action is None or not (hasattr(transfer, "uses") and hasattr(transfer, "mapped_variables")):
@@ -139,9 +137,6 @@ def jobs_of(
     """
     Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once.
 
-    :param pairs: the pairs
-    :param methods: the methods
-    :param seeds: the seeds
     :param sources: instances of each pair's sources, by name; () where they could not be learned
     """
     by_name = {method.name: method for method in methods}

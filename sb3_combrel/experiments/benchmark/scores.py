@@ -76,14 +76,7 @@ class MethodScores(NamedTuple):
 
 
 def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], seeds: Sequence[int]) -> dict[str, Cell]:
-    """
-    Gather the outcomes of a pair by method.
-
-    :param pair: the pair
-    :param methods: all that are chosen
-    :param outcomes: of any runs
-    :param seeds: seeds that count
-    """
+    """Gather the outcomes of a pair, and of the seeds that count, by method."""
     own = sorted((each for each in outcomes if each.group == pair.name and each.seed in seeds), key=lambda each: each.seed)
     cells = {}
     for method in methods:
@@ -105,8 +98,6 @@ def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]
 
     Over steps, all runs of the pair are compared over as many as the shortest has in episodes that have ended.
 
-    :param pair: the pair
-    :param cells: by method
     :return: for each method with runs, shape (n_runs,)
     """
     curves = {name: curves_of(cell.outcomes) for name, cell in cells.items() if cell.outcomes}
@@ -123,13 +114,7 @@ def _steps_of_all(cells: Mapping[str, Cell]) -> int:
 
 
 def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
-    """
-    Compare the methods of a pair with no transfer, where that has been run.
-
-    :param pair: the pair
-    :param cells: by method
-    :return: by method, of those with runs
-    """
+    """Compare the methods of a pair that have runs with no transfer, where that has been run."""
     of_runs = performances(pair, cells)
     without = of_runs.get(NONE)
     raw, measures = {}, {}
@@ -172,27 +157,22 @@ def measure_name(pair: Pair, measure: str) -> str:
 
 
 def _measures(pair: Pair, cell: Cell, without: Cell, floor: float, n_steps: int) -> TransferMeasures:
-    curves, curves_without = curves_of(cell.outcomes), curves_of(without.outcomes)
-    shortest = int(min(each.n_episodes.min() for each in (curves, curves_without)))
-    return compare_learning(
-        curves,
-        curves_without,
-        threshold=pair.threshold,
-        **counts_within(shortest),
-        floor=min(0.0, floor),
-        n_steps=n_steps,
-    )
+    both = curves_of(cell.outcomes), curves_of(without.outcomes)
+    counts = counts_within(int(min(each.n_episodes.min() for each in both)))
+    return compare_learning(both[0], both[1], threshold=pair.threshold, floor=min(0.0, floor), n_steps=n_steps, **counts)
 
 
 def _p_values(pair: Pair, measures: Mapping[str, TransferMeasures], measure: str) -> dict[str, float]:
-    found = {}
-    for name, of_method in measures.items():
-        comparison = getattr(of_method, measure_name(pair, measure))
-        if comparison is None or min(len(comparison.with_transfer), len(comparison.without)) < FEWEST_RUNS:
-            found[name] = np.nan
-        else:
-            found[name] = comparison.p_value
-    return found
+    of_methods = {name: getattr(each, measure_name(pair, measure)) for name, each in measures.items()}
+    return {
+        name: np.nan if each is None or min(map(len, each[:2])) < FEWEST_RUNS else each.p_value
+        for name, each in of_methods.items()
+    }
+
+
+def performance_of(scores: Mapping[str, MethodScores]) -> dict[str, np.ndarray]:
+    """The performance of each method's runs, shape (n_runs,)."""
+    return {name: each.performance for name, each in scores.items()}
 
 
 def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, float]:
@@ -200,9 +180,6 @@ def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> d
     Rank the methods of a pair by the interquartile mean of their performance; 1 is the best, equal ones share their ranks.
 
     Methods whose runs are the same count as one.
-
-    :param performance: of each method's runs, shape (n_runs,)
-    :param cells: by method
     """
     distinct = _distinct(performance, cells)
     means = np.array([float(interquartile_mean(each)) for each in distinct.values()])
@@ -211,13 +188,7 @@ def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> d
 
 
 class MeanRank(NamedTuple):
-    """
-    The mean rank of a method over pairs.
-
-    :param rank: the mean
-    :param low: lower bound of its 95% bootstrap interval, NaN where a pair has too few runs; ``high``: upper bound
-    :param n_pairs: number of pairs
-    """
+    """The mean rank of a method over ``n_pairs`` pairs, and its 95% bootstrap interval, NaN where a pair has too few runs."""
 
     rank: float
     low: float
@@ -239,10 +210,7 @@ def mean_ranks(
     are stretched to the number of methods of the pair that has most: the best has 1, the last that number. Methods whose runs
     are the same count as one.
 
-    :param performance: of the runs, shape (n_runs,), by pair and method
-    :param cells: by pair and method
-    :param n_resamples: number of draws
-    :param seed: of the draws
+    :param performance: of the runs, shape (n_runs,), by pair and method; ``cells``: likewise
     """
     rng = np.random.default_rng(seed)
     distinct = {pair: _distinct(of_methods, cells[pair]) for pair, of_methods in performance.items()}

@@ -33,13 +33,7 @@ TITLE = "Both tasks of the iCub at several kernel breadths, with and without noi
 
 
 def jobs_of(n_seeds: int, n_episodes: int, breadths: Sequence[float]) -> list[Job]:
-    """
-    Make the runs, seed by seed; the group is the task, the method the whole setting.
-
-    :param n_seeds: runs of each setting, with the seeds from 0 on
-    :param n_episodes: episodes of each run
-    :param breadths: values of ``model_breadth``
-    """
+    """Make the runs, seed by seed; the group is the task, the method the whole setting."""
     return [
         Job(
             group=task,

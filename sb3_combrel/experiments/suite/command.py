@@ -10,6 +10,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +60,7 @@ def variant_of(text: str) -> Variant:
 
 
 def seeds_of(text: str, first_seed: int = 0) -> list[int]:
-    """
-    Read seeds from the command line.
-
-    :param text: numbers and ranges, such as ``0-9`` or ``0,2,5-7``
-    :param first_seed: is added to each
-    :raises ValueError: if it is not that
-    """
+    """Read seeds such as ``0-9`` or ``0,2,5-7`` from the command line; ``first_seed`` is added to each."""
     seeds: list[int] = []
     for part in text.split(","):
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
@@ -91,20 +86,24 @@ def run_suite(
 
     What is complete is not done again; all runs in the folder are in the CSV files, the tables are of these arguments' runs.
 
-    :param output: folder for all results
-    :param tasks: what to learn
-    :param variants: the settings to compare, with different names
-    :param seeds: seeds of the runs
     :param jobs: processes at a time; None: one a core
-    :param evaluation_episodes: episodes to play after learning
     :param reference: name of the variant that the others are compared with; None for the first
-    :param test: ``"welch"`` or ``"mann-whitney"``
-    :param console: where to write; None for the standard output
+    :param test: one of :data:`~sb3_combrel.comparison.statistics.TESTS`
     :raises ValueError: if an argument is out of its range, or the folder has a run with the same name and other settings
     """
+    check_count("jobs", jobs, none_allowed=True)
+    check_count("evaluation_episodes", evaluation_episodes)
     names = [variant.name for variant in variants]
-    reference = names[0] if reference is None and names else reference
-    _check(variants, tasks, jobs, evaluation_episodes, reference, test)
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"variants must be at least one, with different names, got {names!r}")
+    reference = names[0] if reference is None else reference
+    if reference not in names:
+        raise ValueError(f"reference must be the name of a variant, one of {', '.join(names)}, got {reference!r}")
+    if test not in TESTS:
+        raise ValueError(f"test must be one of {', '.join(TESTS)}, got {test!r}")
+    for variant, task in product(variants, tasks):
+        if variant.transfer is not None:
+            check_transfer(variant.transfer, task)
     console = console or Console()
     prepare_folder(output)
     wanted = {source.name: source for task in tasks for own in variants if (source := own.source(task)) is not None}
@@ -118,29 +117,6 @@ def run_suite(
     tables = [overview, frozen, *(task_table(cells, task, names, f"p against {reference}") for task in tasks)]
     (output / TABLES).write_text("\n".join(table.as_markdown() for table in tables))
     console.print(overview.for_terminal())
-
-
-def _check(
-    variants: Sequence[Variant],
-    tasks: Sequence[Task],
-    jobs: int | None,
-    evaluation_episodes: int,
-    reference: str | None,
-    test: str,
-) -> None:
-    check_count("jobs", jobs, none_allowed=True)
-    check_count("evaluation_episodes", evaluation_episodes)
-    names = [variant.name for variant in variants]
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"variants must be at least one, with different names, got {names!r}")
-    if reference not in names:
-        raise ValueError(f"reference must be the name of a variant, one of {', '.join(names)}, got {reference!r}")
-    if test not in TESTS:
-        raise ValueError(f"test must be one of {', '.join(TESTS)}, got {test!r}")
-    for variant in variants:
-        for task in tasks:
-            if variant.transfer is not None:
-                check_transfer(variant.transfer, task)
 
 
 def _value(text: str) -> Any:

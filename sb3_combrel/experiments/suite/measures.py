@@ -33,12 +33,7 @@ class Measure(NamedTuple):
 
 
 def steps_in(first: int, last: int) -> Measure:
-    """
-    Measure the steps of episodes ``first`` to ``last``, counted from 1, together.
-
-    :param first: number of the first episode
-    :param last: number of the last episode
-    """
+    """Measure the steps of episodes ``first`` to ``last``, counted from 1, together."""
     return Measure(f"steps_{first}_to_{last}", lambda episodes: _of_range(episodes.steps, first, last, np.sum))
 
 
@@ -61,19 +56,12 @@ def steps_until_always(limit: int) -> Measure:
     Measure after how many steps of learning every further episode has at most ``limit`` steps; inf if that is never so.
 
     At least :data:`SHORTEST_TAIL` episodes must be left: a single short one at the end would prove nothing.
-
-    :param limit: steps of an episode
     """
     return Measure(f"steps_until_always_{limit}", lambda episodes: settled_after(episodes.steps, limit))
 
 
 def steps_until_median(limit: int, window: int = 5) -> Measure:
-    """
-    Measure after how many steps of learning the median of ``window`` episodes is at most ``limit``; inf if it never is.
-
-    :param limit: steps of an episode
-    :param window: number of episodes
-    """
+    """Measure after how many steps of learning the median of ``window`` episodes is at most ``limit``; inf if it never is."""
 
     def steps(episodes: Episodes) -> float:
         return float(steps_to_reach(episodes.steps[None], limit, window)[0])
@@ -81,26 +69,16 @@ def steps_until_median(limit: int, window: int = 5) -> Measure:
     return Measure(f"steps_until_median_{limit}", steps)
 
 
-def settled_after(steps: np.ndarray, limit: int, shortest_tail: int = SHORTEST_TAIL) -> float:
-    """
-    Count the steps up to the end of the last episode that has more than ``limit`` of them.
-
-    :param steps: steps of each episode, shape (n_episodes,)
-    :param limit: steps of an episode
-    :param shortest_tail: inf if fewer episodes than this follow
-    """
+def settled_after(steps: np.ndarray, limit: int) -> float:
+    """Count the steps up to the end of the last episode that has more than ``limit``; inf if too few follow."""
     too_long = np.flatnonzero(steps > limit)
     n_before = int(too_long[-1]) + 1 if len(too_long) else 0
-    return float(steps[:n_before].sum()) if len(steps) - n_before >= shortest_tail else np.inf
+    return float(steps[:n_before].sum()) if len(steps) - n_before >= SHORTEST_TAIL else np.inf
 
 
 def failures(episodes: Episodes, failure_return: float | None) -> np.ndarray:
     """
-    Tell which episodes have failed.
-
-    :param episodes: the episodes
-    :param failure_return: those have whose return is at most this; None: those that a time limit ended
-    :return: bool, shape (n_episodes,)
+    Tell which episodes have failed: those whose return is at most ``failure_return``; None: those that a time limit ended.
     """
     return ~episodes.terminated if failure_return is None else episodes.returns <= failure_return
 
@@ -110,30 +88,19 @@ def summary_of_learning(episodes: Episodes, failure_return: float | None) -> dic
     last = episodes.last(LAST)
     if not len(last.steps):
         return {"last10_return": np.nan, "last10_failed": np.nan}
-    return {
-        "last10_return": float(last.returns.mean()),
-        "last10_failed": float(failures(last, failure_return).mean()),
-    }
+    failed = failures(last, failure_return)
+    return {"last10_return": float(last.returns.mean()), "last10_failed": float(failed.mean())}
 
 
 def summary_of_evaluation(episodes: Episodes, failure_return: float | None, last10_return: float) -> dict[str, float]:
     """
-    Return what is recorded of evaluation episodes.
+    Return what is recorded of evaluation episodes, at least one.
 
     ``as_good`` is 1 if the mean return is at most 5% below that of the last episodes of learning and no episode failed.
-
-    :param episodes: the evaluation episodes, at least one
-    :param failure_return: see :func:`failures`
-    :param last10_return: mean return of the last episodes of learning
     """
     mean, n_failures = float(episodes.returns.mean()), int(failures(episodes, failure_return).sum())
     as_good = n_failures == 0 and mean >= last10_return - TOLERATED_LOSS * abs(last10_return)
-    return {
-        "mean": mean,
-        "worst": float(episodes.returns.min()),
-        "failures": n_failures,
-        "as_good": float(as_good),
-    }
+    return {"mean": mean, "worst": float(episodes.returns.min()), "failures": n_failures, "as_good": float(as_good)}
 
 
 def _of_range(column: np.ndarray, first: int, last: int, statistic: Callable[[np.ndarray], float]) -> float:

@@ -44,12 +44,7 @@ class MeanSuccessor(Model):
     n_successors: ClassVar[int] = 1
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
-        """
-        Predict from the target's own instances.
-
-        :param states: unit coordinates, shape (n, n_variables)
-        :param actions: int64, shape (n,)
-        """
+        """Predict from the target's own instances; see :class:`~sb3_combrel.models.base.Model`."""
         n, d = states.shape
         found = Predictions(np.zeros(n), np.zeros(n), np.zeros((n, self.n_successors)), np.zeros((n, self.n_successors, d)))
         for action in np.unique(actions):
@@ -73,7 +68,7 @@ class MeanSuccessor(Model):
         outcome = np.exp(-(squared - squared[:, :1]) / min(settings.model_breadth, settings.outcome_breadth) ** 2)
         outcome /= outcome.sum(axis=1, keepdims=True)
         goes_on = 1.0 - (outcome * self.instances.terminated[action, near]).sum(axis=1)
-        probability, effect = self._successors(mean, residual, weight)
+        probability, effect = _successors(self.n_successors, mean, residual, weight)
         return Predictions(
             weight=np.exp(-squared / settings.model_breadth**2).sum(axis=1),
             reward=(outcome * self.instances.reward[action, near]).sum(axis=1),
@@ -81,38 +76,31 @@ class MeanSuccessor(Model):
             effect=np.clip(effect, effects.min(axis=0), effects.max(axis=0)),
         )
 
-    def _successors(self, mean: np.ndarray, residual: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Probabilities, shape (n, n_successors), and effects, from the mean and the residuals of the nearest instances."""
-        return np.ones((len(mean), 1)), mean[:, None]
-
 
 class ResidualSuccessors(MeanSuccessor):
-    """
-    The same, with a successor for each of the five nearest instances: the mean, plus its residual less their mean residual.
-
-    Parameters: see :class:`~sb3_combrel.models.base.Model`.
-    """
+    """The same, with a successor for each of the five nearest instances: the mean, plus its residual less their mean one."""
 
     n_successors = 5
 
-    def _successors(self, mean: np.ndarray, residual: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        n, k = len(mean), min(self.n_successors, weight.shape[1])
-        probability, effect = np.zeros((n, self.n_successors)), np.zeros((n, self.n_successors, mean.shape[1]))
-        probability[:, :k] = weight[:, :k] / weight[:, :k].sum(axis=1, keepdims=True)
-        nearest = residual[:, :k] - (probability[:, :k, None] * residual[:, :k]).sum(axis=1, keepdims=True)
-        effect[:, :k] = mean[:, None] + nearest
-        return probability, effect
+
+def _successors(
+    n_successors: int, mean: np.ndarray, residual: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities, shape (n, n_successors), and effects; of a single one the residual less the mean residual is 0."""
+    n, k = len(mean), min(n_successors, weight.shape[1])
+    probability, effect = np.zeros((n, n_successors)), np.zeros((n, n_successors, mean.shape[1]))
+    probability[:, :k] = weight[:, :k] / weight[:, :k].sum(axis=1, keepdims=True)
+    nearest = residual[:, :k] - (probability[:, :k, None] * residual[:, :k]).sum(axis=1, keepdims=True)
+    effect[:, :k] = mean[:, None] + nearest
+    return probability, effect
 
 
 def _fit(
     at: np.ndarray, states: np.ndarray, effects: np.ndarray, weight: np.ndarray, ridge: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Fit effects as linear functions of the state, once for each of n states.
+    Fit effects as linear functions of the state, once for each of n states ``at``, from k instances of shape (n, k, d) each.
 
-    :param at: shape (n, d)
-    :param states: of k instances for each, shape (n, k, d); ``effects``: the same
-    :param weight: shape (n, k); ``ridge``: shape (n,)
     :return: effects at ``at``, shape (n, d), and residuals of the instances, shape (n, k, d)
     """
     share = (weight / weight.sum(axis=1, keepdims=True))[..., None]
@@ -152,12 +140,7 @@ def jobs_of(n_seeds: int) -> list[ModelRun]:
 
 
 def residual_successors(seeds: int = 4, jobs: int | None = 1) -> None:
-    """
-    Compare the two models, and print a table with a row for each run.
-
-    :param seeds: runs of each, from seed 0 on
-    :param jobs: processes at a time
-    """
+    """Compare the two models with ``seeds`` runs of each, ``jobs`` at a time, and print a table with a row for each run."""
     check_count("seeds", seeds)
     results = run_missing(jobs_of(seeds), backend=Backend(n_jobs=jobs), console=Console(stderr=True))
     check_all_succeeded(results)

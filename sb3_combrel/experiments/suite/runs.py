@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import pandas as pd
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -107,15 +108,7 @@ def suite_runs(
     evaluation_episodes: int,
     sources: Mapping[str, SourceInstances],
 ) -> list[SuiteRun]:
-    """
-    Make the runs, seed by seed.
-
-    :param tasks: what to learn
-    :param variants: the settings to compare
-    :param seeds: the seeds
-    :param evaluation_episodes: episodes to play after learning
-    :param sources: instances of the source tasks, by name
-    """
+    """Make the runs, seed by seed; ``sources``: instances of the source tasks, by name."""
 
     def transfer_of(task: Task, variant: Variant) -> Any:
         source = variant.source(task)
@@ -151,9 +144,8 @@ def records(folder: Path) -> list[tuple[dict[str, Any], Result]]:
 def write_csv_files(folder: Path) -> None:
     """Write ``runs.csv``, one row a run, and ``episodes.csv``, one row an episode of learning, of all complete runs."""
     found = records(folder)
-    rows = [{**result.more["row"], "settings": json.dumps(settings)} for settings, result in found]
-    runs = pd.DataFrame(rows)
-    write_csv(runs[[*(name for name in runs if name != "settings"), "settings"]], folder / RUNS_FILE)
+    runs = pd.DataFrame([result.more["row"] for _, result in found])
+    write_csv(runs.assign(settings=[json.dumps(settings) for settings, _ in found]), folder / RUNS_FILE)
     episodes = [
         pd.DataFrame(
             {
@@ -161,8 +153,8 @@ def write_csv_files(folder: Path) -> None:
                 "episode": range(1, len(result.steps) + 1),
                 "steps": result.steps,
                 "return": result.returns,
-                "terminated": [int(each) for each in result.terminated],
-                "truncated": [int(not each) for each in result.terminated],
+                "terminated": np.array(result.terminated, dtype=int),
+                "truncated": np.logical_not(result.terminated).astype(int),
             }
         )
         for _, result in found

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeAction
 
+from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments.suite.measures import (
     Measure,
     mean_return_in,
@@ -51,12 +52,7 @@ class NoisyActions(gym.ActionWrapper):
 
 @dataclass(frozen=True)
 class Source:
-    """
-    A source task of transfer.
-
-    :param name: name of its file
-    :param learn: learns it and returns its instances
-    """
+    """A source task of transfer: the name of its file, and what learns it and returns its instances."""
 
     name: str
     learn: Callable[[], SourceInstances]
@@ -90,10 +86,17 @@ class Task:
     source: Source | None = None
 
     def __post_init__(self) -> None:
-        if (self.n_steps is None) == (self.n_episodes is None):
-            raise ValueError(
-                f"{self.name}: either n_steps or n_episodes must be given, got {self.n_steps!r} and {self.n_episodes!r}"
-            )
+        check_budget(self.name, self.n_steps, self.n_episodes)
+
+
+def check_budget(name: str, n_steps: int | None, n_episodes: int | None) -> None:
+    """
+    :raises ValueError: unless exactly one of the numbers is given, at least 1
+    """
+    if (n_steps is None) == (n_episodes is None):
+        raise ValueError(f"{name}: either n_steps or n_episodes must be given, got {n_steps!r} and {n_episodes!r}")
+    check_count("n_steps", n_steps, none_allowed=True)
+    check_count("n_episodes", n_episodes, none_allowed=True)
 
 
 def make_pendulum() -> gym.Env:
@@ -107,12 +110,7 @@ def make_acrobot() -> gym.Env:
 
 
 def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
-    """
-    Make an environment in which every tenth action is a random one.
-
-    :param env_id: id of an environment with Discrete actions
-    :param kwargs: arguments of ``gymnasium.make``
-    """
+    """Make an environment in which every tenth action is a random one; see ``gymnasium.make``."""
     return NoisyActions(make_env(env_id, **kwargs))
 
 
@@ -217,12 +215,7 @@ TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 
 
 def tasks_of(names: list[str]) -> list[Task]:
-    """
-    Return the tasks of some names.
-
-    :param names: some of :data:`TASKS`, or "all" alone
-    :raises ValueError: if a name is unknown
-    """
+    """Return the tasks of some names, or of "all" alone."""
     if names == ["all"]:
         return list(TASKS.values())
     unknown = [name for name in names if name not in TASKS]

@@ -58,11 +58,8 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
 
 def source_for(name: str, task: Task) -> Source:
     """
-    Return the source task from which a transfer method transfers to a task.
+    Return the source task from which a transfer method transfers to a task: its own; ``COMBREL@other-domain``: another's.
 
-    :param name: one of :data:`TRANSFERS`
-    :param task: the target task
-    :return: the task's own source; for ``COMBREL@other-domain`` the one of another domain
     :raises ValueError: if the task has no source task, or none of another domain is known
     """
     if task.source is None:
@@ -81,8 +78,6 @@ def check_transfer(name: str, task: Task) -> None:
     """
     Check that a task can be learnt with a transfer method.
 
-    :param name: its name
-    :param task: the target task
     :raises ValueError: if the name is unknown, the task has no such source task, or the mapping that is asked for is not known
     """
     if name not in TRANSFERS:

@@ -60,7 +60,6 @@ def permuted(env: gym.Env, order: Sequence[int]) -> gym.Env:
     """
     Put the variables of an environment's observations, and their bounds, in another order.
 
-    :param env: an environment with a Box of shape (n_variables,)
     :param order: for each variable of the new observation the index of the old one
     :raises ValueError: if ``order`` is no permutation of the variables
     """
@@ -82,11 +81,7 @@ def right_mapping() -> InterTaskMapping:
 
 
 def learn_source(seed: int = 0) -> SourceInstances:
-    """
-    Learn CartPole-v1 by Fitted R-Max and keep 1000 instances that cover the visited states, falls included.
-
-    :param seed: seed of the learner and the choice
-    """
+    """Learn CartPole-v1 by Fitted R-Max and keep 1000 instances that cover the visited states, falls included."""
     with closing(make_cart_pole()) as env, chosen_on_purpose():
         return SourceInstances.from_fitted_rmax(
             env, N_INSTANCES, seed, n_episodes=N_SOURCE_EPISODES, degree=SOURCE_DEGREE, **LEARNER

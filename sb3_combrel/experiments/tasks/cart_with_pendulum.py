@@ -66,25 +66,14 @@ class CartWithPendulumEnv(gym.Env[np.ndarray, np.int64]):
         self._state: np.ndarray | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        Begin an episode.
-
-        :param seed: seed of this and the following episodes; None continues with the present generator
-        :param options: not used
-        """
+        """Begin an episode."""
         super().reset(seed=seed)
         position, angle = self.np_random.uniform(-0.55, -0.45), np.pi + self.np_random.uniform(-0.1, 0.1)
         self._state = np.array([position, 0.0, _wrapped(angle), 0.0])
         return self._observation(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """
-        Push the cart, turn the pendulum, or let both be.
-
-        :param action: number of an action
-        :return: observation, reward -1, whether all parts are at their goals, False, and a dictionary with ``is_success``
-        :raises ValueError: if there is no such action
-        """
+        """Push the cart, turn the pendulum, or let both be; see :class:`CartWithPendulumEnv`."""
         if self._state is None:
             raise ResetNeeded("call reset() before the first step")
         if not self.action_space.contains(action):

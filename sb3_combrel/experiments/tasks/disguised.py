@@ -38,7 +38,6 @@ def mirrored(env: gym.Env, variables: Sequence[bool]) -> gym.Env:
     """
     Mirror variables of an environment's observations in their ranges: what was lowest is highest.
 
-    :param env: an environment with a Box of shape (n_variables,)
     :param variables: whether each variable is mirrored
     :raises ValueError: if their number is another, or one that is mirrored has no finite bounds
     """

@@ -16,9 +16,5 @@ LEARNER: dict[str, Any] = {"max_value": 100.0}
 
 
 def learn_source(seed: int = 0) -> SourceInstances:
-    """
-    Learn the source task by Fitted R-Max and keep 1000 instances that cover the visited states, hits included.
-
-    :param seed: seed of the learner and the choice
-    """
+    """Learn the source task by Fitted R-Max and keep 1000 instances that cover the visited states, hits included."""
     return SourceInstances.from_fitted_rmax(SOURCE_ID, N_INSTANCES, seed, **LEARNER)

@@ -16,12 +16,7 @@ NOISE: dict[str, float] = {"noise-small": 0.003, "noise": 0.03, "noise-large": 0
 
 
 def noise(source: SourceInstances, size: float) -> SourceInstances:
-    """
-    Effects are random and say nothing; successors stay in the task's bounds.
-
-    :param source: a good source
-    :param size: standard deviation of the effects, in parts of the range of each variable
-    """
+    """Effects are random, of a size in parts of each variable's range, and say nothing; successors stay in bounds."""
     rng = np.random.default_rng(0)
     scale = size * (source.scaling.high - source.scaling.low)
     after = source.states + scale * rng.standard_normal(source.states.shape)

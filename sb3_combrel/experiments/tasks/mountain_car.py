@@ -47,11 +47,7 @@ def factored_mapping(n_axes: int) -> FactoredMapping:
 
 
 def methods(source: SourceInstances) -> dict[str, Transfer | None]:
-    """
-    Make the transfer methods that are compared, by name: none, with a random mapping, with the right one, and COMBREL.
-
-    :param source: instances of the source task
-    """
+    """Make the transfer methods that are compared, by name: none, with a random mapping, with the right one, and COMBREL."""
     return {
         NO_TRANSFER: None,
         RANDOM: TIMBREL(source, mapping="random", mappings="factored", use="prior"),
@@ -61,11 +57,7 @@ def methods(source: SourceInstances) -> dict[str, Transfer | None]:
 
 
 def learn_source(seed: int = 0) -> SourceInstances:
-    """
-    Learn the source task by Q-learning and keep 1000 instances of its experience.
-
-    :param seed: seed of the learner and the sample
-    """
+    """Learn the source task by Q-learning and keep 1000 instances of its experience."""
     import combrel_envs  # noqa: F401 - registers the tasks
 
     return SourceInstances.from_q_learning(SOURCE_ID, n_instances=N_INSTANCES, seed=seed)

@@ -21,10 +21,7 @@ GOAL_SIZE = 0.15
 
 class Box(NamedTuple):
     """
-    A box of the unit square or cube; a wall's inside is where the robot cannot be, its faces are free.
-
-    :param low: lower corner, shape (n_variables,)
-    :param high: upper corner, shape (n_variables,)
+    A box of the unit square or cube, given by two corners; a wall's inside is where the robot cannot be, its faces are free.
     """
 
     low: np.ndarray
@@ -37,11 +34,8 @@ class Box(NamedTuple):
 
 def slab(axis: int, low: float, high: float, gap: Sequence[tuple[float, float]]) -> list[Box]:
     """
-    Make a wall across the unit box, with a gap.
+    Make a wall across the unit box from ``low`` to ``high`` along an axis, with a gap.
 
-    :param axis: the wall is perpendicular to this axis
-    :param low: where it begins along the axis
-    :param high: where it ends along the axis
     :param gap: (lower, upper) end of the gap along each of the other axes, in their order
     :return: boxes that together are the wall; a wall ends outside the unit box, so that its faces there are no way past it
     """
@@ -72,12 +66,7 @@ WALLS: dict[int, tuple[Box, ...]] = {
 
 def move(position: np.ndarray, displacement: np.ndarray, walls: Sequence[Box]) -> np.ndarray:
     """
-    Move a point, axis by axis, until a wall or the boundary of the unit box stops it.
-
-    :param position: in the unit box and not inside a wall, shape (n_variables,)
-    :param displacement: shape (n_variables,)
-    :param walls: boxes that cannot be entered
-    :return: the new position
+    Move a point of the unit box, axis by axis, until a wall or the boundary stops it; the new position, shape (n_variables,).
     """
     position = position.copy()
     for axis in np.flatnonzero(displacement):
@@ -127,12 +116,7 @@ class PointRobotEnv(gym.Env[np.ndarray, np.int64]):
         self._position: np.ndarray | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        Begin an episode.
-
-        :param seed: seed of this and the following episodes; None continues with the present generator
-        :param options: not used
-        """
+        """Begin an episode."""
         super().reset(seed=seed)
         n_variables = len(self.goal.low)
         self._position = np.full(n_variables, MARGIN)
@@ -143,13 +127,7 @@ class PointRobotEnv(gym.Env[np.ndarray, np.int64]):
         return self._position.astype(np.float32), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """
-        Move the robot.
-
-        :param action: number of an action
-        :return: observation, reward -1, whether it is in the goal, False, and a dictionary with ``is_success``
-        :raises ValueError: if there is no such action
-        """
+        """Move the robot; see :class:`PointRobotEnv`."""
         if self._position is None:
             raise ResetNeeded("call reset() before the first step")
         if not self.action_space.contains(action):

@@ -72,16 +72,9 @@ def test_markers_of_methods_that_differ_are_full(tmp_path, monkeypatch):
     assert [line.get_markerfacecolor() == "white" for line in markers] == [False, True]
 
 
-def test_with_few_runs_there_are_no_bands(tmp_path, monkeypatch):
+def test_few_runs_have_no_bands_and_no_transfer_a_panel_if_it_is_alone(tmp_path, monkeypatch):
     panels, _ = drawn_of([NONE, "a"], tmp_path, monkeypatch, n_seeds=2)
     assert [len(panel.collections) for panel in panels.values()] == [0]
-
-
-def test_no_transfer_alone_has_a_panel(tmp_path, monkeypatch):
     panels, _ = drawn_of([NONE], tmp_path, monkeypatch)
     assert list(panels) == [f"{NONE} (4)"] and len(panels[f"{NONE} (4)"].lines) == 1
-
-
-def test_without_any_run_the_picture_says_so(tmp_path, monkeypatch):
-    panels, performance = drawn_of([], tmp_path, monkeypatch)
-    assert not panels and performance is None
+    assert drawn_of([], tmp_path, monkeypatch) == ({}, None)

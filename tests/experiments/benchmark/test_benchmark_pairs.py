@@ -95,42 +95,23 @@ class TestEveryPair:
 
 class TestKnownMappings:
     @pytest.mark.parametrize("name", ["mirrored-car", "two-sources", "icub"])
-    def test_predicts_nearly_as_well_as_the_best_of_the_set(self, name, sources):
+    def test_predicts_nearly_as_well_as_what_complies_best(self, name, sources):
         pair = PAIRS[name]
-        target = random_instances(pair.target, 400, seed=1)
-        found = errors_of(pair, sources[name], target)
-        assert found.least <= found.known + 1e-12 and found.least <= found.chosen + 1e-12
-        assert found.known < 0.5 and found.known < 1.3 * found.least + 0.02
+        found = errors_of(pair, sources[name], random_instances(pair.target, 400, seed=1))
+        assert found.known < 0.5 and found.known < 1.3 * found.chosen + 0.02
 
     def test_another_mapping_predicts_worse(self, sources):
-        pair = PAIRS["mirrored-car"]
-        target = random_instances(pair.target, 300, seed=1)
-        right = errors_of(pair, sources["mirrored-car"], target).known
+        pair, target = PAIRS["mirrored-car"], random_instances(make_disguised_car, 300, seed=1)
+        right = errors_of(pair, sources["mirrored-car"], target)
         for wrong in (disguise(ORDER, (1, 1), ACTIONS), disguise(ORDER, SIGNS, (0, 1, 2)), disguise((0, 1), SIGNS, ACTIONS)):
             other = replace(pair, known=FactoredMapping((wrong,)))
-            assert errors_of(other, sources["mirrored-car"], target).known > 1.5 * right
-
-    def test_the_error_of_a_known_mapping_is_that_of_its_predictions(self, sources):
-        """Against the mean over transitions of what the prior itself predicts."""
-        pair, (source,) = PAIRS["mirrored-car"], sources["mirrored-car"]
-        target = random_instances(pair.target, 200, seed=1)
-        found = errors_of(pair, (source,), target).known
-        with closing(pair.make_target()) as env:
-            bound = FittedRMax(env, transfer=METHODS["oracle"].make(source, pair), seed=0).agent.transfer
-        scaling = bound.task.scaling
-        states, after = scaling.to_unit(target.states), scaling.to_unit(target.next_states)
-        predicted = bound.source_prior.predict(states, target.actions).effect
-        naive = ((after - states - predicted) ** 2).sum() / ((after - states) ** 2).sum()
-        assert found == pytest.approx(naive, rel=1e-6)
+            assert errors_of(other, sources["mirrored-car"], target).known > 1.5 * right.known
+        # What COMBREL chooses is the known one, and both ways of computing its error agree.
+        assert right.chosen == pytest.approx(right.known, rel=1e-6)
 
     def test_nobody_knows_one(self):
-        with pytest.raises(ValueError, match="known must be a mapping, got None: nobody knows that of nothing-in-common"):
+        with pytest.raises(ValueError, match="known must be a mapping: nobody knows the mapping"):
             errors_of(PAIRS["nothing-in-common"], (random_instances(make_car, 50),), random_instances(make_car, 50))
-
-    def test_one_that_is_not_in_the_set(self, sources):
-        pair = replace(PAIRS["mirrored-car"], mappings="factored")
-        with pytest.raises(ValueError, match="known must be made of copies of the pair's set of mappings"):
-            errors_of(pair, sources["mirrored-car"], random_instances(pair.target, 50))
 
 
 def mapped(action, source, variable, sign, used):

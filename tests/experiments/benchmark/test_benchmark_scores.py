@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 from rich.console import Console
-from scipy import stats
 
 from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
@@ -19,7 +18,7 @@ from sb3_combrel.experiments.benchmark.report import (
     write_report,
 )
 from sb3_combrel.experiments.benchmark.runs import jobs_of
-from sb3_combrel.experiments.benchmark.scores import Cell, cells_of, compare, interquartile, mean_ranks, performances, ranks
+from sb3_combrel.experiments.benchmark.scores import cells_of, compare, interquartile, mean_ranks, performances, ranks
 from sb3_combrel.experiments.suite.tasks import Source
 from sb3_combrel.runs.job import Result
 
@@ -103,6 +102,7 @@ class TestRanks:
         methods = [method_of("a"), method_of("b", same_as="c"), method_of("c"), method_of("d")]
         cells = cells_of(pair, methods, made_up({"a": 0.0, "c": 5.0, "d": -5.0}), range(5))
         assert cells["b"].outcomes == cells["c"].outcomes and cells["b"].run_as == "c"
+        assert [each.seed for each in cells_of(pair, methods, cells["a"].outcomes, [1, 3])["a"].outcomes] == [1, 3]
         assert ranks(performances(pair, cells), cells) == {"a": 2.0, "b": 1.0, "c": 1.0, "d": 3.0}
         compared = compare(pair, cells)
         assert note_of("b", cells["b"]) == "the same as c"
@@ -266,19 +266,6 @@ class TestTables:
         outcomes = [outcome("made-up", each.name, 0, [], error="RuntimeError: never") for each in self.METHODS]
         made = write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], Console(quiet=True))
         assert all(path.exists() for path in made) and "RuntimeError: never" in (tmp_path / "made-up.md").read_text()
-
-    def test_only_the_seeds_asked_for_count(self):
-        pair = pair_of()
-        cells = cells_of(pair, [method_of("a")], made_up({"a": 0.0}), [1, 3])
-        assert [each.seed for each in cells["a"].outcomes] == [1, 3]
-        assert isinstance(cells["a"], Cell)
-
-
-def test_holm_and_ranks_agree_with_scipy_where_it_has_them():
-    values = np.random.default_rng(0).normal(size=(4, 6))
-    _, cells = cells_by({name: 0.0 for name in "abcd"})
-    found = ranks(dict(zip("abcd", values, strict=True)), cells)
-    np.testing.assert_array_equal(list(found.values()), stats.rankdata([-naive_iqm(row) for row in values]))
 
 
 def test_a_method_whose_name_is_no_file_name_is_refused():
