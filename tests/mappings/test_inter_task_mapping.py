@@ -85,15 +85,15 @@ class TestInterTaskMapping:
         [
             (((None, None), (0,)), "state must map at least one"),
             (((0,), ()), "action must hold one"),
-            (((0.5,), (0,)), "state must hold integers or None, got the entry 0.5"),
+            (((0.5,), (0,)), "state must hold integers from 0 on or None, got the entry 0.5"),
             (((-1,), (0,)), "state must hold integers from 0 on or None, got the entry -1"),
-            (((0,), (None,)), "action must hold integers, got the entry None"),
+            (((0,), (None,)), "action must hold integers from 0 on, got the entry None"),
             (((10**30,), (0,)), "state must hold indices up to 2147483647 or None, got a larger entry"),
             (((0,), (2**31,)), "action must hold indices up to 2147483647, got a larger entry"),
             (((True,), (0,)), "state .* entry True"),
             (("01", (0,)), "state must be a sequence"),
             (((0,), (0,), (1, 1)), r"sign must have 1 entries"),
-            (((0,), (0,), (0,)), r"sign must hold \+1 and -1 only"),
+            (((0,), (0,), (0,)), r"sign must have 1 entries, \+1 or -1"),
         ],
     )
     def test_wrong_arguments_are_named(self, arguments, message):
