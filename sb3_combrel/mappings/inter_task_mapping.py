@@ -270,7 +270,9 @@ def _signs(sign: Sequence[int] | None, state: tuple[int | None, ...]) -> tuple[i
     if sign is None:
         return (1,) * len(state)
     if len(sign) != len(state) or any(entry not in (1, -1) for entry in sign):
-        raise ValueError(f"sign must have {len(state)} entries, +1 or -1, one for each entry of state={state}, got sign={sign!r}")
+        raise ValueError(
+            f"sign must have {len(state)} entries, +1 or -1, one for each entry of state={state}, got sign={sign!r}"
+        )
     return tuple(1 if i is None or entry == 1 else -1 for i, entry in zip(state, sign, strict=True))
 
 

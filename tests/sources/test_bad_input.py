@@ -7,7 +7,6 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.sources import recording
 from sb3_combrel.sources.q_learning import QLearning
 from sb3_combrel.sources.source_recorder import SourceRecorder
 
@@ -133,9 +132,3 @@ def test_a_method_of_choice_that_does_not_exist_is_refused_before_learning():
     for learn in (SourceInstances.from_q_learning, SourceInstances.from_fitted_rmax):
         with pytest.raises(ValueError, match="method must be 'random' or 'covering', got 'best'"):
             learn("no such task", 5, method="best")
-
-
-def test_fitted_rmax_must_have_been_handed_in(monkeypatch):
-    monkeypatch.setattr(recording, "_fitted_rmax", [])
-    with pytest.raises(RuntimeError, match="import sb3_combrel first"):
-        SourceInstances.from_fitted_rmax(TASK, 5, n_episodes=1, max_value=0.0)

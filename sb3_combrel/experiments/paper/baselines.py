@@ -26,7 +26,7 @@ from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB
 from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, Episodes, play
 from sb3_combrel.runs.job import chosen_on_purpose, make_env
-from sb3_combrel.sources.recording import TransitionRecorder
+from sb3_combrel.sources.source_recorder import SourceRecorder
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import Transfer
 
@@ -259,7 +259,7 @@ def prefill(job: BaselineJob) -> tuple[Episodes, Transitions]:
             f"algorithm must be one of {', '.join(OF_SOURCE)}, got {job.algorithm!r}: there is nothing to transfer"
         )
     settings = PREFILLINGS[job.env_id]
-    recorder, transitions = EpisodeRecorder(settings.n_episodes), TransitionRecorder()
+    recorder, transitions = EpisodeRecorder(settings.n_episodes), SourceRecorder()
     with closing(make_env(job.env_id, max_episode_steps=job.max_episode_steps)) as env, chosen_on_purpose():
         model = FittedRMax(env, transfer=COMBREL(job.source, **settings.transfer), seed=job.seed, **settings.learner)
         model.learn(settings.n_episodes * job.max_episode_steps, [transitions, recorder], log_interval=None)
