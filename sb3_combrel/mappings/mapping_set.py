@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from operator import index as as_index
 from typing import Any, NamedTuple, Unpack
@@ -42,7 +42,8 @@ _SETS: dict[str, tuple[bool, bool, type[AllActionMappings | BalancedActionMappin
     "all": (False, True, AllActionMappings),
     "balanced": (True, True, BalancedActionMappings),
 }
-_OTHER_SETS = ("paper_mountain_car", "paper_icub")
+_SIZED_SETS = (*_SETS, *(f"signed_{each}" for each in _SETS))
+_PAPER_SETS = ("paper_mountain_car", "paper_icub")
 _FACTORED_SETS = ("factored", "signed_factored")
 
 
@@ -93,10 +94,7 @@ class MappingSet:
         self.actions = actions if isinstance(actions, ActionMappings) else ListedActionMappings(actions)
         self.names: MappingNames | None = None
         if self.signs.shape != self.state_mappings.shape or not np.isin(self.signs, (1, -1)).all():
-            raise ValueError(
-                f"signs must be +1 and -1 and have the shape of state_mappings, {self.state_mappings.shape}, "
-                f"got shape {self.signs.shape}"
-            )
+            raise ValueError(f"signs must be +1 and -1 and have the shape of state_mappings, {self.state_mappings.shape}")
         if self.state_mappings.min() < UNMAPPED or (self.state_mappings == UNMAPPED).all(axis=1).any():
             raise ValueError("state_mappings must be source variables from 0 on or -1 for None, at least one of them not -1")
         self.signs[self.state_mappings == UNMAPPED] = 1
@@ -104,24 +102,11 @@ class MappingSet:
         rows = np.hstack([self.state_mappings, self.signs])
         _, first, row_of = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         self._first_equal: Ints = first[row_of.reshape(-1)].astype(np.int64)
-        self.pairs: Ints | None = None if pairs is None else self._checked_pairs(pairs)
-        if self.pairs is None:
+        self.pairs: Ints | None = None
+        if pairs is None:
             self._check_size()
         else:
-            # State mapping (the first of equal ones) and source actions, shape (n_mappings, n_target_actions), of each member.
-            self._states = self._first_equal[self.pairs[:, 0]]
-            self._source_actions: Ints = np.array([self.actions[number] for number in self.pairs[:, 1].tolist()], np.int64)
-
-    def _checked_pairs(self, pairs: ArrayLike) -> Ints:
-        table = index_table("pairs", pairs, "(n_mappings, 2)")
-        size = self.n_state_mappings, self.n_action_mappings
-        if table.shape[1] != 2 or table.min() < 0 or (table.max(axis=0) >= size).any():
-            raise ValueError(
-                f"pairs must be numbers of state mappings below {size[0]:,} and of action mappings below "
-                f"{count_text(size[1])}, got {table.shape[1]} columns of numbers from {table.min()} to {table.max()}"
-            )
-        table.flags.writeable = False
-        return table
+            self._take_pairs(pairs)
 
     def _check_size(self) -> None:
         n_states = len(np.unique(self._first_equal))
@@ -132,14 +117,26 @@ class MappingSet:
                 f"{MAX_CANDIDATES:,} that are practical; choose fewer state mappings, or list the mappings of interest"
             )
 
+    def _take_pairs(self, pairs: ArrayLike) -> None:
+        self.pairs = index_table("pairs", pairs, "(n_mappings, 2)")
+        size = self.n_state_mappings, self.n_action_mappings
+        if self.pairs.shape[1] != 2 or self.pairs.min() < 0 or (self.pairs.max(axis=0) >= size).any():
+            raise ValueError(
+                f"pairs must be numbers of state mappings below {size[0]:,} and of action mappings below "
+                f"{count_text(size[1])}, got {self.pairs.tolist()}"
+            )
+        self.pairs.flags.writeable = False
+        # State mapping (the first of equal ones) and source actions, shape (n_mappings, n_target_actions), of each member.
+        self._states = self._first_equal[self.pairs[:, 0]]
+        self._source_actions = np.array([self.actions[number] for number in self.pairs[:, 1].tolist()], dtype=np.int64)
+
     @classmethod
     def injective(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
         """
         Each source variable is used by exactly one target variable, the other target variables are unmapped.
 
         If the source task has more variables than the target task, each target variable gets a source variable of its
-        own instead. All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 12 x 243. Parameters and
-        errors: see :meth:`from_name`.
+        own instead. All action mappings: from 2 to 4 variables and 3 to 5 actions 12 x 243. Parameters: :meth:`from_name`.
         """
         return cls.from_name("injective", *sizes, signs=signs, **named_sizes)
 
@@ -148,8 +145,8 @@ class MappingSet:
         """
         Every target variable is mapped and every source variable is used at least once (as many as there is room for).
 
-        All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 14 x 243. The translated instances lie on
-        diagonals of the target's state space. Parameters and errors: see :meth:`from_name`.
+        All action mappings: from 2 to 4 variables and 3 to 5 actions 14 x 243. The translated instances lie on diagonals of
+        the target's state space. Parameters: :meth:`from_name`.
         """
         return cls.from_name("surjective", *sizes, signs=signs, **named_sizes)
 
@@ -158,8 +155,8 @@ class MappingSet:
         """
         Every source variable is used at least once (as many as there is room for), target variables may be unmapped.
 
-        It contains the injective and the surjective set. All action mappings are included. From 2 to 4 variables and 3
-        to 5 actions: 50 x 243. Parameters and errors: see :meth:`from_name`.
+        It contains the injective and the surjective set. All action mappings: from 2 to 4 variables and 3 to 5 actions
+        50 x 243. Parameters: :meth:`from_name`.
         """
         return cls.from_name("all", *sizes, signs=signs, **named_sizes)
 
@@ -168,7 +165,7 @@ class MappingSet:
         """
         The injective state mappings with those action mappings only that use the source actions as equally as possible.
 
-        From 2 to 4 variables and 3 to 5 actions: 12 x 90. Parameters and errors: see :meth:`from_name`.
+        From 2 to 4 variables and 3 to 5 actions: 12 x 90. Parameters: :meth:`from_name`.
         """
         return cls.from_name("balanced", *sizes, signs=signs, **named_sizes)
 
@@ -192,9 +189,8 @@ class MappingSet:
         :raises ValueError: for another name, if a number is below 1 or astronomically large, or if there are too many state
             mappings
         """
-        unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
-        if unsigned not in _SETS:
-            raise _unknown_set(name)
+        check_set_name(name, _SIZED_SETS)
+        unsigned = name.removeprefix("signed_")
         once, allow_none, action_mappings = _SETS[unsigned]
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=once, allow_none=allow_none)
         actions = action_mappings(n_source_actions, n_target_actions)
@@ -235,16 +231,14 @@ class MappingSet:
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
         """
         listed = list(mappings)
-        if not listed:
-            raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
+        wrong = [each for each in listed if not isinstance(each, InterTaskMapping)]
+        if not listed or wrong:
+            raise ValueError(f"mappings must be a list of at least one InterTaskMapping, got {(wrong or listed)!r}")
         first = listed[0]
-        # Dictionaries keep the order of first appearance.
         states: dict[tuple[tuple[int, ...], tuple[int, ...]], int] = {}
         actions: dict[tuple[int, ...], int] = {}
         pairs = []
         for mapping in listed:
-            if not isinstance(mapping, InterTaskMapping):
-                raise ValueError(f"mappings must be InterTaskMapping objects, got {mapping!r}")
             if (mapping.n_target_variables, mapping.n_target_actions) != (first.n_target_variables, first.n_target_actions):
                 raise ValueError(
                     f"mappings must all have the same numbers of target variables and actions, got {first!r} and {mapping!r}"
@@ -346,8 +340,7 @@ class MappingSet:
         matching = self._matching(state_index, action, source_action)
         if not matching.size:
             raise ValueError(
-                f"no mapping of the set has state mapping {state_index} and maps target action {action} "
-                f"to source action {source_action}"
+                f"no mapping of the set has state mapping {state_index} and source action {source_action} for {action}"
             )
         return int(matching[0])
 
@@ -384,16 +377,11 @@ def _state(row: Ints) -> tuple[int | None, ...]:
     return tuple(None if i == UNMAPPED else i for i in row.tolist())
 
 
-def check_set_name(name: str) -> None:
+def check_set_name(name: object, known: Sequence[str] = (*_SIZED_SETS, *_PAPER_SETS, *_FACTORED_SETS)) -> None:
     """Raise ``ValueError`` if there is no set of that name."""
-    if name.removeprefix("signed_") not in _SETS and name not in (*_OTHER_SETS, *_FACTORED_SETS):
-        raise _unknown_set(name)
-
-
-def _unknown_set(name: object) -> ValueError:
-    names = *_SETS, *(f"signed_{each}" for each in _SETS), *_OTHER_SETS
-    factored = f'with use="prior" also {", ".join(_FACTORED_SETS)}'
-    return ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
+    if name not in known:
+        names, factored = ", ".join((*_SIZED_SETS, *_PAPER_SETS)), ", ".join(_FACTORED_SETS)
+        raise ValueError(f'mappings must be one of {names}; with use="prior" also {factored}; got {name!r}')
 
 
 def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:
