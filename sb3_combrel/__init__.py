@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
-from sb3_combrel.sources.recording import register_fitted_rmax
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.tensorboard.explain import explain
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from sb3_combrel.comparison.compare import compare
 
 FittedRMax.default_callbacks.append(with_dashboard)
-register_fitted_rmax(FittedRMax)
 
 __all__ = [
     "COMBREL",

@@ -8,8 +8,7 @@ from sb3_combrel.mappings.action_mappings import (
 )
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, InterTaskMapping, MappingNames
-from sb3_combrel.mappings.mapping_set import MappingSet
-from sb3_combrel.mappings.members import Candidates
+from sb3_combrel.mappings.mapping_set import Candidates, MappingSet
 from sb3_combrel.mappings.named_sets import resolve
 
 __all__ = [

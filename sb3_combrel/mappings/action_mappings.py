@@ -42,9 +42,17 @@ class ActionMappings(ABC):
     def count(self, action: int, source_action: int) -> int:
         """Number of the action mappings that map target action ``action`` to ``source_action``."""
 
-    @abstractmethod
     def first(self, action: int, source_action: int) -> int:
         """Number of the first of them; ``ValueError`` if there is none."""
+        if not self.count(action, source_action):
+            raise ValueError(
+                f"no mapping of the set maps target action {action} to source action {source_action}; "
+                f"the possible source actions are {self.source_actions_for(action).tolist()}"
+            )
+        return self._first(action, source_action)
+
+    @abstractmethod
+    def _first(self, action: int, source_action: int) -> int: ...
 
     def source_actions_for(self, action: int) -> Ints:
         """The source actions that target action ``action`` is mapped to by some mapping, ascending; unless overridden, all."""
@@ -53,12 +61,6 @@ class ActionMappings(ABC):
     def _check_index(self, index: int) -> None:
         if not 0 <= index < self.n_mappings:
             raise IndexError(f"action mapping {index} does not exist, there are {self.n_mappings}")
-
-    def _none_maps(self, action: int, source_action: int) -> ValueError:
-        return ValueError(
-            f"no mapping of the set maps target action {action} to source action {source_action}; "
-            f"the possible source actions are {self.source_actions_for(action).tolist()}"
-        )
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,7 @@ class AllActionMappings(ActionMappings):
     def count(self, action: int, source_action: int) -> int:
         return self.n_source_actions ** (self.n_target_actions - 1) if 0 <= source_action < self.n_source_actions else 0
 
-    def first(self, action: int, source_action: int) -> int:
-        if not self.count(action, source_action):
-            raise self._none_maps(action, source_action)
+    def _first(self, action: int, source_action: int) -> int:
         return source_action * self.n_source_actions ** (self.n_target_actions - 1 - action)
 
 
@@ -130,9 +130,7 @@ class BalancedActionMappings(ActionMappings):
         # By symmetry: the mappings are closed under permutations of the target actions and of the source actions.
         return self.n_mappings // self.n_source_actions if 0 <= source_action < self.n_source_actions else 0
 
-    def first(self, action: int, source_action: int) -> int:
-        if not self.count(action, source_action):
-            raise self._none_maps(action, source_action)
+    def _first(self, action: int, source_action: int) -> int:
         # The first such mapping has at each position the first choice that leaves a `source_action` for position `action`.
         chosen: list[int] = []
         number = 0
@@ -204,11 +202,8 @@ class ListedActionMappings(ActionMappings):
     def count(self, action: int, source_action: int) -> int:
         return int(np.count_nonzero(self.mappings[:, action] == source_action))
 
-    def first(self, action: int, source_action: int) -> int:
-        found = np.flatnonzero(self.mappings[:, action] == source_action)
-        if not found.size:
-            raise self._none_maps(action, source_action)
-        return int(found[0])
+    def _first(self, action: int, source_action: int) -> int:
+        return int((self.mappings[:, action] == source_action).argmax())
 
     def source_actions_for(self, action: int) -> Ints:
         return np.unique(self.mappings[:, action])

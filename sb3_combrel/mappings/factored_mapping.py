@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Unpack
 
 import numpy as np
 
 from sb3_combrel.common.serialisation import register_reader, register_writer
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, TaskSizes, as_mapping
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, Names, TaskSizes, as_mapping
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,23 +70,21 @@ class FactoredMapping:
             each.check(**sizes)
 
     def with_names(
-        self,
-        source_variables: Iterable[str],
-        target_variables: Iterable[str],
-        source_actions: Iterable[str],
-        target_actions: Iterable[str],
+        self, source_variables: Names, target_variables: Names, source_actions: Names, target_actions: Names
     ) -> FactoredMapping:
         """The same mapping with names for ``repr``, and numbers for names; see :meth:`InterTaskMapping.with_names`."""
-        names = tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions)
-        return FactoredMapping(tuple(each.with_names(*names) for each in self.copies))
+        names = tuple(map(tuple, (source_variables, target_variables, source_actions, target_actions)))
+        return FactoredMapping([each.with_names(*names) for each in self.copies])
 
     def __repr__(self) -> str:
-        if any(each.names is None for each in self.copies):
-            return f"FactoredMapping({list(self.copies)!r})"
         names = self.copies[0].names
-        assert names is not None
-        moves = [(describe_copy(each), [each.names.source_actions[u] for u in each.action]) for each in self.copies]  # type: ignore[union-attr]
-        return describe_actions(names.target_actions, moves)
+        if names is None or any(each.names is None for each in self.copies):
+            return f"FactoredMapping({list(self.copies)!r})"
+        moves = [(describe_copy(each), [names.source_actions[u] for u in each.action]) for each in self.copies]
+        return "; ".join(
+            f"{name}: " + ", ".join(f"{actions[a]} on {variables}" for variables, actions in moves)
+            for a, name in enumerate(names.target_actions)
+        )
 
 
 def describe_copy(copy: InterTaskMapping) -> str:
@@ -107,19 +105,6 @@ def describe_both_sides(copy: InterTaskMapping) -> str:
 def _in_source_order(copy: InterTaskMapping) -> list[int]:
     """The mapped target variables by their source variables."""
     return [v for _, v in sorted((k, v) for v, k in enumerate(copy.state) if k is not None)]
-
-
-def describe_actions(target_actions: Sequence[str], moves: Sequence[tuple[str, Sequence[str]]]) -> str:
-    """
-    Say what each target action does to each copy: "East: Right on (x, vx), Neutral on (y, vy); West: ...".
-
-    :param moves: of each copy its variables as text, and the name of its source action for each target action
-    """
-    lines = (
-        f"{name}: " + ", ".join(f"{actions[a]} on {variables}" for variables, actions in moves)
-        for a, name in enumerate(target_actions)
-    )
-    return "; ".join(lines)
 
 
 def _disjoint(copies: tuple[InterTaskMapping, ...]) -> tuple[InterTaskMapping, ...]:

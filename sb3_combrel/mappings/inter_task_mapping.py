@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_combrel.common.serialisation import register_reader, register_writer
-from sb3_combrel.mappings.named_entries import Entries, as_entries, has_names, numbers
+from sb3_combrel.mappings.named_entries import Entries, as_entries, as_given, has_names, numbers
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Names = Iterable[str]
 
 UNMAPPED = -1
 """Represents None in integer arrays of state mappings."""
@@ -82,21 +83,25 @@ class InterTaskMapping:
         *,
         names: MappingNames | None = None,
     ) -> None:
-        given = as_entries("state", state), as_entries("action", action)
+        states, actions = as_entries("state", state), as_entries("action", action)
         signs = None if sign is None else as_entries("sign", sign)
-        named = any(has_names(entries) for entries in (*given, signs or ()))
-        if named and names is not None:
-            groups = MappingNames(*(tuple(map(str, group)) for group in names))
-            given = (
-                numbers("state", given[0], groups.target_variables, groups.source_variables),
-                numbers("action", given[1], groups.target_actions, groups.source_actions),
-            )
-            signs = None if signs is None else numbers("sign", signs, groups.target_variables, (), default=1)
-        if not named or names is not None:
-            given = _checked(*given)
-            signs = _signs(signs, given[0])
-            names = None if names is None else _checked_names(names, *given)
-        for name, value in {"state": given[0], "action": given[1], "sign": signs, "names": names}.items():
+        if names is not None:
+            names = MappingNames(*(tuple(map(str, group)) for group in names))
+            states = numbers("state", states, names.target_variables, names.source_variables)
+            actions = numbers("action", actions, names.target_actions, names.source_actions)
+            signs = None if signs is None else numbers("sign", signs, names.target_variables, (), default=1)
+        if names is not None or not any(map(has_names, (states, actions, signs or ()))):
+            states = tuple(None if i is None else _index("state", i) for i in states)
+            actions = tuple(_index("action", a) for a in actions)
+            if all(i is None for i in states) or not actions:
+                raise ValueError(
+                    "state must map at least one target variable to a source variable, and action must hold one source action "
+                    f"for each target action, got state={state!r}, action={action!r}"
+                )
+            signs = _signs(signs, states)
+        if names is not None:
+            _check_names(names, states, actions)
+        for name, value in {"state": states, "action": actions, "sign": signs, "names": names}.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -204,40 +209,35 @@ class InterTaskMapping:
         :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
         """
         self._check_numbers()
-        _check_sizes("state", self.state, n_target_variables, n_source_variables, "variables")
-        _check_sizes("action", self.action, n_target_actions, n_source_actions, "actions")
+        sizes = n_source_variables, n_target_variables, n_source_actions, n_target_actions
+        check_sizes(self.state, self.action, *sizes)
 
     def with_names(
-        self,
-        source_variables: Iterable[str],
-        target_variables: Iterable[str],
-        source_actions: Iterable[str],
-        target_actions: Iterable[str],
+        self, source_variables: Names, target_variables: Names, source_actions: Names, target_actions: Names
     ) -> InterTaskMapping:
         """
         The same mapping with the two tasks' names for ``repr``; entries that were given by name become their numbers.
 
         :raises ValueError: if there are fewer names than the mapping uses, or it has a name that is none of these
         """
-        names = MappingNames(tuple(source_variables), tuple(target_variables), tuple(source_actions), tuple(target_actions))
+        names = MappingNames(*map(tuple, (source_variables, target_variables, source_actions, target_actions)))
         return InterTaskMapping(self.state, self.action, self.sign, names=names)
 
     def __repr__(self) -> str:
         if self.has_names:
-            parts = {"state": self.state, "action": self.action, **({} if self.sign is None else {"sign": self.sign})}
-            return f"InterTaskMapping({', '.join(f'{name}={_as_given(entries)!r}' for name, entries in parts.items())})"
+            parts = {"state": self.state, "action": self.action, "sign": self.sign}
+            given = {name: entries for name, entries in parts.items() if entries is not None}
+            return f"InterTaskMapping({', '.join(f'{name}={as_given(entries)!r}' for name, entries in given.items())})"
         if self.names is None:
             mirrored = f", sign={self.sign}" if -1 in self.state_sign else ""
             return f"InterTaskMapping(state={self.state}, action={self.action}{mirrored})"
-        variables = []
-        for target, source, sign in zip(self.names.target_variables, self.state, self.state_sign, strict=True):
-            if source is not None:
-                name = self.names.source_variables[source]
-                variables.append(f"{target}<-{name}" if sign > 0 else f"{target}<-(-{name})")
-        actions = [
-            f"{target}<-{self.names.source_actions[source]}"
-            for target, source in zip(self.names.target_actions, self.action, strict=True)
+        source_variables, target_variables, source_actions, target_actions = self.names
+        variables = [
+            f"{name}<-{source_variables[source]}" if sign > 0 else f"{name}<-(-{source_variables[source]})"
+            for name, source, sign in zip(target_variables, self.state, self.state_sign, strict=True)
+            if source is not None
         ]
+        actions = [f"{name}<-{source_actions[source]}" for name, source in zip(target_actions, self.action, strict=True)]
         return f"InterTaskMapping({', '.join(variables)}; {', '.join(actions)})"
 
     def _source_columns(self, name: str, values: ArrayLike) -> Floats:
@@ -252,31 +252,13 @@ class InterTaskMapping:
         return array[..., np.maximum(self.state_index, 0)]
 
 
-def _checked(state: Sequence[Any], action: Sequence[Any]) -> tuple[tuple[int | None, ...], tuple[int, ...]]:
-    """Entries as integers."""
-    indices = tuple(None if i is None else _index("state", i) for i in state)
-    if all(i is None for i in indices):
-        raise ValueError(f"state must map at least one target variable to a source variable, got state={state!r}")
-    actions = tuple(_index("action", a) for a in action)
-    if not actions:
-        raise ValueError("action must hold one source action for each target action, got action=()")
-    return indices, actions
-
-
-def _as_given(entries: Sequence[Any]) -> Any:
-    """Pairs as a dict again."""
-    return dict(entries) if any(isinstance(each, tuple) for each in entries) else tuple(entries)
-
-
 def _index(name: str, value: object) -> int:
     """A non-negative integer; bool is refused, it would pass as 0 or 1."""
     none = " or None" if name == "state" else ""
     try:
-        if isinstance(value, bool):
-            raise TypeError
-        number = as_index(value)  # type: ignore[arg-type]
-    except TypeError as error:
-        raise ValueError(f"{name} must hold integers{none}, got the entry {value!r}") from error
+        number = -1 if isinstance(value, bool) else as_index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
     if number < 0:
         raise ValueError(f"{name} must hold integers from 0 on{none}, got the entry {value!r}")
     if number > _MAX_INDEX:
@@ -287,22 +269,19 @@ def _index(name: str, value: object) -> int:
 def _signs(sign: Sequence[int] | None, state: tuple[int | None, ...]) -> tuple[int, ...]:
     if sign is None:
         return (1,) * len(state)
-    entries = tuple(sign)
-    if len(entries) != len(state):
-        raise ValueError(f"sign must have {len(state)} entries, one for each entry of state={state}, got sign={sign!r}")
-    if any(entry not in (1, -1) for entry in entries):
-        raise ValueError(f"sign must hold +1 and -1 only, got sign={sign!r}")
-    return tuple(1 if i is None or entry == 1 else -1 for i, entry in zip(state, entries, strict=True))
+    if len(sign) != len(state) or any(entry not in (1, -1) for entry in sign):
+        raise ValueError(
+            f"sign must have {len(state)} entries, +1 or -1, one for each entry of state={state}, got sign={sign!r}"
+        )
+    return tuple(1 if i is None or entry == 1 else -1 for i, entry in zip(state, sign, strict=True))
 
 
-def _checked_names(names: MappingNames, state: tuple[int | None, ...], action: tuple[int, ...]) -> MappingNames:
-    named = MappingNames(*(tuple(str(name) for name in group) for group in names))
-    used = (max(i for i in state if i is not None) + 1, len(state), max(action) + 1, len(action))
-    for kind, group, min_names in zip(MappingNames._fields, named, used, strict=True):
+def _check_names(names: MappingNames, state: Sequence[int | None], action: Sequence[int]) -> None:
+    used = max(i for i in state if i is not None) + 1, len(state), max(action) + 1, len(action)
+    for kind, group, n_used in zip(MappingNames._fields, names, used, strict=True):
         exact = kind.startswith("target")
-        if (exact and len(group) != min_names) or len(group) < min_names:
-            raise ValueError(f"{kind} must hold {'' if exact else 'at least '}{min_names} names, got {group}")
-    return named
+        if len(group) < n_used or (exact and len(group) > n_used):
+            raise ValueError(f"{kind} must hold {'' if exact else 'at least '}{n_used} names, got {group}")
 
 
 def _columns(name: str, values: ArrayLike, n_columns: int) -> Floats:
@@ -312,28 +291,37 @@ def _columns(name: str, values: ArrayLike, n_columns: int) -> Floats:
     return array
 
 
-def _check_sizes(name: str, entries: Sequence[int | None], n_target: int, n_source: int, kind: str) -> None:
-    if len(entries) != n_target:
-        raise ValueError(
-            f"{name} must have {n_target} entries, one for each of the target task's {kind}, "
-            f"got {len(entries)}: {name}={tuple(entries)}"
-        )
-    largest = max(entry for entry in entries if entry is not None)
-    if largest >= n_source:
-        raise ValueError(
-            f"{name} must hold indices from 0 to {n_source - 1}, the source task has {n_source} {kind}, "
-            f"got {largest} in {name}={tuple(entries)}"
-        )
+def check_sizes(
+    state: Sequence[int | None],
+    action: Sequence[int],
+    n_source_variables: int,
+    n_target_variables: int,
+    n_source_actions: int,
+    n_target_actions: int,
+) -> None:
+    """See :meth:`InterTaskMapping.check`."""
+    for name, kind, entries, n_target, n_source in (
+        ("state", "variables", state, n_target_variables, n_source_variables),
+        ("action", "actions", action, n_target_actions, n_source_actions),
+    ):
+        largest = max(entry for entry in entries if entry is not None)
+        if len(entries) != n_target:
+            fault = f"have {n_target} entries, one for each of the target task's {kind}, got {len(entries)}:"
+        elif largest >= n_source:
+            fault = f"hold indices from 0 to {n_source - 1}, the source task has {n_source} {kind}, got {largest} in"
+        else:
+            continue
+        raise ValueError(f"{name} must {fault} {name}={tuple(entries)}")
 
 
 def index_table(name: str, values: ArrayLike, shape: str) -> Ints:
     """A table of indices as an array of its own, two-dimensional and not empty; ``shape`` says in words what is right."""
     try:
         array = np.array(values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be integers of shape {shape}, got {values!r}") from error
+    except (TypeError, ValueError):
+        array = np.empty(0)
     if array.ndim != 2 or 0 in array.shape or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name} must be integers of shape {shape}, got {array.dtype} of shape {array.shape}")
+        raise ValueError(f"{name} must be integers of shape {shape}, got {values!r}")
     if array.max() > _MAX_INDEX:
         raise ValueError(f"{name} must hold indices up to {_MAX_INDEX}, got {array.max()}")
     return array.astype(np.int64)

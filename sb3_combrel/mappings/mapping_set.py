@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from operator import index as as_index
-from typing import Any, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,11 +25,38 @@ from sb3_combrel.mappings.inter_task_mapping import (
     InterTaskMapping,
     Ints,
     MappingNames,
+    Names,
     TaskSizes,
+    check_sizes,
     index_table,
 )
-from sb3_combrel.mappings.members import AllPairs, Candidates, ListedPairs
 from sb3_combrel.mappings.state_mappings import TWO_VARIABLES_ON_FOUR, state_mappings_using_sources, with_mirrored
+
+MAX_CANDIDATES = 10_000_000
+"""Compliance is computed for every pair of a state mapping and a source action of a target action."""
+
+# Whether a source variable is used once at most, whether target variables may be unmapped, and the action mappings.
+_SETS: dict[str, tuple[bool, bool, type[AllActionMappings | BalancedActionMappings]]] = {
+    "injective": (True, True, AllActionMappings),
+    "surjective": (False, False, AllActionMappings),
+    "all": (False, True, AllActionMappings),
+    "balanced": (True, True, BalancedActionMappings),
+}
+_SIZED_SETS = (*_SETS, *(f"signed_{each}" for each in _SETS))
+_PAPER_SETS = ("paper_mountain_car", "paper_icub")
+_FACTORED_SETS = ("factored", "signed_factored")
+
+
+class Candidates(NamedTuple):
+    """
+    The different ways in which the mappings of a set treat one target action; compliance distinguishes no others.
+
+    :param state_index: row of ``MappingSet.state_mappings``, shape (n_candidates,)
+    :param source_action: source action that the target action maps to, shape (n_candidates,)
+    """
+
+    state_index: Ints
+    source_action: Ints
 
 
 class MappingSet:
@@ -66,91 +94,85 @@ class MappingSet:
         self.actions = actions if isinstance(actions, ActionMappings) else ListedActionMappings(actions)
         self.names: MappingNames | None = None
         if self.signs.shape != self.state_mappings.shape or not np.isin(self.signs, (1, -1)).all():
-            raise ValueError(
-                f"signs must be +1 and -1 and have the shape of state_mappings, {self.state_mappings.shape}, "
-                f"got shape {self.signs.shape}"
-            )
+            raise ValueError(f"signs must be +1 and -1 and have the shape of state_mappings, {self.state_mappings.shape}")
         if self.state_mappings.min() < UNMAPPED or (self.state_mappings == UNMAPPED).all(axis=1).any():
             raise ValueError("state_mappings must be source variables from 0 on or -1 for None, at least one of them not -1")
         self.signs[self.state_mappings == UNMAPPED] = 1
         self.state_mappings.flags.writeable = self.signs.flags.writeable = False
-        _, first, row_of = np.unique(
-            np.hstack([self.state_mappings, self.signs]), axis=0, return_index=True, return_inverse=True
-        )
+        rows = np.hstack([self.state_mappings, self.signs])
+        _, first, row_of = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         self._first_equal: Ints = first[row_of.reshape(-1)].astype(np.int64)
-        self._members = (
-            AllPairs(self._first_equal, self.actions) if pairs is None else ListedPairs(self._first_equal, self.actions, pairs)
-        )
+        self.pairs: Ints | None = None
+        if pairs is None:
+            self._check_size()
+        else:
+            self._take_pairs(pairs)
 
-    @property
-    def pairs(self) -> Ints | None:
-        """The members as they were listed, shape (n_mappings, 2); None for all pairs."""
-        return self._members.pairs if isinstance(self._members, ListedPairs) else None
+    def _check_size(self) -> None:
+        n_states = len(np.unique(self._first_equal))
+        n_candidates = n_states * sum(len(self.source_actions_for(action)) for action in range(self.n_target_actions))
+        if n_candidates > MAX_CANDIDATES:
+            raise ValueError(
+                f"{n_states:,} state mappings with these action mappings make {n_candidates:,} candidates, more than the "
+                f"{MAX_CANDIDATES:,} that are practical; choose fewer state mappings, or list the mappings of interest"
+            )
+
+    def _take_pairs(self, pairs: ArrayLike) -> None:
+        self.pairs = index_table("pairs", pairs, "(n_mappings, 2)")
+        size = self.n_state_mappings, self.n_action_mappings
+        if self.pairs.shape[1] != 2 or self.pairs.min() < 0 or (self.pairs.max(axis=0) >= size).any():
+            raise ValueError(
+                f"pairs must be numbers of state mappings below {size[0]:,} and of action mappings below "
+                f"{count_text(size[1])}, got {self.pairs.tolist()}"
+            )
+        self.pairs.flags.writeable = False
+        # State mapping (the first of equal ones) and source actions, shape (n_mappings, n_target_actions), of each member.
+        self._states = self._first_equal[self.pairs[:, 0]]
+        self._source_actions = np.array([self.actions[number] for number in self.pairs[:, 1].tolist()], dtype=np.int64)
 
     @classmethod
-    def injective(
-        cls,
-        n_source_variables: int,
-        n_target_variables: int,
-        n_source_actions: int,
-        n_target_actions: int,
-        *,
-        signs: bool = False,
-    ) -> MappingSet:
+    def injective(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
         """
         Each source variable is used by exactly one target variable, the other target variables are unmapped.
 
         If the source task has more variables than the target task, each target variable gets a source variable of its
-        own instead. All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 12 x 243.
-
-        :param n_source_variables: number of the source's state variables, and so on
-        :param signs: also include every state mapping with any of its mapped variables mirrored
-        :raises ValueError: if a number is below 1 or astronomically large, or if there are too many state mappings
+        own instead. All action mappings: from 2 to 4 variables and 3 to 5 actions 12 x 243. Parameters: :meth:`from_name`.
         """
-        rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=True, allow_none=True)
-        return cls._of(rows, AllActionMappings(n_source_actions, n_target_actions), signs)
+        return cls.from_name("injective", *sizes, signs=signs, **named_sizes)
 
     @classmethod
-    def surjective(
-        cls,
-        n_source_variables: int,
-        n_target_variables: int,
-        n_source_actions: int,
-        n_target_actions: int,
-        *,
-        signs: bool = False,
-    ) -> MappingSet:
+    def surjective(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
         """
         Every target variable is mapped and every source variable is used at least once (as many as there is room for).
 
-        All action mappings are included. From 2 to 4 variables and 3 to 5 actions: 14 x 243. The translated instances lie on
-        diagonals of the target's state space. Parameters and errors: see :meth:`injective`.
+        All action mappings: from 2 to 4 variables and 3 to 5 actions 14 x 243. The translated instances lie on diagonals of
+        the target's state space. Parameters: :meth:`from_name`.
         """
-        rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=False, allow_none=False)
-        return cls._of(rows, AllActionMappings(n_source_actions, n_target_actions), signs)
+        return cls.from_name("surjective", *sizes, signs=signs, **named_sizes)
 
     @classmethod
-    def all(
-        cls,
-        n_source_variables: int,
-        n_target_variables: int,
-        n_source_actions: int,
-        n_target_actions: int,
-        *,
-        signs: bool = False,
-    ) -> MappingSet:
+    def all(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
         """
         Every source variable is used at least once (as many as there is room for), target variables may be unmapped.
 
-        It contains the injective and the surjective set. All action mappings are included. From 2 to 4 variables and 3
-        to 5 actions: 50 x 243. Parameters and errors: see :meth:`injective`.
+        It contains the injective and the surjective set. All action mappings: from 2 to 4 variables and 3 to 5 actions
+        50 x 243. Parameters: :meth:`from_name`.
         """
-        rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=False, allow_none=True)
-        return cls._of(rows, AllActionMappings(n_source_actions, n_target_actions), signs)
+        return cls.from_name("all", *sizes, signs=signs, **named_sizes)
 
     @classmethod
-    def balanced(
+    def balanced(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
+        """
+        The injective state mappings with those action mappings only that use the source actions as equally as possible.
+
+        From 2 to 4 variables and 3 to 5 actions: 12 x 90. Parameters: :meth:`from_name`.
+        """
+        return cls.from_name("balanced", *sizes, signs=signs, **named_sizes)
+
+    @classmethod
+    def from_name(
         cls,
+        name: str,
         n_source_variables: int,
         n_target_variables: int,
         n_source_actions: int,
@@ -159,12 +181,23 @@ class MappingSet:
         signs: bool = False,
     ) -> MappingSet:
         """
-        The injective state mappings with those action mappings only that use the source actions as equally as possible.
+        One of the sets by its name, as in a YAML file.
 
-        From 2 to 4 variables and 3 to 5 actions: 12 x 90. Parameters and errors: see :meth:`injective`.
+        :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``
+        :param n_source_variables: number of the source's state variables, and so on
+        :param signs: also include every state mapping with any of its mapped variables mirrored
+        :raises ValueError: for another name, if a number is below 1 or astronomically large, or if there are too many state
+            mappings
         """
-        rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=True, allow_none=True)
-        return cls._of(rows, BalancedActionMappings(n_source_actions, n_target_actions), signs)
+        check_set_name(name, _SIZED_SETS)
+        unsigned = name.removeprefix("signed_")
+        once, allow_none, action_mappings = _SETS[unsigned]
+        rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=once, allow_none=allow_none)
+        actions = action_mappings(n_source_actions, n_target_actions)
+        mirrored = None
+        if signs or unsigned != name:
+            rows, mirrored = with_mirrored(rows)
+        return cls(rows, actions, mirrored)
 
     @classmethod
     def paper_mountain_car(cls) -> MappingSet:
@@ -198,16 +231,14 @@ class MappingSet:
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
         """
         listed = list(mappings)
-        if not listed:
-            raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
+        wrong = [each for each in listed if not isinstance(each, InterTaskMapping)]
+        if not listed or wrong:
+            raise ValueError(f"mappings must be a list of at least one InterTaskMapping, got {(wrong or listed)!r}")
         first = listed[0]
-        # Dictionaries keep the order of first appearance.
         states: dict[tuple[tuple[int, ...], tuple[int, ...]], int] = {}
         actions: dict[tuple[int, ...], int] = {}
         pairs = []
         for mapping in listed:
-            if not isinstance(mapping, InterTaskMapping):
-                raise ValueError(f"mappings must be InterTaskMapping objects, got {mapping!r}")
             if (mapping.n_target_variables, mapping.n_target_actions) != (first.n_target_variables, first.n_target_actions):
                 raise ValueError(
                     f"mappings must all have the same numbers of target variables and actions, got {first!r} and {mapping!r}"
@@ -218,34 +249,6 @@ class MappingSet:
         chosen = cls(state_mappings, list(actions), signs, pairs=pairs)
         chosen.names = first.names
         return chosen
-
-    @classmethod
-    def from_name(
-        cls,
-        name: str,
-        n_source_variables: int,
-        n_target_variables: int,
-        n_source_actions: int,
-        n_target_actions: int,
-        *,
-        signs: bool = False,
-    ) -> MappingSet:
-        """
-        One of the sets by its name, as in a YAML file.
-
-        :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``
-        :raises ValueError: for another name; for the other parameters and errors see :meth:`injective`
-        """
-        unsigned = name.removeprefix("signed_") if isinstance(name, str) else name
-        if unsigned not in _SETS:
-            raise _unknown_set(name)
-        numbers = (n_source_variables, n_target_variables, n_source_actions, n_target_actions)
-        return getattr(cls, unsigned)(*numbers, signs=signs or unsigned != name)
-
-    @classmethod
-    def _of(cls, state_mappings: Ints, actions: ActionMappings, signs: bool) -> MappingSet:
-        rows, mirrored = with_mirrored(state_mappings) if signs else (state_mappings, None)
-        return cls(rows, actions, mirrored)
 
     @property
     def n_state_mappings(self) -> int:
@@ -260,7 +263,7 @@ class MappingSet:
     @property
     def n_mappings(self) -> int:
         """Number of mappings; unlike ``len`` it has no upper limit."""
-        return self._members.n_mappings
+        return self.n_state_mappings * self.n_action_mappings if self.pairs is None else len(self.pairs)
 
     @property
     def n_target_actions(self) -> int:
@@ -283,15 +286,14 @@ class MappingSet:
         number = number + self.n_mappings if number < 0 else number
         if not 0 <= number < self.n_mappings:
             raise IndexError(f"mapping {index} does not exist, the set has {self.n_mappings}")
-        state_index, action_index = self._members.pair(number)
-        state = tuple(None if i == UNMAPPED else i for i in self.state_mappings[state_index].tolist())
-        sign = tuple(self.signs[state_index].tolist())
-        return InterTaskMapping(state, self.actions[action_index], sign, names=self.names)
+        row, action_index = divmod(number, self.n_action_mappings) if self.pairs is None else self.pairs[number].tolist()
+        sign = self.signs[row].tolist()
+        return InterTaskMapping(_state(self.state_mappings[row]), self.actions[action_index], sign, names=self.names)
 
     def source_actions_for(self, action: int) -> Ints:
         """The source actions, ascending, that a target action is mapped to; ``ValueError`` if there is no such action."""
         self._check_action(action)
-        return self._members.source_actions_for(action)
+        return self.actions.source_actions_for(action) if self.pairs is None else np.unique(self._source_actions[:, action])
 
     def candidates(self, action: int) -> Candidates:
         """
@@ -303,8 +305,12 @@ class MappingSet:
         :return: the pairs, ordered by state mapping and source action
         :raises ValueError: if there is no such target action
         """
-        self._check_action(action)
-        return self._members.candidates(action)
+        source_actions = self.source_actions_for(action)
+        if self.pairs is None:
+            rows = np.unique(self._first_equal)
+            return Candidates(np.repeat(rows, len(source_actions)), np.tile(source_actions, len(rows)))
+        different = np.unique(np.column_stack([self._states, self._source_actions[:, action]]), axis=0)
+        return Candidates(different[:, 0].copy(), different[:, 1].copy())
 
     def count(self, state_index: int, action: int, source_action: int) -> int:
         """
@@ -314,7 +320,10 @@ class MappingSet:
         :raises ValueError: if there is no such target action
         """
         self._check_action(action)
-        return self._members.count(state_index, action, source_action)
+        if self.pairs is not None:
+            return len(self._matching(state_index, action, source_action))
+        equal = np.count_nonzero(self._first_equal == self._first_equal[state_index])
+        return int(equal) * self.actions.count(action, source_action)
 
     def find(self, state_index: int, action: int, source_action: int) -> int:
         """
@@ -325,36 +334,33 @@ class MappingSet:
         :raises ValueError: if there is none
         """
         self._check_action(action)
-        return self._members.find(state_index, action, source_action)
+        if self.pairs is None:
+            first = int(self._first_equal[state_index])
+            return first * self.n_action_mappings + self.actions.first(action, source_action)
+        matching = self._matching(state_index, action, source_action)
+        if not matching.size:
+            raise ValueError(
+                f"no mapping of the set has state mapping {state_index} and source action {source_action} for {action}"
+            )
+        return int(matching[0])
+
+    def _matching(self, state_index: int, action: int, source_action: int) -> Ints:
+        same_state = self._states == self._first_equal[state_index]
+        return np.flatnonzero(same_state & (self._source_actions[:, action] == source_action))
 
     def check(self, **sizes: Unpack[TaskSizes]) -> None:
-        """Check every mapping against the spaces of the two tasks, see :meth:`InterTaskMapping.check`."""
-        source_actions = [self._members.source_actions_for(action) for action in range(self.n_target_actions)]
-        lengths = self.state_mappings.shape[1], self.n_target_actions
-        if (
-            lengths == (sizes["n_target_variables"], sizes["n_target_actions"])
-            and self.state_mappings.max() < sizes["n_source_variables"]
-            and max(int(actions.max()) for actions in source_actions) < sizes["n_source_actions"]
-        ):
-            return
-        # Members with the largest index of a source variable or action: one of them fails its own check.
-        for action in range(self.n_target_actions):
-            states, actions = self.candidates(action)
-            for worst in (self.state_mappings[states].max(axis=1).argmax(), actions.argmax()):
-                self[self.find(int(states[worst]), action, int(actions[worst]))].check(**sizes)
+        """Check all state and action mappings against the spaces of the tasks, see :meth:`InterTaskMapping.check`."""
+        # Those with the largest numbers: if they fit, all do.
+        state = _state(self.state_mappings[self.state_mappings.max(axis=1).argmax()])
+        actions = [int(self.source_actions_for(action).max()) for action in range(self.n_target_actions)]
+        check_sizes(state, actions, **sizes)
 
     def with_names(
-        self,
-        source_variables: Iterable[str],
-        target_variables: Iterable[str],
-        source_actions: Iterable[str],
-        target_actions: Iterable[str],
+        self, source_variables: Names, target_variables: Names, source_actions: Names, target_actions: Names
     ) -> MappingSet:
         """The same set, whose members carry names for ``repr``; see :meth:`InterTaskMapping.with_names`."""
-        named = object.__new__(type(self))
-        named.__dict__.update(self.__dict__)
-        groups = source_variables, target_variables, source_actions, target_actions
-        named.names = MappingNames(*(tuple(group) for group in groups))
+        named = copy(self)
+        named.names = MappingNames(*map(tuple, (source_variables, target_variables, source_actions, target_actions)))
         return named
 
     def __repr__(self) -> str:
@@ -367,21 +373,15 @@ class MappingSet:
             raise ValueError(f"action must be a target action from 0 to {self.n_target_actions - 1}, got {action}")
 
 
-_SETS = ("injective", "surjective", "all", "balanced")
-_OTHER_SETS = ("paper_mountain_car", "paper_icub")
-_FACTORED_SETS = ("factored", "signed_factored")
+def _state(row: Ints) -> tuple[int | None, ...]:
+    return tuple(None if i == UNMAPPED else i for i in row.tolist())
 
 
-def check_set_name(name: str) -> None:
+def check_set_name(name: object, known: Sequence[str] = (*_SIZED_SETS, *_PAPER_SETS, *_FACTORED_SETS)) -> None:
     """Raise ``ValueError`` if there is no set of that name."""
-    if name.removeprefix("signed_") not in _SETS and name not in (*_OTHER_SETS, *_FACTORED_SETS):
-        raise _unknown_set(name)
-
-
-def _unknown_set(name: object) -> ValueError:
-    names = [*_SETS, *(f"signed_{each}" for each in _SETS), *_OTHER_SETS]
-    factored = f'with use="prior" also {", ".join(_FACTORED_SETS)}'
-    return ValueError(f"mappings must be one of {', '.join(names)}; {factored}; got {name!r}")
+    if name not in known:
+        names, factored = ", ".join((*_SIZED_SETS, *_PAPER_SETS)), ", ".join(_FACTORED_SETS)
+        raise ValueError(f'mappings must be one of {names}; with use="prior" also {factored}; got {name!r}')
 
 
 def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:

@@ -14,7 +14,7 @@ Entries = Sequence[int | str | None] | Mapping[Any, Any]
 def as_entries(argument: str, values: Any) -> tuple[Any, ...]:
     """What a user gave so that it can be compared and hashed: a dict as pairs of key and value."""
     if isinstance(values, Mapping):
-        return tuple((key, value) for key, value in values.items())
+        return tuple(values.items())
     if isinstance(values, str) or not isinstance(values, Sequence | np.ndarray):
         raise ValueError(
             f"{argument} must be a sequence with one entry for each target variable or action, or a dict from their names, "
@@ -22,6 +22,11 @@ def as_entries(argument: str, values: Any) -> tuple[Any, ...]:
         )
     # Pairs that were written to a file come back as lists.
     return tuple(tuple(each) if isinstance(each, list | tuple) and len(each) == 2 else each for each in values)
+
+
+def as_given(entries: Sequence[Any]) -> Any:
+    """Pairs of :func:`as_entries` as a dict again."""
+    return dict(entries) if any(isinstance(each, tuple) for each in entries) else tuple(entries)
 
 
 def has_names(entries: Sequence[Any]) -> bool:
@@ -44,16 +49,19 @@ def numbers(
     """
     if not any(isinstance(each, tuple) for each in entries):
         return tuple(_number(argument, each, source_names, "source") for each in entries)
+    if not all(isinstance(each, tuple) for each in entries):
+        raise ValueError(f"{argument} must be entries or pairs, not both, got {tuple(entries)!r}")
     found = dict.fromkeys(range(len(target_names)), default)
-    for pair in entries:
-        if not isinstance(pair, tuple):
-            raise ValueError(f"{argument} must be entries or pairs, not both, got {tuple(entries)!r}")
-        target = _number(argument, pair[0], target_names, "target")
-        if target not in found:
-            raise ValueError(f"{argument} must have keys from 0 to {len(target_names) - 1} or names, got {pair[0]!r}")
-        if sum(_number(argument, each[0], target_names, "target") == target for each in entries) > 1:
-            raise ValueError(f"{argument} must have each of the target's {_kind(argument)} once, got {pair[0]!r} twice")
-        found[target] = _number(argument, pair[1], source_names, "source")
+    seen = set()
+    for key, value in entries:
+        target = _number(argument, key, target_names, "target")
+        if target not in found or target in seen:
+            raise ValueError(
+                f"{argument} must have keys from 0 to {len(target_names) - 1} or names, each of the target's "
+                f"{_kind(argument)} once, got {key!r}{' twice' if target in seen else ''}"
+            )
+        seen.add(target)
+        found[target] = _number(argument, value, source_names, "source")
     missing = [target_names[k] for k, each in found.items() if each is None]
     if argument == "action" and missing:
         raise ValueError(f"action must have a source action for each target action, got none for {', '.join(missing)}")

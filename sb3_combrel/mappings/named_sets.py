@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Unpack
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, MappingNames, TaskSizes, as_mapping
 from sb3_combrel.mappings.mapping_set import MappingSet, check_set_name
-
-WHAT_THEY_MUST_BE = "mappings must be a name, an InterTaskMapping, a list of them or a MappingSet"
 
 
 def resolve(
@@ -26,18 +24,13 @@ def resolve(
     :raises ValueError: if ``mappings`` is none of these or does not fit the two tasks
     """
     papers = {"paper_mountain_car": MappingSet.paper_mountain_car, "paper_icub": MappingSet.paper_icub}
-    if isinstance(mappings, MappingSet):
-        resolved = mappings
-    elif isinstance(mappings, str):
-        resolved = papers[mappings]() if mappings in papers else MappingSet.from_name(mappings, **sizes)
-    elif isinstance(mappings, InterTaskMapping | Mapping):
-        resolved = MappingSet.from_list([as_mapping(mappings, "mappings")])
-    elif isinstance(mappings, Iterable):
-        resolved = MappingSet.from_list([as_mapping(mapping, "mappings") for mapping in mappings])
-    else:
-        raise ValueError(f"{WHAT_THEY_MUST_BE}, got {mappings!r}")
-    resolved.check(**sizes)
-    return resolved
+    found = _made(mappings)
+    if isinstance(found, str):
+        found = papers[found]() if found in papers else MappingSet.from_name(found, **sizes)
+    elif not isinstance(found, MappingSet):
+        found = MappingSet.from_list(found if isinstance(found, list) else [found])
+    found.check(**sizes)
+    return found
 
 
 def check_mappings(mappings: Any) -> None:
@@ -47,19 +40,8 @@ def check_mappings(mappings: Any) -> None:
     :param mappings: see :func:`resolve`, or a factored mapping or a dict of its copies
     :raises ValueError: for a set that does not exist, an empty list, or something else than mappings
     """
-    if isinstance(mappings, str):
+    if isinstance(_made(mappings), str):
         check_set_name(mappings)
-    elif isinstance(mappings, Mapping) and "copies" in mappings:
-        _factored(mappings)
-    elif isinstance(mappings, Mapping):
-        as_mapping(mappings, "mappings")
-    elif isinstance(mappings, Sequence):
-        if not mappings:
-            raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
-        for each in mappings:
-            as_mapping(each, "mappings")
-    elif not isinstance(mappings, InterTaskMapping | FactoredMapping | MappingSet | Iterable):
-        raise ValueError(f"{WHAT_THEY_MUST_BE}, got {mappings!r}")
 
 
 def with_numbers(mappings: Any, names: Sequence[MappingNames]) -> Any:
@@ -71,20 +53,29 @@ def with_numbers(mappings: Any, names: Sequence[MappingNames]) -> Any:
     :return: mappings that were given by name, with numbers; anything else as it is
     :raises ValueError: if a name is not that of one variable or action, or stands for different ones in several sources
     """
-    if isinstance(mappings, Mapping):
-        made = _factored(mappings) if "copies" in mappings else as_mapping(mappings, "mappings")
-        return with_numbers(made, names) if made.has_names else mappings
-    if isinstance(mappings, list | tuple):
-        return [with_numbers(each, names) for each in mappings]
-    if not (isinstance(mappings, InterTaskMapping | FactoredMapping) and mappings.has_names):
+    made = _made(mappings)
+    if isinstance(made, list):
+        return [with_numbers(each, names) for each in made]
+    if not (isinstance(made, InterTaskMapping | FactoredMapping) and made.has_names):
         return mappings
-    found = [mappings.with_names(*each) for each in names]
+    found = [made.with_names(*each) for each in names]
     if any(each != found[0] for each in found):
-        raise ValueError(f"{mappings!r} means different variables or actions in each of the source tasks: give numbers")
+        raise ValueError(f"{made!r} means different variables or actions in each of the source tasks: give numbers")
     return found[0]
 
 
-def _factored(mapping: Mapping[str, Any]) -> FactoredMapping:
-    if set(mapping) != {"copies"}:
-        raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
-    return FactoredMapping(**mapping)
+def _made(mappings: Any) -> Any:
+    """Mappings that are given as dicts made, a list of them as a list; names and sets as they are."""
+    if isinstance(mappings, str | InterTaskMapping | FactoredMapping | MappingSet):
+        return mappings
+    if isinstance(mappings, Mapping):
+        if "copies" not in mappings:
+            return as_mapping(mappings, "mappings")
+        if set(mappings) != {"copies"}:
+            raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mappings!r}")
+        return FactoredMapping(**mappings)
+    if not isinstance(mappings, Sequence):
+        raise ValueError(f"mappings must be a name, an InterTaskMapping, a list of them or a MappingSet, got {mappings!r}")
+    if not mappings:
+        raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
+    return [as_mapping(each, "mappings") for each in mappings]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 from math import comb, perm
 
 import numpy as np
@@ -33,7 +33,7 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     different = min(n_source, n_target)
-    _check_state_mappings(_count_state_mappings(n_source, n_target, once, allow_none))
+    _check_n_state_mappings(_count_state_mappings(n_source, n_target, once, allow_none))
     choices = np.arange(UNMAPPED if allow_none else 0, n_source, dtype=np.int64)
     rows = np.empty((1, 0), dtype=np.int64)
     for position in range(n_target):
@@ -56,7 +56,7 @@ def copies_of_source(n_source: int, n_target: int) -> Ints:
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     largest = min(n_source, n_target)
-    _check_state_mappings(sum(comb(n_source, k) * perm(n_target, k) for k in range(1, largest + 1)))
+    _check_n_state_mappings(sum(comb(n_source, k) * perm(n_target, k) for k in range(1, largest + 1)))
     rows = []
     for size in range(largest, 0, -1):
         for used in combinations(range(n_source), size):
@@ -76,16 +76,16 @@ def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
     :raises ValueError: if there are more than ``MAX_STATE_MAPPINGS``
     """
     mapped = state_mappings != UNMAPPED
-    n_mapped = mapped.sum(axis=1)
-    # With the integers of Python, which do not overflow.
-    _check_state_mappings(sum(2**n for n in n_mapped.tolist()))
-    copies = 2**n_mapped
-    rows = np.repeat(state_mappings, copies, axis=0)
-    # The k-th copy of a mapping mirrors its mapped variables by the binary digits of k.
-    number = np.arange(len(rows)) - np.repeat(np.cumsum(copies) - copies, copies)
-    digit = np.cumsum(rows != UNMAPPED, axis=1) - 1
-    mirrored = (rows != UNMAPPED) & ((number[:, None] >> np.maximum(digit, 0)) & 1 == 1)
-    return rows, np.where(mirrored, -1, 1).astype(np.int64)
+    _check_n_state_mappings(sum(2**n for n in mapped.sum(axis=1).tolist()))
+    rows, signs = [], []
+    for row, is_mapped in zip(state_mappings, mapped, strict=True):
+        for mirrored in product((1, -1), repeat=int(is_mapped.sum())):
+            sign = np.ones_like(row)
+            # The first variable's changes fastest.
+            sign[is_mapped] = mirrored[::-1]
+            rows.append(row)
+            signs.append(sign)
+    return np.array(rows), np.array(signs)
 
 
 def _count_state_mappings(n_source: int, n_target: int, once: bool, allow_none: bool) -> int:
@@ -98,7 +98,7 @@ def _count_state_mappings(n_source: int, n_target: int, once: bool, allow_none: 
     return sum((-1) ** k * comb(n_source, k) * (choices - k) ** n_target for k in range(n_source + 1))
 
 
-def _check_state_mappings(count: int) -> None:
+def _check_n_state_mappings(count: int) -> None:
     if count > MAX_STATE_MAPPINGS:
         raise ValueError(
             f"these spaces have {count_text(count)} state mappings of that kind, more than the {MAX_STATE_MAPPINGS:,} that "

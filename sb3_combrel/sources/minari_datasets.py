@@ -30,7 +30,7 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     env_spec = data.env_spec
     unnamed = {"env": None if env_spec is None else env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
-    names = kept.get("names", {})
+    names = {name: tuple(each) for name, each in kept.get("names", {}).items()}
     return Transitions(
         np.concatenate([episode.observations[:-1] for episode in episodes]),
         actions - int(data.action_space.start),
@@ -40,10 +40,8 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
         scaling.low,
         scaling.high,
         n_actions,
-        tuple(names.get("state_names", ())),
-        tuple(names.get("action_names", ())),
-        kept.get("origin", unnamed),
-        tuple(names.get("periodic", ())),
+        origin=kept.get("origin", unnamed),
+        **names,
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sb3_combrel.common.checks import check_count, check_finite, count_text
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.sources.transitions import (
+    LEARNERS,
     TransitionLog,
     Transitions,
     as_transition_count,
@@ -220,3 +221,6 @@ def learn_q_learning(
     finally:
         if isinstance(env, str):
             made.env.close()
+
+
+LEARNERS["q_learning"] = learn_q_learning

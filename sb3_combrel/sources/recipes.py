@@ -18,10 +18,10 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.sources.transitions import LEARNERS
 
 CACHE_VARIABLE = "SB3_COMBREL_CACHE"
 RENEW_VARIABLE = "SB3_COMBREL_RENEW"
-LEARNERS = ("q_learning", "fitted_rmax")
 DEFAULT_RECIPE: Mapping[str, Any] = {"n_instances": 1000, "total_timesteps": 30_000, "seed": 0}
 # Files that this process has learned or named: a study of a hundred trials says so once, and learns once.
 _SEEN: set[Path] = set()
@@ -163,34 +163,24 @@ def fingerprint(env_id: str) -> str:
         made = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     except (ImportError, AttributeError):
         made = None
-    if made is not None:
-        classes = inspect.getmro(made) if inspect.isclass(made) else (made,)
-        modules = {each.__module__ for each in classes} - {"builtins", "typing", "abc", "gymnasium.core"}
-        package = str(getattr(made, "__module__", "")).partition(".")[0]
-        parts += [_text_of(name) for name in sorted(modules | _imported(modules, package))]
+    modules: set[str] = set()
+    for each in inspect.getmro(made) if inspect.isclass(made) else [made]:
+        _add_modules(getattr(each, "__module__", ""), modules)
+    files = (getattr(sys.modules[name], "__file__", None) for name in sorted(modules))
+    parts += [Path(file).read_text(errors="replace") for file in files if file]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
 
 
-def _imported(modules: set[str], package: str) -> set[str]:
-    """Modules of the same package that the given ones use, directly or not."""
-    found: set[str] = set()
-    open_ = {name for name in modules if name.partition(".")[0] == package and package != "gymnasium"}
-    while open_:
-        module = sys.modules.get(open_.pop())
-        for value in list(vars(module).values()) if module is not None else []:
-            name = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None)
-            if isinstance(name, str) and name.partition(".")[0] == package and name not in found | modules:
-                found.add(name)
-                open_.add(name)
-    return found
-
-
-def _text_of(module: str) -> str:
-    file = getattr(sys.modules.get(module), "__file__", None)
-    try:
-        return Path(file).read_text() if file else module
-    except (OSError, UnicodeDecodeError):
-        return module
+def _add_modules(name: str, modules: set[str]) -> None:
+    """Add a module and those of the same package that it uses, directly or not; of Gymnasium only environments' own."""
+    package = name.partition(".")[0]
+    if name in modules or name not in sys.modules or package in sys.stdlib_module_names or name == "gymnasium.core":
+        return
+    modules.add(name)
+    for value in list(vars(sys.modules[name]).values()) if package != "gymnasium" else []:
+        used = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None)
+        if isinstance(used, str) and used.partition(".")[0] == package:
+            _add_modules(used, modules)
 
 
 def task_spec(name: str) -> EnvSpec | None:

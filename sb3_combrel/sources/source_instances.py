@@ -21,10 +21,11 @@ from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.common.serialisation import register_reader, register_writer
-from sb3_combrel.sources import minari_datasets, q_learning, recording
+from sb3_combrel.sources import minari_datasets, recording
+from sb3_combrel.sources.q_learning import learn_q_learning
 from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
-from sb3_combrel.sources.transitions import Transitions, as_transition_count, count_actions
+from sb3_combrel.sources.transitions import LEARNERS, Transitions, as_transition_count, count_actions
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -164,7 +165,7 @@ class SourceInstances:
         total_timesteps = as_transition_count("total_timesteps", total_timesteps)
         n_instances = as_count("n_instances", n_instances, max=total_timesteps, why_max="total_timesteps")
         check_method(method)
-        learned = q_learning.learn_q_learning(env, seed, total_timesteps, learner)
+        learned = learn_q_learning(env, seed, total_timesteps, learner)
         return cls(*learned).subset(n_instances, method, seed)
 
     @classmethod
@@ -193,7 +194,7 @@ class SourceInstances:
         """
         n_instances = as_transition_count("n_instances", n_instances)
         check_method(method)
-        learned = recording.learn_fitted_rmax(env, seed, n_episodes, learner)
+        learned = LEARNERS["fitted_rmax"](env, seed, n_episodes, learner)
         return cls(*learned).subset(n_instances, method, seed)
 
     @classmethod

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -37,10 +38,14 @@ class Transitions(NamedTuple):
     low: Floats
     high: Floats
     n_actions: int
-    state_names: tuple[str, ...]
-    action_names: tuple[str, ...]
-    origin: Mapping[str, Any]
+    state_names: tuple[str, ...] = ()
+    action_names: tuple[str, ...] = ()
+    origin: Mapping[str, Any] = MappingProxyType({})
     periodic: tuple[bool, ...] = ()
+
+
+#: By name, what learns a source task: called with the environment or its id, the seed, how long, and a dict of arguments.
+LEARNERS: dict[str, Callable[[str | gym.Env[Any, Any], int | None, int, dict[str, Any]], Transitions]] = {}
 
 
 class TransitionLog:
@@ -80,32 +85,20 @@ class TransitionLog:
             self._rows[position] = row
 
     def transitions(
-        self, scaling: StateScaling, n_actions: int, names: Mapping[str, Sequence[Any]], origin: Mapping[str, Any]
+        self, scaling: StateScaling, n_actions: int, names: Mapping[str, tuple[Any, ...]], origin: Mapping[str, Any]
     ) -> Transitions:
         """
-        What is in the log.
+        What is in the log; ``ValueError`` if that is nothing.
 
         :param names: ``state_names``, ``action_names`` and ``periodic``, as far as known
         :param origin: where the transitions came from
-        :raises ValueError: if there are none
         """
         if not self._rows:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
-        _, states, actions, rewards, next_states, terminated = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
-        return Transitions(
-            np.array(states, dtype=np.float64),
-            np.array(actions, dtype=np.int64),
-            np.array(rewards, dtype=np.float64),
-            np.array(next_states, dtype=np.float64),
-            np.array(terminated, dtype=np.bool_),
-            scaling.low,
-            scaling.high,
-            n_actions,
-            tuple(names.get("state_names", ())),
-            tuple(names.get("action_names", ())),
-            origin,
-            tuple(names.get("periodic", ())),
-        )
+        _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
+        kinds = np.float64, np.int64, np.float64, np.float64, np.bool_
+        arrays = [np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)]
+        return Transitions(*arrays, scaling.low, scaling.high, n_actions, origin=origin, **names)
 
 
 def check_observation(observation: Any, when: str) -> None:

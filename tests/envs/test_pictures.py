@@ -37,7 +37,6 @@ class TestMountainCar:
             env.reset(options={"state": place + [0.0] * n})
             pictures.append(env.render())
         env.close()
-        env.close()
         assert pictures[0].shape == (120, 160, 3) and pictures[0].dtype == np.uint8 and pictures[0].std() > 20
         assert all(0.001 < changed(pictures[0], other) < 0.1 for other in pictures[1:])
 

@@ -4,10 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3 import PPO
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.sources import recording
 from sb3_combrel.sources.q_learning import QLearning
 from sb3_combrel.sources.source_recorder import SourceRecorder
 
@@ -46,41 +44,25 @@ def record(env):
     return SourceInstances.record(None, env, 20, seed=0)
 
 
-def from_fitted_rmax(env):
-    limited = gym.wrappers.TimeLimit(env, 10)
-    return SourceInstances.from_fitted_rmax(limited, 10, seed=0, n_episodes=2, max_value=0.0, resolution=2, model_breadth=0.2)
-
-
 def learn_by_q_learning(env):
     return QLearning(env, seed=0).learn(20)
 
 
-LEARNERS = [record, from_fitted_rmax, learn_by_q_learning]
-
-
-@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("learner", [record, learn_by_q_learning])
 @pytest.mark.parametrize(("good_steps", "observation"), [(0, NAN), (1, INF), (4, -INF)])
 def test_an_observation_that_is_not_finite_is_named(learner, good_steps, observation):
     with pytest.raises(ValueError, match=rf"the environment returned an observation that is not finite.*{observation}"):
         learner(Faulty(good_steps, observation=observation))
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
-def test_a_reward_that_is_not_finite_is_named(learner):
-    with pytest.raises(ValueError, match=r"the environment returned a reward that is not .*finite.*nan"):
-        learner(Faulty(3, reward=NAN))
-
-
-@pytest.mark.parametrize("reward", [None, "much", [1.0, 2.0], INF])
+@pytest.mark.parametrize("reward", ["much", [1.0, 2.0], INF, NAN])
 def test_a_reward_that_is_no_number_is_named(reward):
-    expected = r"the environment returned a reward that is not a finite number, in step 3 of episode 1"
-    with pytest.raises(ValueError, match=expected):
+    says = "the environment returned a reward that is not a finite number, in"
+    with pytest.raises(ValueError, match=f"{says} step 3 of episode 1"):
         learn_by_q_learning(Faulty(3, reward=reward))
-
-
-def test_the_recorder_names_a_reward_that_is_not_finite():
-    with pytest.raises(ValueError, match=r"a reward that is not a finite number, in transition 4: .*inf"):
-        PPO("MlpPolicy", Faulty(5, reward=INF), n_steps=8, n_epochs=1, batch_size=8).learn(8, callback=SourceRecorder())
+    # Vectorised environments keep rewards in an array of numbers.
+    with pytest.raises(ValueError, match=f"{says} transition 2" if isinstance(reward, float) else None):
+        record(Faulty(3, reward=reward))
 
 
 def test_q_learning_names_rewards_that_its_values_cannot_represent():
@@ -107,11 +89,6 @@ def test_learning_refuses_what_is_no_count(name, call, number):
         call(number)
 
 
-def test_more_instances_than_steps_are_refused():
-    with pytest.raises(ValueError, match=r"n_instances must be a whole number from 1 to 10 \(total_timesteps\), got 11"):
-        SourceInstances.from_q_learning(TASK, 11, total_timesteps=10)
-
-
 @pytest.mark.parametrize("number", [each for each in NO_COUNTS if each not in (1e308, 10**30)])
 def test_subsets_and_recorders_refuse_what_is_no_count(number):
     some = SourceInstances.record(None, TASK, 8, seed=0)
@@ -124,6 +101,8 @@ def test_subsets_and_recorders_refuse_what_is_no_count(number):
 def test_whole_floats_are_counts():
     some = SourceInstances.record(None, TASK, 8.0, seed=0)
     assert (len(some), len(some.subset(3.0)), len(some.subset(10**30))) == (8, 3, 8)
+    with pytest.raises(ValueError, match=r"n_instances must be a whole number from 1 to 10 \(total_timesteps\), got 11"):
+        SourceInstances.from_q_learning(TASK, 11, total_timesteps=10)
     learned = SourceInstances.from_q_learning(TASK, 5.0, seed=0, total_timesteps=1e2)
     assert learned.origin["total_timesteps"] == 100
     np.testing.assert_array_equal(learned.states, SourceInstances.from_q_learning(TASK, 5, 0, total_timesteps=100).states)
@@ -133,9 +112,3 @@ def test_a_method_of_choice_that_does_not_exist_is_refused_before_learning():
     for learn in (SourceInstances.from_q_learning, SourceInstances.from_fitted_rmax):
         with pytest.raises(ValueError, match="method must be 'random' or 'covering', got 'best'"):
             learn("no such task", 5, method="best")
-
-
-def test_fitted_rmax_must_have_been_handed_in(monkeypatch):
-    monkeypatch.setattr(recording, "_fitted_rmax", [])
-    with pytest.raises(RuntimeError, match="import sb3_combrel first"):
-        SourceInstances.from_fitted_rmax(TASK, 5, n_episodes=1, max_value=0.0)

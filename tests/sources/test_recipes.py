@@ -41,15 +41,11 @@ def test_a_task_is_learned_when_the_model_is_made_and_read_the_next_time(method,
     assert_same(first.transfer.source, second.transfer.source)
 
 
-def in_another_process(monkeypatch):
-    monkeypatch.setattr(recipes, "_SEEN", set())
-
-
 def test_what_is_read_is_named_once_with_its_date(monkeypatch, tmp_path, capsys):
     find_source(WALK)
     (file,) = (tmp_path / "cache").iterdir()
     os.utime(file, (0.0, time.mktime((2021, 3, 4, 5, 6, 0, 0, 0, -1))))
-    in_another_process(monkeypatch)
+    monkeypatch.setattr(recipes, "_SEEN", set())
     capsys.readouterr()
     find_source(WALK)
     printed = capsys.readouterr().out
@@ -63,9 +59,9 @@ def test_a_source_is_renewed_once_in_a_process(by, monkeypatch, tmp_path, capsys
     find_source(WALK)
     (file,) = (tmp_path / "cache").iterdir()
     some_source().save(file)
-    in_another_process(monkeypatch)
+    monkeypatch.setattr(recipes, "_SEEN", set())
     assert_same(find_source(WALK), some_source())
-    in_another_process(monkeypatch)
+    monkeypatch.setattr(recipes, "_SEEN", set())
     capsys.readouterr()
     if by == "variable":
         monkeypatch.setenv(recipes.RENEW_VARIABLE, "1")
@@ -113,42 +109,34 @@ def test_a_changed_module_of_the_dynamics_is_noticed(tmp_path, monkeypatch):
     assert recipes.fingerprint(WALK) != before
 
 
-def test_files_tasks_and_instances_may_be_listed_together(tmp_path):
+def test_files_tasks_and_instances_may_be_listed_together_and_are_saved_with_the_model(tmp_path):
     file = some_source().save(tmp_path / "source.npz")
-    found = COMBREL([str(file), WALK, some_source()], use="instances")
-    [one, two, three] = small(transfer=found).transfer.sources
+    small(transfer=COMBREL([str(file), WALK, some_source()], use="instances")).save(tmp_path / "model")
+    file.unlink()
+    [one, two, three] = FittedRMax.load(tmp_path / "model", env=Walk()).transfer.sources
     assert_same(one, some_source())
     assert_same(three, some_source())
     assert two.origin["env"] == WALK
 
 
-def test_a_saved_model_has_the_instances(tmp_path):
-    small(transfer=COMBREL(WALK)).learn(40).save(tmp_path / "model")
-    for file in (tmp_path / "cache").iterdir():
-        file.unlink()
-    assert len(FittedRMax.load(tmp_path / "model", env=Walk()).transfer.source) == 40
-
-
-@pytest.mark.parametrize("name", ["nowhere.npz", "Nowhere-v0", "no_such_package:Task-v0", "combrel/Nowhere-v0", ""])
-def test_what_does_not_exist_is_refused_at_construction(name):
-    for method, source in ((COMBREL, name), (TIMBREL, [some_source(), name])):
-        with pytest.raises(FileNotFoundError, match=r"there is no source file .*and no environment of that name"):
-            method(source)
-
-
 @pytest.mark.parametrize(
-    ("source", "message"),
+    ("source", "error", "message"),
     [
-        ({"n_instances": 3}, "the recipe of a source needs 'env'"),
-        ({"env": WALK, "learner": "sarsa"}, "learner must be q_learning or fitted_rmax, got 'sarsa'"),
-        (7, "source must be SourceInstances, a path to them, or a list of these"),
-        ([], "source must be SourceInstances"),
+        *(
+            (name, FileNotFoundError, "there is no source file .*and no environment of that name")
+            for name in ("nowhere.npz", "Nowhere-v0", "no_such_package:Task-v0", "combrel/Nowhere-v0", "")
+        ),
+        ({"n_instances": 3}, ValueError, "the recipe of a source needs 'env'"),
+        ({"env": WALK, "learner": "sarsa"}, ValueError, "learner must be q_learning or fitted_rmax, got 'sarsa'"),
+        (7, ValueError, "source must be SourceInstances, a path to them, or a list of these"),
+        ([], ValueError, "source must be SourceInstances"),
     ],
 )
-def test_what_is_no_source_is_refused_at_construction(source, message):
-    for method in (COMBREL, TIMBREL):
-        with pytest.raises(ValueError, match=message):
-            method(source)
+def test_what_is_no_source_is_refused_at_construction(source, error, message):
+    for given in (source, [some_source(), source]):
+        for method in (COMBREL, TIMBREL):
+            with pytest.raises(error, match=message):
+                method(given)
 
 
 def test_a_path_that_goes_before_it_is_read_is_named(tmp_path):

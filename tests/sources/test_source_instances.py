@@ -101,7 +101,3 @@ class TestSubset:
     def test_equal_states_are_not_chosen_twice(self):
         rows = covering_rows(np.zeros((9, 2)), np.zeros(9, dtype=int), np.zeros(9, dtype=bool), 7, np.random.default_rng(0))
         assert len(set(rows.tolist())) == 7
-
-    def test_another_method_is_refused(self):
-        with pytest.raises(ValueError, match="method must be 'random' or 'covering', got 'best'"):
-            some_source().subset(3, "best")

@@ -22,7 +22,7 @@ from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB, MOUNTAIN_CAR, D
 from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, Episodes, play
 from sb3_combrel.runs.job import UNLIMITED, Job, Result, chosen_on_purpose, described
-from sb3_combrel.sources.recording import TransitionRecorder
+from sb3_combrel.sources.source_recorder import SourceRecorder
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import Transfer
 
@@ -174,7 +174,7 @@ def prefill(job: BaselineJob) -> tuple[Episodes, Transitions]:
     """Learn a few episodes with COMBREL; these, and what to fill the replay buffer with, translated for their states."""
     assert job.source is not None
     learner, arguments, n_episodes = PREFILLINGS[str(job.env)]
-    recorder, transitions = EpisodeRecorder(n_episodes), TransitionRecorder()
+    recorder, transitions = EpisodeRecorder(n_episodes), SourceRecorder()
     with closing(Job.make_env(job)) as env, chosen_on_purpose():
         model = FittedRMax(env, transfer=COMBREL(job.source, **arguments), seed=job.seed, **learner)
         model.learn(UNLIMITED, [transitions, recorder], log_interval=None)
