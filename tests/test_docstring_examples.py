@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shutil
 import textwrap
 
 import gymnasium
@@ -34,19 +35,27 @@ def test_examples_are_found():
     assert examples_of("Text::\n\n    a = 1\n\n    b = 2\n\nMore.") == ["a = 1\n\nb = 2\n\n"]
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Source instances, and the file of a model."""
+    path = tmp_path_factory.mktemp("models") / "car.zip"
+    small(transfer=sb3_combrel.COMBREL(walk_source())).learn(10).save(path)
+    return sb3_combrel.SourceInstances.record(None, "combrel/MountainCar2D-v0", n_instances=100, seed=0), path
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] * (name in TAKE_LONG)) for name in sb3_combrel.__all__]
 )
-def test_whatever_is_exported_has_an_example_that_runs(name, tmp_path, monkeypatch, capsys):
+def test_whatever_is_exported_has_an_example_that_runs(name, made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     documented = getattr(sb3_combrel, name)
     found = examples_of(documented.__doc__)
     assert found, f"{name} has no example"
-    source = sb3_combrel.SourceInstances.record(None, "combrel/MountainCar2D-v0", n_instances=300, seed=0)
-    small(transfer=sb3_combrel.COMBREL(walk_source())).learn(40).save("car")
+    source, model = made
+    shutil.copy(model, "car.zip")
     names = {each: getattr(sb3_combrel, each) for each in sb3_combrel.__all__}
     for example in found:
-        short = re.sub(r"steps=[\d_]+", "steps=60", example).replace("seeds=10", "seeds=2")
+        short = re.sub(r"steps=[\d_]+", "steps=20", example).replace("seeds=10", "seeds=2")
         short = short.replace("combrel/MountainCar4D-v0", SHORT_CAR)
         exec(compile(short, name, "exec"), names | {"sb3_combrel": sb3_combrel, "source": source, "np": np})
     written = {path.name for path in tmp_path.iterdir()}

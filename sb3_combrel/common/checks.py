@@ -8,26 +8,20 @@ import numpy as np
 
 
 def check_positive(name: str, value: object, *, max: float = float("inf")) -> None:
-    """
-    :raises ValueError: unless ``value`` is a number above 0 and not above ``max``
-    """
+    """:raises ValueError: unless ``value`` is a number above 0 and not above ``max``"""
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= max or not math.isfinite(value):
         limit = "" if max == float("inf") else f" and at most {max:g}"
         raise ValueError(f"{name} must be a number above 0{limit}, got {value!r}")
 
 
 def check_finite(name: str, value: object) -> None:
-    """
-    :raises ValueError: unless ``value`` is a finite number
-    """
+    """:raises ValueError: unless ``value`` is a finite number"""
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
 
 
 def check_boolean(name: str, value: object) -> None:
-    """
-    :raises ValueError: unless ``value`` is True or False
-    """
+    """:raises ValueError: unless ``value`` is True or False"""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {value!r}")
 
@@ -35,8 +29,7 @@ def check_boolean(name: str, value: object) -> None:
 def check_count(
     name: str, value: object, *, min: int = 1, max: int | None = None, none_allowed: bool = False, why_max: str = ""
 ) -> None:
-    """
-    :param why_max: the reason for ``max``, for the message, such as "more cannot be kept in memory"
+    """:param why_max: the reason for ``max``, for the message, such as "more cannot be kept in memory"
     :raises ValueError: unless ``value`` is a whole number from ``min`` to ``max`` (or None, where that is allowed)
     """
     if value is None and none_allowed:
@@ -51,8 +44,7 @@ def check_count(
 
 
 def as_count(name: str, value: object, *, min: int = 1, max: int | None = None, why_max: str = "") -> int:
-    """
-    A whole number that may have been written as a float, such as 1e5; for the parameters see :func:`check_count`.
+    """A whole number that may have been written as a float, such as 1e5; for the parameters see :func:`check_count`.
 
     :return: the value as an int
     :raises ValueError: unless it is a whole number from ``min`` to ``max``
@@ -71,9 +63,7 @@ def count_text(number: int) -> str:
 
 
 def check_resolution(value: int | Sequence[int] | None, n_variables: int) -> None:
-    """
-    :raises ValueError: unless ``value`` is None, a whole number, or one for each state variable
-    """
+    """:raises ValueError: unless ``value`` is None, a whole number, or one for each state variable"""
     if value is None:
         return
     each = [value] if isinstance(value, Integral) else value

@@ -23,15 +23,8 @@ from numba.core import event
 PACKAGE = Path(__file__).absolute().parent.parent
 
 
-@lru_cache(1)
-def _remove_outdated_once() -> None:
-    remove_outdated()
-
-
 def remove_outdated(package: Path = PACKAGE, cache: str = str(getattr(config, "CACHE_DIR", ""))) -> None:
-    """
-    Remove compiled code that is older than any source file in the folders that have some; done before the first
-    call of a compiled function.
+    """Remove compiled code that is older than any source file in the folders that have some, before the first call.
 
     Numba compiles a function again when its own file has changed, not when a file has changed whose functions it calls.
 
@@ -57,10 +50,11 @@ def remove_outdated(package: Path = PACKAGE, cache: str = str(getattr(config, "C
             continue
 
 
+_remove_outdated_once = lru_cache(1)(remove_outdated)
+
 _njit: Any = njit
 # Three options that are not in Numba's documentation, here alone; what they give up is noted with each.
-# _nrt: the functions allocate nothing, so they need no reference counts, which take half of the time of a step. A function
-# that allocates does not compile. Arrays are kept alive by the caller's arguments.
+# _nrt: no reference counts, which take half of the time of a step. A function that allocates does not compile.
 _options: dict[str, Any] = dict(cache=True, error_model="numpy", _nrt=False)
 compiled = _njit(**_options)
 
@@ -82,13 +76,9 @@ inner_fast = _njit(**_options, no_cpython_wrapper=True, fastmath={"reassoc", "co
 
 
 class EntryPoint:
-    """
-    A compiled function for callers from Python: ``EntryPoint(function)(...)``, or ``.call(...)``, a little quicker.
+    """A compiled function for callers from Python: ``EntryPoint(function)(...)``, or ``.call(...)``, a little quicker.
 
-    Its first call may have to compile; it then prints a message, and garbage collection waits: a compiler makes millions of
-    objects that stay for a while.
-
-    :param function: made by :data:`compiled`
+    Its first call may have to compile; it then prints a message, and garbage collection waits.
     """
 
     def __init__(self, function: Any):

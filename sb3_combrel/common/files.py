@@ -8,11 +8,9 @@ from pathlib import Path
 
 
 def write_whole(target: Path, content: bytes) -> None:
-    """
-    Write a file in one go: who reads it finds the old content or the new, even if the writer is killed meanwhile.
+    """Write a file in one go: who reads it finds the old content or the new, even if the writer is killed meanwhile.
 
-    :param target: path of the file; its folder is made if need be
-    :param content: all of it
+    :param target: its folder is made if need be
     :raises OSError: if the file cannot be written
     """
     target.parent.mkdir(parents=True, exist_ok=True)

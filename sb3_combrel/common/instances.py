@@ -34,10 +34,7 @@ class Instances(NamedTuple):
     def empty(
         cls, n_actions: int, n_variables: int, capacity: int = 8 * BLOCK, periodic: Sequence[bool] | np.ndarray | None = None
     ) -> "Instances":
-        """
-        Make room for instances.
-
-        :param capacity: of each action, a multiple of BLOCK
+        """:param capacity: of each action, a multiple of BLOCK
         :param periodic: one bool for each state variable; None: none is periodic
         """
         n_blocks = capacity // BLOCK
@@ -66,12 +63,10 @@ class Instances(NamedTuple):
         terminated: np.ndarray,
         periodic: Sequence[bool] | np.ndarray | None = None,
     ) -> "Instances":
-        """Instances given one a row, in their order.
+        """Instances given one a row, in their order; coordinates of periodic variables are wrapped to [0, 1].
 
-        :param action: int64, shape (n,)
+        :param action: int64, shape (n,); ``reward`` and ``terminated``, bool: the same
         :param state: shape (n, n_variables); ``effect``: the same
-        :param reward: shape (n,); ``terminated``: bool, same shape
-        :param periodic: see :meth:`empty`; coordinates of periodic variables are wrapped to [0, 1]
         """
         flags = flag_array(periodic, state.shape[1])
         if flags.any():
@@ -83,10 +78,9 @@ class Instances(NamedTuple):
         made = cls.empty(n_actions, state.shape[1], capacity, flags)
         made.size[:] = counts
         for a, n in enumerate(counts):
-            rows = np.flatnonzero(action == a)
+            rows, first = np.flatnonzero(action == a), np.arange(0, n, BLOCK)
             made.state[a, :n], made.effect[a, :n] = state[rows], effect[rows]
             made.reward[a, :n], made.terminated[a, :n] = reward[rows], terminated[rows]
-            first = np.arange(0, n, BLOCK)
             if n > 0:
                 made.block_low[a, :, : len(first)] = np.minimum.reduceat(state[rows], first).T
                 made.block_high[a, :, : len(first)] = np.maximum.reduceat(state[rows], first).T
@@ -102,11 +96,9 @@ class Instances(NamedTuple):
 
     def rows(self) -> np.ndarray:
         """Action, state, effect, reward and terminated of each instance, by action: float64, shape (n, 2 n_variables + 3)."""
-        by_action = [
-            np.column_stack([np.full(n, a), self.state[a, :n], self.effect[a, :n], self.reward[a, :n], self.terminated[a, :n]])
-            for a, n in enumerate(self.size.tolist())
-        ]
-        return np.vstack(by_action)
+        columns = self.state, self.effect, self.reward, self.terminated
+        sizes = enumerate(self.size.tolist())
+        return np.vstack([np.column_stack([np.full(n, a), *(column[a, :n] for column in columns)]) for a, n in sizes])
 
     @property
     def capacity(self) -> int:

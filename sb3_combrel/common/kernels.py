@@ -108,16 +108,14 @@ def measure_blocks(instances, action, at):
 
 @part
 def near_instances(instances, action, state, kernel, indices, weights, n_before):
-    """The instances of ``action`` that the kernel keeps at ``state``, nearest first.
+    """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
 
-    What was near at the last query is likely to be near again. Looked at first, it gives at once a list that most
-    other instances are too far away to enter. The result does not depend on it.
+    What was near at the last query is looked at first: most others are then too far away to enter. The result does not
+    depend on it.
 
     :param kernel: (breadth, min_weight, min_fraction)
-    :param indices: int32 scratch that receives them, at least ``list_room(min_fraction)`` long
-    :param weights: float64 scratch of the same length that receives their weights exp(-d^2 / breadth^2)
+    :param indices: int32, receives them, at least ``list_room(min_fraction)`` long; ``weights``: exp(-d^2 / breadth^2)
     :param n_before: how many instances of the last query are in ``indices``
-    :return: how many, sum of their weights
     """
     breadth, min_weight, min_fraction = kernel
     scale = -1.0 / (breadth * breadth)
@@ -188,15 +186,12 @@ def insert_by_distance(items, distances, length, item, distance):
 
 @inner
 def nearest_instances(instances, action, state, farthest, items, distances, n_before, left_out=-1):
-    """The nearest instances of ``action``, nearest first, as many as ``items`` has room for.
-
-    What was near at the last query is looked at first; the result does not depend on it.
+    """The nearest instances of ``action``, nearest first, as many as ``items`` has room for; how many.
 
     :param farthest: squared distance beyond which none counts
-    :param items: int32; receives them. ``distances``: float64; receives their squared distances
-    :param n_before: how many of the last query are in ``items``
+    :param items: int32, receives them; ``distances``: their squared distances
+    :param n_before: how many of the last query, which is looked at first, are in ``items``
     :param left_out: an instance that does not count
-    :return: how many
     """
     count = instances.size[action]
     room = len(items)

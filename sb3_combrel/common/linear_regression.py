@@ -52,9 +52,8 @@ def solve_regression(sums, ridge, factor, fit):
     + ridge I and C = sum w (x - mean) (e - mean)^T, B = S^-1 C by Cholesky's decomposition.
 
     :param ridge: above 0, as few instances do not determine all slopes
-    :param factor: float64 scratch, shape (n_variables, n_variables)
-    :param fit: receives them, float64, shape (n_variables + n_variables ** 2,): a, then B row by row: ``fit[d + j * d + k]``
-        is how much effect k grows along variable j
+    :param factor: scratch, shape (d, d)
+    :param fit: receives them, shape (d + d^2,): a, then B: ``fit[d + j * d + k]`` is how much effect k grows along variable j
     """
     d = factor.shape[0]
     total = sums[0]

@@ -20,8 +20,7 @@ class ListStore(NamedTuple):
     start: np.ndarray  # int64, (n_lists,): first entry of each list's slot, -1 while it has none
     length: np.ndarray  # int32, (n_lists,)
     size_class: np.ndarray  # int8, (n_lists,): the slot has room for MIN_SLOT << size_class entries
-    # Head of the chain of free slots of each class, -1 if none; how many entries are in slots (USED); 1 if there was no room
-    # for the last slot asked for (FULL).
+    # Head of each class's chain of free slots, or -1; entries in slots (USED); 1 if there was no room for the last (FULL).
     allocator: np.ndarray  # int64, (N_SIZE_CLASSES + 2,)
 
     @classmethod

@@ -39,8 +39,7 @@ _scale_into_box = EntryPoint(scale_into_box)
 
 
 class ObservationScaler:
-    """
-    Scales observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
+    """Scales observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
 
     Periodic variables are wrapped instead: any angle is the same as one between the bounds.
 
@@ -56,10 +55,7 @@ class ObservationScaler:
         self._warned = False
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """
-        Scale observations.
-
-        :param observations: raw units, shape (..., n_variables)
+        """:param observations: raw units, shape (..., n_variables)
         :return: unit coordinates in [0, 1], same shape
         :raises ValueError: if an observation is not finite
         """

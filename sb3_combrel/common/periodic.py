@@ -35,12 +35,9 @@ def differences(a: NDArray[np.float64], b: NDArray[np.float64], periodic: NDArra
 
 
 def periodic_flags(periodic: object, n_variables: int) -> tuple[bool, ...]:
-    """
-    Check the argument ``periodic``.
+    """The argument ``periodic`` as one bool for each state variable.
 
-    :param periodic: None, or one bool for each state variable
-    :return: one bool for each state variable
-    :raises ValueError: if it is something else
+    :raises ValueError: if it is neither that nor None
     """
     if periodic is None:
         return (False,) * n_variables

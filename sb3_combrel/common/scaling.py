@@ -20,8 +20,7 @@ _LARGEST_BOUND = 1e30
 
 @dataclass(frozen=True, eq=False)
 class StateScaling:
-    """
-    The affine map between a box of states and the unit cube, in which all distances are measured.
+    """The affine map between a box of states and the unit cube, in which all distances are measured.
 
     A state outside the box is not clipped: it gets a unit coordinate outside [0, 1], so that the map stays invertible.
 
@@ -45,15 +44,11 @@ class StateScaling:
 
     @classmethod
     def from_space(cls, space: spaces.Space[Any], bounds: Bounds | None = None) -> StateScaling:
-        """
-        Take the scaling from an observation space.
+        """Take the scaling from an observation space.
 
         :param space: a one-dimensional ``Box`` of floating-point numbers
-        :param bounds: ``(low, high)`` in raw units to use in place of the space's own; each is one number for all
-            variables or one number a variable. Needed where the space is unbounded.
-        :return: the scaling, with one coordinate for each variable of the space
-        :raises ValueError: if the space is not such a box, if it has infinite bounds and ``bounds`` is not given, or if
-            ``bounds`` does not fit the space
+        :param bounds: ``(low, high)``, raw units, in place of the space's own, each one number, or one a variable
+        :raises ValueError: if the space is not such a box or is unbounded and ``bounds`` not given, or if these do not fit it
         """
         n_variables = _count_variables(space)
         if bounds is not None:
@@ -74,21 +69,11 @@ class StateScaling:
         return int(self.low.size)
 
     def to_unit(self, states: ArrayLike) -> NDArray[np.float64]:
-        """
-        Divide each state variable by its range.
-
-        :param states: raw units, shape (..., n_variables)
-        :return: unit coordinates of the same shape, in [0, 1] for states in the box
-        """
+        """Unit coordinates, in [0, 1] for states in the box, of states in raw units, shape (..., n_variables)."""
         return (np.asarray(states, dtype=np.float64) - self.low) / (self.high - self.low)
 
     def to_raw(self, units: ArrayLike) -> NDArray[np.float64]:
-        """
-        Undo :meth:`to_unit`.
-
-        :param units: unit coordinates, shape (..., n_variables)
-        :return: states in raw units, same shape
-        """
+        """States in raw units, of unit coordinates, shape (..., n_variables)."""
         return self.low + np.asarray(units, dtype=np.float64) * (self.high - self.low)
 
     def __eq__(self, other: object) -> bool:
@@ -150,11 +135,10 @@ def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64]
     wrong = f"bounds must be (low, high), each a finite number or a sequence of {n_variables} finite numbers, got {{}}"
     try:
         low, high = (np.array(bound, dtype=np.float64) for bound in bounds)
-        is_boolean = any(isinstance(each, bool | np.bool_) for given in bounds for each in np.array(given, dtype=object).flat)
+        if any(isinstance(each, bool | np.bool_) for given in bounds for each in np.array(given, dtype=object).flat):
+            raise TypeError("booleans are no numbers")
     except (TypeError, ValueError) as error:
         raise ValueError(wrong.format(f"bounds={bounds!r}")) from error
-    if is_boolean:
-        raise ValueError(wrong.format(f"bounds={bounds!r}"))
     for name, bound in (("low", low), ("high", high)):
         if bound.shape not in ((), (n_variables,)):
             raise ValueError(wrong.format(f"a {name} of shape {bound.shape} in bounds={bounds!r}"))

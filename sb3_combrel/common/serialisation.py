@@ -22,33 +22,26 @@ _READERS: dict[str, Callable[..., Any]] = {}
 
 
 def register_writer(written: type[T], write: Callable[[T], tuple[str, Content]]) -> None:
-    """
-    Make objects of a class writable.
+    """Make objects of a class, but not of its subclasses, writable.
 
-    :param written: the class; objects of its subclasses are refused, they may contain more than would be written
-    :param write: gives an object's kind, for which a reader is registered, and its content, arguments of that reader:
-        anything that :func:`to_plain` takes
+    :param write: gives an object's kind, and its content, anything that :func:`to_plain` takes: arguments of the kind's reader
     """
     _WRITERS[written] = write
 
 
 def register_reader(kind: str, read: Callable[..., Any]) -> None:
-    """
-    Make objects of a kind readable.
+    """Make objects of a kind readable.
 
     :param kind: name of the kind in files; a name is never given to another format
-    :param read: makes the object of its content, given as keyword arguments and read by :func:`from_plain` already; it
-        may raise any exception if the content is damaged
+    :param read: makes the object of its content, keyword arguments; it may raise any exception if the content is damaged
     """
     _READERS[kind] = read
 
 
 def to_plain(value: Any) -> Any:
-    """
-    A value as numbers, text, lists and dicts.
+    """A value as numbers, text, lists and dicts.
 
-    :param value: None, a number, text, a path, an array; an object of a registered class (source instances, a mapping or
-        a set of mappings); or sequences and dicts of these
+    :param value: None, a number, text, a path, an array, an object of a registered class; or sequences and dicts of these
     :raises TypeError: if it is, or contains, something else
     """
     if value is None or isinstance(value, bool | int | float | str):
@@ -69,24 +62,14 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(value: Any) -> Any:
-    """
-    What :func:`to_plain` wrote; tuples and arrays come back as lists, paths as text.
+    """What :func:`to_plain` wrote; tuples and arrays come back as lists, paths as text.
 
     :raises ValueError: if it was not written by :func:`to_plain` or is damaged
     """
-    try:
-        return _read(value)
-    except RecursionError as error:
-        raise ValueError("what was written is damaged: lists and dicts are nested too deeply") from error
-
-
-def _read(value: Any) -> Any:
     if isinstance(value, Mapping):
-        content = {key: _read(each) for key, each in value.items() if key != KIND}
+        content = {key: from_plain(each) for key, each in value.items() if key != KIND}
         return _read_object(value[KIND], content) if KIND in value else content
-    if isinstance(value, list):
-        return [_read(each) for each in value]
-    return value
+    return [from_plain(each) for each in value] if isinstance(value, list) else value
 
 
 def _read_object(kind: Any, content: Content) -> Any:

@@ -10,8 +10,7 @@ from sb3_combrel.common.scaling import StateScaling
 
 @dataclass(frozen=True)
 class Task:
-    """
-    State variables and actions of a task.
+    """State variables and actions of a task.
 
     :param scaling: raw <-> unit coordinates of its states
     :param n_actions: number of actions

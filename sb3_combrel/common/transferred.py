@@ -68,11 +68,9 @@ _TYPES = tuple(map(np.dtype, (np.int64, np.float64, np.float64, np.float64, np.b
 def check_transferred(
     given: TransferredInstances, method: object, own_weight: np.ndarray, n_variables: int, threshold: float
 ) -> None:
-    """
-    Check what a transfer method returned before compiled code reads it.
+    """Check what a transfer method returned before compiled code reads it.
 
-    :param method: the transfer method, named in the message
-    :param own_weight: weight of the target's own instances of each pair that was asked for, shape (n,)
+    :param own_weight: of the target's own instances of each pair that was asked for, shape (n,)
     :param threshold: weight that own and transferred instances of a pair must reach together
     :raises ValueError: if rows are missing, arrays have other types or shapes, a value is not finite, a weight is not above
         0, or the weights of a pair do not reach the threshold

@@ -23,8 +23,7 @@ from sb3_combrel.planning.sweeping import NOWHERE, Planner
 from sb3_combrel.planning.visits import Visits
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
-# Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan, and near
-# enough that one grid point that leads nowhere does not lower its neighbours' interpolated values for long.
+# Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan.
 LONGEST_PLAN = 10_000
 
 # Backups in multiples of those of a step, passes over the grid, and backups for each pair that transfer has changed.
@@ -38,8 +37,7 @@ THRESHOLD_DECAY = 0.98
 
 
 class FittedRMaxAgent:
-    """
-    Fitted R-Max on arrays. States are in unit coordinates (``task.scaling.to_unit(states)``), actions are numbered from 0.
+    """Fitted R-Max on arrays. States are in unit coordinates (``task.scaling.to_unit(states)``), actions are numbered from 0.
 
     One step of learning is ``action = agent.act(state)``, then ``agent.update(state, action, reward, next_state,
     terminated)``; call ``agent.end_episode(truncated)`` at the end of each episode. All methods may be called from any
@@ -61,9 +59,7 @@ class FittedRMaxAgent:
         rng: np.random.Generator | None = None,
         model_class: type[Model] | None = None,
     ):
-        self.settings = settings
-        self.task = task
-        self.transfer = transfer
+        self.settings, self.task, self.transfer = settings, task, transfer
         self.model_class = MODELS[settings.degree] if model_class is None else model_class
         self.rng = np.random.default_rng() if rng is None else rng
         self._prediction_rng = self.rng.spawn(1)[0]
@@ -147,13 +143,12 @@ class FittedRMaxAgent:
         memory: EpisodeMemory | None = None,
         environment: int = 0,
     ) -> int:
-        """
-        Choose an action.
+        """Choose an action.
 
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
-            first. Otherwise the best action of those that are known; where none is, of those that are modelled with
-            transferred instances. Where a source bounds the values, the best of all actions, the first of several.
+            first. Otherwise the best of the actions that are known, or else modelled with transferred instances; where a
+            source bounds the values, of all.
         :param episode: in learning, a number that tells the episodes of all environments apart
         :param memory: in evaluation, what is stored of the episode so far; in a loop other actions are tried
         :param environment: in learning, the number of the environment, for a transfer method that decides actions
@@ -225,8 +220,7 @@ class FittedRMaxAgent:
             return int(self._prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
 
     def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
-        """
-        Compute the action values at an exact state; optimistic actions have ``max_value``, or what a prior bounds it by.
+        """Compute the action values at an exact state; optimistic actions have ``max_value``, or what a prior bounds it by.
 
         :param state: unit coordinates, shape (n_variables,)
         :param values: at the grid points; by default the planner's, optimistic ones
@@ -248,8 +242,7 @@ class FittedRMaxAgent:
     def update(
         self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
     ) -> None:
-        """
-        Learn from one transition, and plan.
+        """Learn from one transition, and plan.
 
         :param state: unit coordinates; ``next_state``: the same
         :param action: from 0 on
@@ -265,8 +258,7 @@ class FittedRMaxAgent:
             self._plan(self.max_backups, NOWHERE if terminated else next_state)
 
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
-        """
-        Plan on while no action is due.
+        """Plan on while no action is due.
 
         :param truncated: whether the episode ended by its time limit
         :param environment: see :meth:`act`
@@ -291,8 +283,7 @@ class FittedRMaxAgent:
                 self._plan(0)
 
     def _lowered_threshold(self) -> float:
-        # Where the kernel is so narrow that all that is within an episode's reach cannot become known, exploration would
-        # otherwise go on for ever. In the end any instance that counts at all suffices.
+        # Exploration would otherwise not end where a narrow kernel cannot know all that is within an episode's reach.
         full, min_weight = self.model_settings.exploration_threshold, self.model_settings.min_weight
         return max(full * THRESHOLD_DECAY ** max(0, self.n_truncated - DECAY_AFTER_EPISODES), min(full, min_weight))
 
@@ -349,11 +340,7 @@ class FittedRMaxAgent:
         self.planner.bounds = (min(low, min(0.0, high) + LONGEST_PLAN * min(0.0, reward)), high)
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """
-        What has been learned, float64 arrays by name, from which all else is rebuilt.
-
-        Names and shapes do not change, but for the number of rows of arrays with several axes.
-        """
+        """What has been learned, float64 arrays by name; only the number of rows of arrays with several axes ever changes."""
         with self._lock:
             of_transfer = {} if self.transfer is None else self.transfer.get_state()
             return {

@@ -17,14 +17,7 @@ MAX_SEED = 2**32 - 1
 
 
 def policy_and_env(policy: Any, env: Any, aliases: Container[str]) -> tuple[Any, Any]:
-    """
-    Find out which of two arguments is the policy: it may be given first, second or not at all.
-
-    :param policy: the first argument of the constructor
-    :param env: the second
-    :param aliases: names of policies
-    :return: policy and environment
-    """
+    """Policy and environment: of the constructor's first two arguments the policy may be the first, the second or none."""
     if _is_policy(policy, aliases):
         return policy, env
     return (env if _is_policy(env, aliases) else DEFAULT_POLICY), policy
@@ -36,15 +29,10 @@ def _is_policy(thing: Any, aliases: Container[str]) -> bool:
     return isinstance(thing, type) and issubclass(thing, BasePolicy)
 
 
-def check_actions(action_space: spaces.Space[Any]) -> int:
-    """
-    Check that actions are discrete.
-
-    :return: how many there are
-    :raises ValueError: if they are not; for continuous ones it says how to make them discrete
-    """
+def check_actions(action_space: spaces.Space[Any]) -> None:
+    """:raises ValueError: if actions are not discrete; for continuous ones it says how to make them discrete"""
     if isinstance(action_space, spaces.Discrete):
-        return int(action_space.n)
+        return
     message = f"FittedRMax needs Discrete actions, the environment has {action_space}"
     if isinstance(action_space, spaces.Box) and len(action_space.shape) == 1:
         n = action_space.shape[0]
@@ -54,19 +42,13 @@ def check_actions(action_space: spaces.Space[Any]) -> int:
 
 
 def check_type(name: str, value: object, types: tuple[type, ...], right: str) -> None:
-    """
-    :param right: what the argument must be, for the message
-    :raises ValueError: unless ``value`` is of one of the types
-    """
+    """:raises ValueError: unless ``value`` is of one of the types, which the message calls ``right``"""
     if not isinstance(value, types):
         raise ValueError(f"{name} must be {right}, got {value!r}")
 
 
 def check_policy(policy: type[BasePolicy], policy_kwargs: object, taken: Sequence[str]) -> None:
-    """
-    Check a policy and the arguments for it.
-
-    :param taken: arguments of the policy that the algorithm itself passes
+    """:param taken: arguments of the policy that the algorithm itself passes
     :raises ValueError: if it is no policy of this algorithm, or ``policy_kwargs`` are no dict of arguments that it takes
     """
     if not issubclass(policy, FittedRMaxPolicy):

@@ -39,8 +39,7 @@ PASSED_TO_POLICY = ("observation_space", "action_space", "transfer", "rng")
 
 
 class FittedRMax(SavedAlgorithm):
-    """
-    Fitted R-Max: model-based exploration in continuous state spaces.
+    """Fitted R-Max: model-based exploration in continuous state spaces.
 
     Paper: Jong & Stone, "Model-based exploration in continuous state spaces" (SARA 2007). Transfer: Taylor, Jong &
     Stone 2008 (TIMBREL); Fachantidis et al. (COMBREL). For small Box observation spaces (up to about five state
@@ -51,23 +50,22 @@ class FittedRMax(SavedAlgorithm):
     dynamic programming on a uniform grid of states, after every step, computes the value function of this model.
     Deviations from the original, and why:
 
-    - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables and the box
-      itself for more: far fewer states.
+    - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables, the box for more.
     - What was known once stays known (the original falls back when a nearer instance shortens the list).
-    - Planning is bounded by ``max_backups`` a step, points around the agent first; the others are backed up later, most of
-      them at an episode's end. Staying in a grid point is summed in closed form.
+    - Planning is bounded by ``max_backups`` a step, points around the agent first; most others are backed up at an episode's
+      end. Staying in a grid point is summed in closed form.
     - With ``degree=1`` the planner's model leads several steps ahead, until a cell of the grid is left (``max_model_steps``):
       values that are interpolated at every step spread over the grid.
-    - With ``degree=1``, as long as no outcome has told states apart (no episode has ended, and all rewards were alike), what
-      is known is decided by a kernel that narrows whenever nearly all is known: otherwise a small goal might not be found.
+    - With ``degree=1``, as long as no episode has ended and all rewards were alike, what is known is decided by a kernel that
+      narrows whenever nearly all is known: otherwise a small goal might not be found.
     - Where the agent returns to the same small cell many times in an episode, an interpolated value that is too high is
       corrected (see ``sb3_combrel.planning.corrections``): otherwise the agent could be caught in a loop for ever.
-    - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%: with a narrow
-      kernel all that is within reach cannot become known, and exploration would not end.
+    - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%, so that
+      exploration ends where a narrow kernel cannot know all that is within reach.
 
-    ``predict(obs, deterministic=True)`` takes the best known action, or, where none is known, the best of those that have a
-    model from transferred instances; ``deterministic=False`` takes the optimistic ones first, as in learning. Pass the state
-    that it returns to the next call, as ``evaluate_policy`` does: the policy then notices when it is caught in a loop.
+    ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
+    transferred instances; ``deterministic=False`` takes optimistic ones first, as in learning. Pass the state that it returns
+    to the next call, as ``evaluate_policy`` does: the policy then notices when it is caught in a loop.
 
     ::
 
@@ -75,17 +73,16 @@ class FittedRMax(SavedAlgorithm):
         model.save("car")
         action, state = model.predict(np.array([-0.5, 0.0]), deterministic=True)
 
-    Cost: a step's time is about linear in the number of instances near the state, and, with a small factor, in the number of
-    all instances. Memory is about 400 bytes for an instance, and 800 bytes for a known state-action pair of the grid. Both
-    are bounded, by ``max_instances`` and by the grid.
+    A step's time is about linear in the number of instances near the state. Memory, about 400 bytes for an instance and 800
+    for a known state-action pair of the grid, is bounded by ``max_instances`` and by the grid.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", which means the same); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
     :param transfer: a transfer method, such as ``COMBREL(source)``; or a dict, as in RL-Zoo's YAML files, from the
-        method's name to its arguments. A copy of it is used, which is ``model.transfer`` from then on, with its results
-    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates. None: with ``degree=1`` 0.15 for one
-        or two state variables, 0.25 for three, 0.4 for four or five, 0.5 for more; with ``degree=0`` 0.09, 0.15 and 0.2. With
-        a smaller one the model is more exact and more is explored.
+        method's name to its arguments. A copy of it is used: ``model.transfer``, with its results
+    :param model_breadth: breadth b of the kernel exp(-d^2 / b^2), in unit coordinates; a smaller one is more exact, and
+        explores more. None: with ``degree=1`` 0.15 for one or two state variables, 0.25 for three, 0.4 for four or five, 0.5
+        for more; with ``degree=0`` 0.09, 0.15 and 0.2.
     :param min_fraction: with ``degree=0``, an instance counts while it has this fraction of the weight of the nearer ones; 0.1
         keeps at most 11 instances a pair, 0.01 (the original's) 101
     :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach. None: 0.05 with
@@ -97,8 +94,7 @@ class FittedRMax(SavedAlgorithm):
     :param gamma: discount factor, in (0, 1]
     :param planning_tolerance: changes of value up to this are not propagated
     :param max_backups: grid points backed up in a step at most, besides those whose model changed; 400 times as many when an
-        episode ends. None: 1600 / 2^d with d state variables (400 / 2^d with ``degree=0``), as the cost of a backup grows
-        with 2^d.
+        episode ends. None: 1600 / 2^d with d state variables (400 / 2^d with ``degree=0``)
     :param max_instances: of one action; beyond, the nearest instance is replaced (with ``degree=0`` the one in the fewest
         lists of grid points). None: no limit.
     :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
@@ -250,11 +246,7 @@ class FittedRMax(SavedAlgorithm):
 
     @property
     def settings(self) -> FittedRMaxSettings:
-        """
-        The arguments that only this algorithm has, validated.
-
-        :raises ValueError: if one is out of its range
-        """
+        """The arguments that only this algorithm has; a ValueError if one is out of its range."""
         return FittedRMaxSettings(**{name: getattr(self, name) for name in FittedRMaxSettings.names()})
 
     @property
@@ -271,8 +263,7 @@ class FittedRMax(SavedAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfFittedRMax:
-        """
-        Learn, and return the trained model.
+        """Learn, and return the trained model.
 
         :param total_timesteps: environment steps, of all environments together
         :param callback: callback(s) called at every step

@@ -19,14 +19,12 @@ ORDER_WITH_BOUNDS = (EXPLORE, OPTIMISTIC, EXPLOIT)
 
 
 class EpisodeMemory:
-    """
-    Notices that an evaluation is caught in a loop, and changes how actions are chosen.
+    """Notices that an evaluation is caught in a loop, and changes how actions are chosen.
 
-    Where data are few a model may predict progress that does not happen. Learning would find out; a policy that learns no
-    more would repeat the same for ever. While a model is right, values rise along the way by what is *expected* with each
-    step, (1 - gamma) Q - reward. An agent is caught in a loop when it is in the same small cell more than ``MAX_VISITS``
-    times, and its value has not risen by half of what was expected since the first of them: then actions are chosen in
-    the next manner. Where it is good to stay, as with a pole in balance, no rise is expected.
+    Where data are few a model may predict progress that does not happen, and a policy that learns no more would repeat the
+    same for ever. While a model is right, values rise along the way by what is *expected* with each step,
+    (1 - gamma) Q - reward. An agent is caught in a loop when it is in the same small cell more than ``MAX_VISITS`` times, and
+    its value has not risen by half of what was expected since the first of them. Where it is good to stay none is expected.
     """
 
     def __init__(self) -> None:
@@ -40,8 +38,7 @@ class EpisodeMemory:
         return self._n_loops % len(ORDER)
 
     def note(self, cell: Hashable, value: float, reward: float, gamma: float) -> None:
-        """
-        Note a step that is about to be made.
+        """Note a step that is about to be made.
 
         :param cell: where (see :func:`small_cell`)
         :param value: Q of the chosen action
@@ -63,18 +60,12 @@ class EpisodeMemory:
 
 
 def manner(memory: EpisodeMemory | None, is_bounded: bool) -> int:
-    """
-    How actions are chosen in an evaluation: :data:`EXPLOIT`, :data:`OPTIMISTIC` or :data:`EXPLORE`.
-
-    :param memory: of the episode; None: nothing is stored of it
-    :param is_bounded: whether a source bounds what is unknown
-    """
+    """How actions are chosen in an evaluation; ``is_bounded``: a source bounds what is unknown."""
     return (ORDER_WITH_BOUNDS if is_bounded else ORDER)[0 if memory is None else memory.attempt]
 
 
 def memories(state: Sequence[Any] | None, episode_start: np.ndarray | None, n: int) -> list[EpisodeMemory]:
-    """
-    Read the memories of ``n`` episodes from what ``predict`` returned as its state; new ones where an episode begins.
+    """Read the memories of ``n`` episodes from what ``predict`` returned as its state; new ones where an episode begins.
 
     :raises ValueError: if ``state`` is something else
     """

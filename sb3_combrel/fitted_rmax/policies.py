@@ -23,8 +23,7 @@ from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
 
 
 class FittedRMaxPolicy(BasePolicy):
-    """
-    Acts on the action values of a :class:`~sb3_combrel.fitted_rmax.agent.FittedRMaxAgent`, :attr:`agent`.
+    """Acts on the action values of a :class:`~sb3_combrel.fitted_rmax.agent.FittedRMaxAgent`, :attr:`agent`.
 
     Its ``state_dict`` consists of float64 tensors made from :meth:`FittedRMaxAgent.get_state`; all else is rebuilt from these.
 
@@ -33,8 +32,7 @@ class FittedRMaxPolicy(BasePolicy):
     :param lr_schedule: not used; SB3 passes one to every policy
     :param transfer: a transfer method of the policy's own; or what a file has of one
     :param model_class: the model of the dynamics; None: the one for ``degree``
-    :param state_names: names of the state variables, for display
-    :param action_names: names of the actions, for display
+    :param state_names: for display; ``action_names``: the same
     :param rng: generator of all random numbers of learning
     :param settings: arguments of :class:`FittedRMaxSettings`
     """
@@ -87,13 +85,11 @@ class FittedRMaxPolicy(BasePolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        Choose actions for observations.
+        """Choose actions for observations.
 
         :param observation: one, or a batch of them
-        :param state: what the last call returned, of the same environments. With it, as in ``evaluate_policy`` and
-            RL-Zoo, a deterministic policy notices when it is caught in a loop; without, actions depend on the observation
-            alone.
+        :param state: what the last call returned, of the same environments: with it a deterministic policy notices when it
+            is caught in a loop; without, actions depend on the observation alone
         :param episode_start: bool, one for each observation: whether an episode begins with it
         :param deterministic: the best known action; otherwise optimistic actions first, as in learning
         :return: actions, and the state for the next call (None if not deterministic)
@@ -137,8 +133,7 @@ class FittedRMaxPolicy(BasePolicy):
             destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """
-        Load parameters as PyTorch does; without ``strict`` those that are not given stay as they are.
+        """Load parameters as PyTorch does; without ``strict`` those that are not given stay as they are.
 
         :raises RuntimeError: if parameters do not fit; nothing has changed then
         """

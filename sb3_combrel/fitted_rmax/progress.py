@@ -11,36 +11,26 @@ EQUAL_RETURNS = 20
 
 
 class ProgressWatch:
-    """
-    Looks at the episodes of learning, and warns once of each of three things.
+    """Looks at the episodes of learning, and warns once of each of three things.
 
     - A return above ``max_value``: then that is no upper bound, and exploration ends too soon.
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
-      ``max_value`` of what is unknown, and nothing draws the agent to the unknown. An example is MountainCarContinuous with
-      gamma 1, where the best known plan is to do nothing.
+      ``max_value`` of what is unknown, and nothing draws the agent to the unknown.
     - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time: nothing that
       exploration reaches makes a difference.
 
-    :param max_value: value of what is unknown
-    :param gamma: discount factor
     :param tolerance: what is too small to matter for values
     """
 
     def __init__(self, max_value: float, gamma: float, tolerance: float):
-        self.max_value = float(max_value)
-        self.gamma = float(gamma)
-        self.tolerance = float(tolerance)
-        self._n_idle = 0
-        self._n_equal = 0
+        self.max_value, self.gamma, self.tolerance = float(max_value), float(gamma), float(tolerance)
+        self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
-        self._n_optimistic = 0
         self._warned: set[str] = set()
 
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
-        """
-        Look at an episode.
+        """Look at an episode.
 
-        :param rewards: its rewards
         :param terminated: whether it ended in a terminal state, not by its time limit
         :param n_optimistic_actions: how often an action without a model was chosen since learning began
         """

@@ -58,9 +58,9 @@ class SavedAlgorithm(BaseAlgorithm):
         its planning is completed first. Not saved but computed again are ``TIMBREL``'s random draws, and lists shortened by an
         instance that ``max_instances`` has since removed.
 
-        :param path: path to the file where the rl agent should be saved; .zip is added if it has no suffix
-        :param exclude: name of parameters that should be excluded in addition to the default ones
-        :param include: name of parameters that might be excluded but should be included anyway
+        :param path: of the file; .zip is added if it has no suffix
+        :param exclude: names of attributes that are excluded as well
+        :param include: names of excluded attributes that are included
         :raises OSError: if the file cannot be written
         """
         written, archive = copy.copy(self), io.BytesIO()
@@ -87,12 +87,10 @@ class SavedAlgorithm(BaseAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> SelfSavedAlgorithm:
-        """
-        Load the model from a zip-file.
+        """Load the model from a zip-file.
 
         :param path: path to the file (or a file-like) where to load the agent from
-        :param env: the new environment to run the loaded model on (if registered in Gymnasium, can be a str; can be None
-            if you only need prediction from a trained model)
+        :param env: the new environment to run the loaded model on, or its name; None suffices for predictions
         :param device: device on which the tensors of the policy go
         :param custom_objects: objects that replace those of the file
         :param print_system_info: whether to print system info from the saved model and the current system info
@@ -117,15 +115,12 @@ class SavedAlgorithm(BaseAlgorithm):
         exact_match: bool = True,
         device: th.device | str = "auto",
     ) -> None:
-        """
-        Load parameters from the file of a saved model, or from what :meth:`get_parameters` returned.
+        """Load parameters from the file of a saved model, or from what :meth:`get_parameters` returned.
 
         :param load_path_or_dict: path of the file, an open file, or a dict of a dict of tensors, ``{"policy": {...}}``
-        :param exact_match: whether all parameters must be given; otherwise those that are not given stay as they are, and
-            those that the model does not have are ignored
+        :param exact_match: False: those that are not given stay as they are, and unknown ones are ignored
         :param device: not used; the work is done on the CPU
-        :raises ValueError: if parameters are missing, unknown, of another shape or type, or not finite; nothing has changed
-            then
+        :raises ValueError: if parameters are missing, unknown, of another shape or type, or not finite; nothing is changed
         """
         check_boolean("exact_match", exact_match)
         given: Any = load_path_or_dict
@@ -174,9 +169,7 @@ def _read(path: str | Path | io.BufferedIOBase) -> io.BytesIO:
 
 @contextmanager
 def _naming(path: object) -> Iterator[None]:
-    """
-    :raises ValueError: that names the file, whatever reading it raised: damaged content can make libraries raise anything
-    """
+    """:raises ValueError: that names the file, whatever reading it raised: of damaged content libraries raise anything"""
     try:
         yield
     except (FileNotFoundError, PermissionError):

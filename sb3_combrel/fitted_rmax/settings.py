@@ -12,8 +12,7 @@ from sb3_combrel.models.base import Model, ModelSettings
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.models.local_linear import LocalLinear
 
-# By default so many corners of grid cells are looked at in a step, by degree of the local model: a backup costs as much as a
-# cell has corners.
+# Corners of grid cells looked at in a step by default, by degree: a backup costs as much as a cell has corners.
 CORNERS_A_STEP = {0: 400, 1: 1600}
 # By degree of the local model and number of state variables, the last one for more.
 DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
@@ -22,18 +21,14 @@ DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
 # Of degree 1. Mountain Car 4D must change between its actions more often than once a cell.
 DEFAULT_MODEL_STEPS = (50, 50, 50, 3, 3, 50)
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
-# More than any step has time for; at an episode's end there are 400 times as many, which must fit into an int64.
+# At an episode's end there are 400 times as many, which must fit into an int64.
 MAX_BACKUPS = 10**12
-# More would not leave a cell in which the state hardly moves.
-MAX_MODEL_STEPS = 10_000
-# A fit to thousands of instances is no local one.
-MAX_NEIGHBORS = 10_000
+MAX_MODEL_STEPS = MAX_NEIGHBORS = 10_000
 
 
 @dataclass(frozen=True)
 class FittedRMaxSettings:
-    """
-    The arguments of Fitted R-Max, with their defaults; what they mean is said in :class:`~sb3_combrel.FittedRMax`.
+    """The arguments of Fitted R-Max, with their defaults; what they mean is said in :class:`~sb3_combrel.FittedRMax`.
 
     :raises ValueError: if one is out of its range
     """
@@ -64,9 +59,8 @@ class FittedRMaxSettings:
         check_positive("outcome_breadth", self.outcome_breadth)
         check_count("max_model_steps", self.max_model_steps, max=MAX_MODEL_STEPS, none_allowed=True)
         if self.degree == 0 and self.max_model_steps not in (None, 1):
-            raise ValueError(
-                f"max_model_steps must be 1 or None with degree=0, the original algorithm, got {self.max_model_steps}"
-            )
+            given = self.max_model_steps
+            raise ValueError(f"max_model_steps must be 1 or None with degree=0, the original algorithm, got {given}")
         check_positive("min_fraction", self.min_fraction, max=1.0)
         if self.min_weight is not None:
             check_positive("min_weight", self.min_weight, max=0.99)

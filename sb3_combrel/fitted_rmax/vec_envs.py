@@ -32,9 +32,7 @@ def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[An
 
 
 def refuse_normalized_observations(env: VecEnv) -> None:
-    """
-    :raises ValueError: if a ``VecNormalize`` normalizes the observations
-    """
+    """:raises ValueError: if a ``VecNormalize`` normalizes the observations"""
     normalizer = unwrap_vec_normalize(env)
     if normalizer is not None and normalizer.norm_obs:
         raise ValueError(
@@ -45,12 +43,9 @@ def refuse_normalized_observations(env: VecEnv) -> None:
 
 def true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """
-    Find out where each step led before environments reset themselves, and whether that was a terminal state.
+    Where each step led before environments reset themselves, and whether that was a terminal state, which a time limit is not.
 
     :param new_obs: observations after the step, those of the next episode where one is done
-    :param dones: bool, shape (n_envs,)
-    :param infos: of each environment
-    :return: observations, and bool, shape (n_envs,); a time limit is no terminal state
     """
     next_obs, terminated = np.array(new_obs), np.array(dones, dtype=bool)
     for e in np.flatnonzero(dones):

@@ -19,18 +19,11 @@ LONG_STEP_SECONDS = 0.05
 
 
 class Workload(NamedTuple):
-    """
-    The size of a grid, and what it costs.
-
-    :param n_points: grid points
-    :param n_pairs: state-action pairs
-    :param setup_seconds: estimated time until the first step, and for loading a model
-    :param step_seconds: estimated time of a step
-    """
+    """The size of a grid, and what it costs by estimate."""
 
     n_points: int
     n_pairs: int
-    setup_seconds: float
+    setup_seconds: float  # until the first step, and for loading a model
     step_seconds: float
 
     def __str__(self) -> str:
@@ -41,14 +34,7 @@ class Workload(NamedTuple):
 
 
 def workload(grid: StateGrid, n_actions: int, settings: ModelSettings, transfers: bool) -> Workload:
-    """
-    Estimate the work.
-
-    :param grid: the finite sample of states
-    :param n_actions: number of actions
-    :param settings: of the model: its kernel's reach decides how many grid points an instance changes
-    :param transfers: whether there is a transfer method
-    """
+    """Estimate the work; the reach of the model's kernel decides how many grid points an instance changes."""
     d = grid.n_variables
     reach = settings.model_breadth * math.sqrt(-math.log(settings.min_weight))
     ball = math.pi ** (d / 2) / math.gamma(d / 2 + 1) * min(reach, 1.0) ** d

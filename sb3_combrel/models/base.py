@@ -19,9 +19,7 @@ MAX_PAIRS_AT_ONCE = 4096
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """
-    The arguments of :class:`~sb3_combrel.FittedRMax` that a model needs; what they mean is said there.
-    """
+    """The arguments of :class:`~sb3_combrel.FittedRMax` that a model needs; what they mean is said there."""
 
     model_breadth: float
     min_weight: float
@@ -34,19 +32,12 @@ class ModelSettings:
 
 
 class Predictions(NamedTuple):
-    """
-    What the target's own instances predict of n state-action pairs. Unit coordinates.
+    """What the target's own instances predict of n state-action pairs. Unit coordinates, float64."""
 
-    :param weight: float64, shape (n,): weight of the instances behind each prediction, which decides whether it is known
-    :param reward: float64, shape (n,): expected reward
-    :param probability: float64, shape (n, n_successors); what is missing to 1 ends the episode
-    :param effect: float64, shape (n, n_successors, n_variables): displacement to each successor
-    """
-
-    weight: np.ndarray
-    reward: np.ndarray
-    probability: np.ndarray
-    effect: np.ndarray
+    weight: np.ndarray  # (n,): of the instances behind each prediction, which decides whether it is known
+    reward: np.ndarray  # (n,): expected reward
+    probability: np.ndarray  # (n, n_successors); what is missing to 1 ends the episode
+    effect: np.ndarray  # (n, n_successors, n_variables): displacement to each successor
 
 
 class InstanceTransfer(Protocol):
@@ -69,8 +60,7 @@ class InstanceTransfer(Protocol):
 
 
 class Model(ABC):
-    """
-    A model of the dynamics, kept up to date transition by transition. Everything is in unit coordinates.
+    """A model of the dynamics, kept up to date transition by transition. Everything is in unit coordinates.
 
     A subclass must say what its instances predict, :meth:`predict`, and nothing else: the other methods have defaults, which
     are slow, as they compute all pairs of an action anew with each of its transitions. A state-action pair is *known* once
@@ -78,7 +68,6 @@ class Model(ABC):
     with transferred instances; if it is not, it is optimistic.
 
     :param mdp: the finite MDP over the sample of states, which the model writes
-    :param settings: see :class:`ModelSettings`
     :param transfer: where to get instances for pairs that are not known
     """
 
@@ -88,11 +77,8 @@ class Model(ABC):
     accepts_visited: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
-        self.mdp = mdp
-        self.grid = mdp.grid
-        self.n_actions = mdp.n_actions
-        self.settings = settings
-        self.transfer = transfer
+        self.mdp, self.grid, self.n_actions = mdp, mdp.grid, mdp.n_actions
+        self.settings, self.transfer = settings, transfer
         self.exploration_threshold = float(settings.exploration_threshold)
         self.instances = Instances.empty(self.n_actions, self.grid.n_variables, periodic=self.grid.arrays.periodic)
         n_pairs = self.n_actions * self.grid.n_points
@@ -103,8 +89,7 @@ class Model(ABC):
 
     @abstractmethod
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
-        """
-        Predict from the target's own instances.
+        """Predict from the target's own instances.
 
         :param states: shape (n, n_variables)
         :param actions: int64, shape (n,)
@@ -116,12 +101,10 @@ class Model(ABC):
         return int(self.instances.size.sum())
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
-        """
-        Add one transition.
+        """Add one transition; the pairs whose rows are to be updated, int64, by default all of the action.
 
         :param state: shape (n_variables,); ``next_state``: the same
         :param terminated: the episode ended in a terminal state; a time limit is none
-        :return: pairs whose rows are to be updated, int64; by default all of the action
         """
         slot = int(self.instances.size[action])
         if self.settings.max_instances is not None and slot >= self.settings.max_instances:
@@ -146,8 +129,7 @@ class Model(ABC):
         self.mdp.write_rows(pairs, modelled, predictions.probability, predictions.effect, predictions.reward)
 
     def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
-        """
-        Predict every action at an exact state, with transferred instances where the own ones do not suffice.
+        """Predict every action at an exact state, with transferred instances where the own ones do not suffice.
 
         :param state: shape (n_variables,)
         :return: good until the next call; and the transferred instances that were asked for, if any
@@ -221,10 +203,7 @@ class Model(ABC):
 
 
 def join(own: Predictions, given: TransferredInstances, known: np.ndarray) -> tuple[Predictions, np.ndarray]:
-    """Let transferred instances, one row a pair, join the own ones of pairs that are not known, in proportion to their weight.
-
-    :return: the predictions, and which of the pairs have a model, bool, shape (n,)
-    """
+    """Let transferred instances, one row a pair, join those of pairs that are not known; predictions, and what has a model."""
     n = len(known)
     length = np.where(known, 0, given.length[:n])
     used = np.arange(given.weight.shape[1]) < length[:, None]

@@ -14,8 +14,8 @@ from sb3_combrel.models.base import InstanceTransfer, Model, ModelSettings, Pred
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
 from sb3_combrel.planning.q_values import Prediction
 
-# Own weight must have changed by this fraction of the threshold before the row of a pair that has transferred instances is
-# updated within an episode: an instance that hardly counts among them would have hundreds of pairs translated and planned.
+# Within an episode the row of a pair that has transferred instances is updated once its own weight has changed by this
+# fraction of the threshold.
 MIN_CHANGE = 0.5
 
 
@@ -56,11 +56,7 @@ def add_to_row(reward, n_touched, transferred, row, total, scratch, grid):
 
 
 class CompiledModel(Model):
-    """
-    A model whose loops are compiled. Plain tuples for them are made once, not at every step (see ``common.compiled``).
-
-    Parameters: see :class:`~sb3_combrel.models.base.Model`.
-    """
+    """A model whose loops are compiled. Plain tuples for them are made once, not at every step (see ``common.compiled``)."""
 
     #: Successors of an action that the own instances may predict.
     _own_room: int

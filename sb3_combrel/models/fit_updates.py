@@ -11,11 +11,9 @@ from sb3_combrel.models.fit_arrays import FitScratch, Kernel, LinearFits
 from sb3_combrel.models.linear_fits import count_instance, narrow, narrow_and_refit, prediction_moved, recount, refit
 from sb3_combrel.planning.grid import GridArrays, unit_coordinates_of
 
-# Within an episode a pair is fitted again once what new instances leave unexplained may move its prediction by this, in parts
-# of the size of the action's effects.
+# Within an episode a pair is fitted again once new instances may move its prediction by this part of the action's effects.
 MAX_UNEXPLAINED = 0.2
-# Narrower weights differ by many orders of magnitude, and subtracting a large one leaves nothing but rounding of small ones:
-# where less than this is left, and more than that was subtracted, the sums are computed anew.
+# Where less narrower weight than this is left, and more was subtracted, rounding decides: the sums are computed anew.
 MUCH_ROUNDED = 1e-6
 # A variable that hardly ever changes is measured by this part of a cell.
 LEAST_SCALE = 0.02
@@ -23,9 +21,9 @@ LEAST_SCALE = 0.02
 
 @part
 def points_within(state, reach, widest, grid, scratch):
-    """Grid points to which ``state`` is at most as near as ``reach`` says, shape (n_points,), no more than ``widest``.
+    """How many grid points have a squared distance to ``state`` up to ``reach``, shape (n_points,), and up to ``widest``.
 
-    They are written to ``scratch.point``, their squared distances to ``scratch.distance``; how many they are.
+    They are written to ``scratch.point``, their squared distances to ``scratch.distance``.
     """
     first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]
     d = len(state)
@@ -90,8 +88,7 @@ def contradiction(fits, pair, instances, action, slot, state, shares):
 def enter(instances, fits, grid, kernel, thresholds, transition, prior, scratch):
     """Write an instance to its slot, and count it for all pairs that it reaches; plain tuples.
 
-    :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
-        row is to be updated, 0: never)
+    :param thresholds: (weight that makes a pair known, change of that of another pair that has its row updated, 0: never)
     :param transition: (action, slot, state, next_state, reward, terminated)
     :param prior: effect that the prior predicts of it
     :return: of how many pairs the rows are to be updated; their points are moved to the front of ``scratch.point``
@@ -171,7 +168,7 @@ def count_without(instances, fits, pair, action, slot, kernel, scratch):
 
 @compiled
 def leave(instances, fits, grid, kernel, action, slot, scratch):
-    """Take an instance out of the sums of the pairs for which it counts; another is about to be entered in its place.
+    """Take an instance out of the sums of the pairs for which it counts, before another is entered in its place.
 
     Of how many pairs the rows are to be updated at once; their points are moved to the front of ``scratch.point``.
     """
@@ -182,9 +179,8 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
     for k in range(len(state)):
         fits.effect_range[2, action, k] -= abs(instances.effect[action, slot, k])
     products = scratch.products[0]
-    n_found = points_within(
-        instances.state[action, slot], fits.reach[first_pair : first_pair + n_points], kernel.reach, grid, scratch
-    )
+    reach = fits.reach[first_pair : first_pair + n_points]
+    n_found = points_within(instances.state[action, slot], reach, kernel.reach, grid, scratch)
     changed = 0
     for f in range(n_found):
         pair = first_pair + scratch.point[f]
@@ -207,10 +203,7 @@ def leave(instances, fits, grid, kernel, action, slot, scratch):
 
 @compiled
 def refit_changed(fits, grid, scratch, range_has_changed, changed):
-    """Fit all pairs again that have had instances since the last time; how many rows are to be updated, in ``changed``.
-
-    All rows are looked at: the range that effects are kept within may have changed.
-    """
+    """Fit all pairs again that have had instances since the last time; how many rows are to be updated, in ``changed``."""
     n_points = grid.shape[0] * grid.strides[0]
     n = 0
     for pair in range(len(fits.total)):

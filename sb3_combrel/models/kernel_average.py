@@ -13,15 +13,7 @@ from sb3_combrel.common.list_store import ListStore
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
-from sb3_combrel.models.kernel_lists import (
-    IN_ITS_SLOT,
-    TO_BE_PUT,
-    KernelLists,
-    ReachScratch,
-    enter,
-    leave_lists,
-    update_rows,
-)
+from sb3_combrel.models.kernel_lists import IN_ITS_SLOT, TO_BE_PUT, KernelLists, ReachScratch, enter, leave_lists, update_rows
 from sb3_combrel.models.kernel_prediction import NearLists, join_transferred, predict_own
 from sb3_combrel.planning.mdp import FiniteMDP
 
@@ -30,8 +22,7 @@ _predict_own, _join_transferred = EntryPoint(predict_own), EntryPoint(join_trans
 
 
 class KernelAverage(CompiledModel):
-    """
-    The model of Jong & Stone (2007), one for each action, incremental.
+    """The model of Jong & Stone (2007), one for each action, incremental.
 
     An instance at distance d (unit coordinates) weighs exp(-d^2 / breadth^2). Instances that weigh less than ``min_weight``
     do not count; of the others, nearest first, one counts while its weight is at least ``min_fraction`` of the sum of those
@@ -75,12 +66,7 @@ class KernelAverage(CompiledModel):
         self.arrays, self._plain_arrays = arrays, arrays.plain()
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
-        """
-        Add one transition (see :meth:`Model.add`).
-
-        :return: the pairs whose lists changed, but with a transfer method only known ones and those whose weight has changed
-            enough; the others may wait (see :meth:`outdated`)
-        """
+        """As :meth:`Model.add`; with a transfer method, pairs of low weight that changed little may wait (``outdated``)."""
         slot, without = self._slot_for(action)
         changed = self._enter((action, slot, state, next_state, reward, terminated))
         return changed if len(without) == 0 else np.union1d(without, changed)
@@ -130,10 +116,8 @@ class KernelAverage(CompiledModel):
         return self._scratch.point[:changed] + action * self.grid.n_points
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, grid, instances = self.mdp, self.grid.plain, self._plain_instances
-        return int(
-            _update_rows.call(self._plain_arrays, instances, mdp.plain, grid, mdp.gamma, pairs, transferred, mdp.plain_scratch)
-        )
+        mdp, own = self.mdp, (self._plain_arrays, self._plain_instances)
+        return int(_update_rows.call(*own, mdp.plain, self.grid.plain, mdp.gamma, pairs, transferred, mdp.plain_scratch))
 
     def _predict_own(self, state: np.ndarray) -> float:
         near, prediction = self._plain_near, self._plain_prediction
@@ -151,11 +135,7 @@ class KernelAverage(CompiledModel):
         return state
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """
-        Rebuild lists and rows from the instances.
-
-        The saved weights are used where they differ from the new ones by rounding only, and pairs that were known stay known.
-        """
+        """Rebuild all from the instances; saved weights that differ by rounding only are used, and what was known stays so."""
         rows, known, total = state["instances"], state["known"] > 0.5, state["total"]
         rows = rows[np.argsort(np.clip(rows[:, 0], 0, self.n_actions - 1), kind="stable")]
         self.instances = instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)

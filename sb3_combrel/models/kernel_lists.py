@@ -24,8 +24,8 @@ class KernelLists(NamedTuple):
     last_total: np.ndarray  # float64, (n_pairs,): what ``total`` was when the pair's row was updated
     known: np.ndarray  # bool, (n_pairs,): the target's own instances suffice
     n_lists: np.ndarray  # int32, (n_actions, capacity): how many lists each instance is in
-    # The effect of each instance in cells, rounded down; counted from a grid point that the effect is applied to, the grid
-    # points around the state that it leads to, and their multilinear weights.
+    # The effect of each instance in cells, rounded down; relative to a grid point, the points around where it leads; their
+    # multilinear weights.
     corner_low: np.ndarray  # int32, (n_actions, capacity, n_variables)
     corner_offset: np.ndarray  # int32, (n_actions, capacity, 2 ** n_variables)
     corner_weight: np.ndarray  # float64, the same
@@ -46,8 +46,7 @@ class ReachScratch(NamedTuple):
     """Work space for the grid points that an instance reaches."""
 
     kernel: np.ndarray  # float64, (n_variables, largest axis of the grid): one-dimensional kernel factors
-    # First grid coordinate within reach, one past the last, the present one; along a periodic variable the last may come
-    # before the first.
+    # First grid coordinate within reach, one past the last (which may come before the first), the present one.
     at: np.ndarray  # int64, (3, n_variables)
     point: np.ndarray  # int64, (n_points,): points within reach
     weight: np.ndarray  # float64, the same: the instance's weight there
@@ -87,10 +86,9 @@ def factors_in_reach(state, kernel, grid, scratch):
 
 @part
 def points_in_reach(state, kernel, grid, entry, scratch):
-    """Grid points at which an instance at ``state`` weighs at least ``min_weight`` and ``entry``, shape (n_points,).
+    """How many grid points an instance at ``state`` weighs ``min_weight`` at, and ``entry``, shape (n_points,), or more.
 
-    The kernel is a product of one factor a variable, so the exponentials are few: one for each grid coordinate.
-    They and the weights are in ``scratch.point`` and ``scratch.weight``; how many they are.
+    They and the weights are in ``scratch.point`` and ``scratch.weight``. The kernel is a product of one factor a variable.
     """
     _, min_weight, _ = kernel
     first, last, at = scratch.at[0], scratch.at[1], scratch.at[2]
@@ -137,8 +135,7 @@ def enter(instances, arrays, grid, kernel, thresholds, transition, scratch, prog
     """Write an instance to its slot, and put it into the lists of all pairs that it reaches; plain tuples.
 
     :param kernel: (breadth, min_weight, min_fraction)
-    :param thresholds: (weight that makes a pair known, min_change: change of the weight of another pair from which on its
-        row is to be updated)
+    :param thresholds: (weight that makes a pair known, change of the weight of another pair that has its row updated)
     :param transition: (action, slot, state, next_state, reward, terminated)
     :param progress: int64, shape (3,): pairs in reach, how many of them are done, and how many of these are to be updated,
         whose points are moved to the front of ``scratch.point``; TO_BE_PUT or IN_ITS_SLOT, 0, 0 at first

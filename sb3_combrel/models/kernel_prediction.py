@@ -24,10 +24,10 @@ class NearLists(NamedTuple):
 def predict_own(instances, state, kernel, threshold, near, prediction):
     """Predict every action at ``state`` from the instances that the kernel keeps there; the least weight that one has.
 
+    An action that was known stays known: one whose list a nearer instance has shortened counts as weighing ``threshold``.
+
     :param kernel: (breadth, min_weight, min_fraction); plain tuples for the rest
     :param near: receives these instances; those of the last query make the search shorter
-    :param prediction: receives the prediction. An action that was known stays known: one whose list a nearer instance has
-        shortened counts as weighing ``threshold``.
     """
     instances, near, prediction = Instances(*instances), NearLists(*near), Prediction(*prediction)
     least = np.inf

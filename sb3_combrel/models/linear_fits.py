@@ -16,13 +16,11 @@ PER_BREADTH = -np.log(LAST_WEIGHT)
 NARROWEST = 0.02
 # On the slopes, in squares of the kernel's breadth: more flattens slopes across a trajectory once the kernel has narrowed.
 RIDGE = 0.001
-# What the linear fit leaves unexplained of the instances nearest to a state, as at a wall, is added to its prediction, as if
-# there were so much weight of instances besides that it explains.
+# What the fit leaves unexplained of the nearest instances, as at a wall, is added to its prediction, as if there were besides
+# so much weight of instances that it explains.
 EXPLAINED_WEIGHT = 0.5
-# A prior's prediction counts as so much weight of instances that agree with it, and for rewards and ends as so much weight of
-# the narrower kernel.
-PRIOR_WEIGHT = 0.5
-PRIOR_OUTCOME_WEIGHT = 0.1
+# A prior counts as so much weight of instances that agree with it; for rewards and ends, of the narrower kernel.
+PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 # A row is written again within an episode when its prediction has moved by this, in parts of the size of the action's effects.
 TOLERANCE = 0.1
 # The narrower weight of an instance is no less than this: where all are far away their mean is still a quotient.

@@ -13,7 +13,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.compiled_model import add_to_prediction, total_weight
 from sb3_combrel.models.fit_arrays import Kernel
 from sb3_combrel.models.linear_fits import PRIOR_WEIGHT, RIDGE, mean_outcome, narrowed, unexplained_effect
-from sb3_combrel.planning.grid import GridArrays, corners_of
+from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates
 from sb3_combrel.planning.q_values import Prediction
 
 
@@ -81,10 +81,7 @@ def fit_nearest(instances, target, action, state, kernel, near):
 
 @inlined
 def enter_mean(prediction, action, near, state, prior, claimed, known, effect_range):
-    """Enter reward, end, and mean effect of an action, within the range of effects.
-
-    ``claimed``: whether the prior suffices for a model; ``known``: whether the instances do.
-    """
+    """Enter reward, end and mean effect of an action; ``claimed``: the prior makes a model, ``known``: the instances do."""
     d = len(state)
     if near.length[action] > 0:
         reward, end = mean_outcome(near.outcome, prior, claimed and not known)
@@ -105,11 +102,9 @@ def enter_mean(prediction, action, near, state, prior, claimed, known, effect_ra
 def predict_own(instances, of_model, state, kernel, threshold, near, prediction):
     """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
 
-    :param instances: plain tuple, as ``kernel``, ``near`` and ``prediction``
     :param of_model: (target, effect_range) as in ``LinearFits``; what the prior predicts at ``state``, float64, shape
         (n_actions, n_variables + 2); and whether that suffices for a model, bool, shape (n_actions,)
-    :param near: receives these instances; those of the last query make the search shorter
-    :param prediction: receives the prediction; an action of less weight than ``threshold`` has no model without the prior
+    :param near: receives these instances; those of the last query make the search shorter; plain tuples for the rest
     """
     instances, kernel = Instances(*instances), Kernel(*kernel)
     near, prediction = NearestLists(*near), Prediction(*prediction)
@@ -152,18 +147,15 @@ def join_transferred(transferred, threshold, prediction):
 def interpolate_prior(prior, grid, states, actions, corners, found):
     """Write the effects that a prior predicts of states and actions, multilinear between the grid points, to ``found``.
 
-    :param prior: as in ``LinearFits``; ``grid``: a plain tuple
-    :param states: unit coordinates, float64, shape (n, n_variables); beyond the grid the nearest point of it counts
-    :param corners: work space: position, corner_index, corner_weight (see ``corners_of``)
+    :param prior: as in ``LinearFits``; ``corners``: work space: position, corner_index, corner_weight (see ``corners_of``)
     """
     grid = GridArrays(*grid)
     position, corner, weight = corners
     d = len(position)
     n_points = grid.shape[0] * grid.strides[0]
     for i in range(len(actions)):
-        for k in range(d):
-            position[k] = states[i, k] * grid.cells[k] + grid.margin[k]
-            found[i, k] = 0.0
+        grid_coordinates(states[i], grid, position)
+        found[i, :] = 0.0
         first_pair = actions[i] * n_points
         for c in range(corners_of(position, grid, corner, weight)):
             for k in range(d):

@@ -36,12 +36,10 @@ def prior_change(fits, pair, k, grid, at, away):
 def follow(fits, pair, action, grid, at, limits, scratch):
     """Follow a pair's model, the action held, until a variable has changed by a cell of the grid; the number of steps.
 
-    The effect of a step is that of the pair's fit where the step begins, within the range of effects, as at the point itself.
-    The last step is cut short where the cell is left.
+    The effect of a step is that of the pair's fit where it begins, within the range of effects; the last step is cut short.
 
     :param at: grid coordinates of the point
-    :param limits: (max_model_steps, whether there is a prior)
-    :param scratch: ``away`` receives the displacement
+    :param limits: (max_model_steps, whether there is a prior); ``scratch.away`` receives the displacement
     """
     max_steps, has_prior = limits
     d = len(at)
@@ -85,8 +83,8 @@ def follow(fits, pair, action, grid, at, limits, scratch):
 def write_row(fits, mdp, grid, gamma, pair, limits, scratch, fit_scratch):
     """Write the row of a pair whose model is its fit, the prior, or both; False if there is no room.
 
-    Where none of the instances that count has ended an episode, the row leads as many steps ahead as it takes to leave
-    the cell of the grid, rewarded alike. Where one has, it leads one step ahead: how far away an end is matters there.
+    Where none of the instances that count has ended an episode, the row leads as many steps ahead as it takes to leave the
+    cell; otherwise one: how far away an end is matters there.
     """
     n_points = len(mdp.n_optimistic)
     point, action = pair % n_points, pair // n_points

@@ -19,15 +19,13 @@ from sb3_combrel.models.linear_prediction import NearestLists, interpolate_prior
 from sb3_combrel.models.linear_rows import update_rows
 from sb3_combrel.planning.mdp import FiniteMDP
 
-# Grid points count as known with this fraction of the weight that the exact states need at which the agent decides. The
-# values of these are interpolated between grid points, some of which may lie where nothing leads: optimistic for ever, they
-# would make the states beside them look good for ever. Only once an episode has ended or rewards have differed: until then
-# nothing says where to go, and to know how states change is not to know what is there.
+# Grid points count as known with this fraction of the weight that exact states need: where nothing leads they would stay
+# optimistic, and make the states beside them look good, for ever. Only once an episode has ended or rewards have differed:
+# until then to know how states change is not to know what is there.
 ON_GRID = 0.5
-# As long as that is so and this fraction of all pairs is known, which is looked at every so many transitions, known is decided
-# by a kernel of half the squared breadth: a broad kernel knows soon how states change, and would never find a small goal. To
-# demand more weight instead would send the agent to where it has been first. The second and later times nearly all must be
-# known: the agent goes to the nearest of what is not, and each time begins anew near where episodes start.
+# Until then, whenever this fraction of all pairs is known (the first time, and later ones), which is looked at every so many
+# transitions, known is decided by a kernel of half the squared breadth: a broad one would never find a small goal. To demand
+# more weight instead would send the agent to where it has been first.
 EXPLORED, EXPLORED_AGAIN, CHECKED_EVERY = 0.9, 0.99, 50
 # Whatever a file says.
 MAX_NARROWING = 2.0**20
@@ -39,8 +37,7 @@ _join_transferred, _interpolate_prior = EntryPoint(join_transferred), EntryPoint
 
 
 class LocalLinear(CompiledModel):
-    """
-    Local linear regression, one model for each action, incremental (Atkeson, Moore & Schaal 1997).
+    """Local linear regression, one model for each action, incremental (Atkeson, Moore & Schaal 1997).
 
     An instance at distance d (unit coordinates) weighs exp(-d^2 / breadth^2); these weights decide what is known, as in
     the kernel average. The effect at a state is fitted, as a linear function of the state, to its ``n_neighbors`` nearest
@@ -49,15 +46,13 @@ class LocalLinear(CompiledModel):
     which needs few instances, predicts well. Predicted effects stay within the range of the effects seen. Rewards and ends,
     which jump from one state to the next, are kernel averages with a narrower kernel. One successor a pair: the mean.
 
-    A row of the finite MDP leads from a grid point to where its action, held for as many steps as it takes to leave the cell,
-    leads by the pair's own fit, at most ``max_model_steps``: values that are interpolated once a cell are nearer to the truth
-    than those that are interpolated once a step (Munos & Moore 2002). Where an instance near the point has ended an episode
-    it is one step.
+    A row of the finite MDP leads from a grid point to where its action, held until the cell is left, for ``max_model_steps``
+    at most, leads by the pair's fit: values interpolated once a cell are nearer to the truth than those interpolated once a
+    step (Munos & Moore 2002). Where an instance near the point has ended an episode it is one step.
 
-    On the grid, the sums of each pair's regression are kept, and it is solved again where new instances contradict it. When a
-    pair has half as many again as ``n_neighbors`` its kernel narrows, and the sums are computed anew. With ``max_instances``,
-    the nearest instance of the same action is replaced; a pair with less than half of ``n_neighbors`` left gets a broader
-    kernel again.
+    On the grid, the sums of each pair's regression are kept, and it is solved again where new instances contradict it. A
+    pair's kernel narrows when it has half as many again as ``n_neighbors``, and is broader again when less than half of them
+    are left: with ``max_instances``, the nearest instance of the same action is replaced.
 
     With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and pairs
     that it claims to know are modelled before their own instances suffice. The prior's effects are those at the grid points,
@@ -146,12 +141,7 @@ class LocalLinear(CompiledModel):
         self.fits, self._plain_fits = fits, tuple(fits)
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
-        """
-        Add one transition (see :meth:`Model.add`).
-
-        :return: the pairs whose predictions have moved, but with a transfer method only known ones and those whose weight
-            has changed enough; the others may wait (see :meth:`outdated`)
-        """
+        """As :meth:`Model.add`; with a transfer method, pairs of low weight that changed little may wait (``outdated``)."""
         informed = self._inform(reward, terminated)
         slot, left = self._slot_for(state, action)
         min_change = 0.0 if self._giver is None else MIN_CHANGE * self.exploration_threshold
@@ -190,10 +180,7 @@ class LocalLinear(CompiledModel):
         return size, NO_PAIRS
 
     def _prior_at(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the prior predicts of all actions at a state, as in ``LinearFits``, and whether it claims to know.
-
-        The effects are those at the grid points, see :meth:`_prior_effects`; the source's own at the state are not used.
-        """
+        """What the prior predicts of all actions at a state, as in ``LinearFits``, and whether it claims to know."""
         if self._prior is None:
             return self._no_prior
         states = np.repeat(state[None], self.n_actions, axis=0)
@@ -207,8 +194,7 @@ class LocalLinear(CompiledModel):
     def _prior_effects(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The prior's effects, multilinear between the grid points: shape (n, n_variables); without a prior, rows of zeros.
 
-        So the prior is nowhere finer than the grid on which values are computed. Instances at a wall would else confirm it
-        where they are, and change nothing at the grid points beside, which lead through the wall.
+        Finer ones would be confirmed by instances at a wall, but not at the grid points beside, which lead through the wall.
         """
         if self._prior is None:
             return self._no_prior[0]
@@ -259,7 +245,7 @@ class LocalLinear(CompiledModel):
         self.fits.effect_range[1, action] = effects.max(axis=0, initial=-np.inf)
 
     def _forget_range_of(self, action: int, slot: int) -> None:
-        """Take an instance out of the range of effects: only what is there is there after loading, too."""
+        """Take an instance out of the range of effects, as it is after loading."""
         effects = self._instances.effect[action, : self._instances.size[action]]
         low, high = self.fits.effect_range[:2, action]
         if ((effects[slot] <= low) | (effects[slot] >= high)).any():
@@ -323,9 +309,8 @@ class LocalLinear(CompiledModel):
         return changed[:n]
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, planned, scratch = self.mdp, self._planned, self._plain_scratch
-        of_mdp, grid = mdp.plain, self.grid.plain
-        return int(_update_rows.call(self._plain_fits, of_mdp, grid, planned, pairs, transferred, mdp.plain_scratch, scratch))
+        mdp, grid, scratch = self.mdp, self.grid.plain, (self.mdp.plain_scratch, self._plain_scratch)
+        return int(_update_rows.call(self._plain_fits, mdp.plain, grid, self._planned, pairs, transferred, *scratch))
 
     def _predict_own(self, state: np.ndarray) -> float:
         of_model = self.fits.target, self.fits.effect_range, *self._prior_at(state)

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
-from sb3_combrel.planning.grid import interpolate, wrapped
+from sb3_combrel.planning.grid import grid_coordinates, interpolate, wrapped
 
 CELLS_PER_GRID_CELL = 3
-# Box edges, joint limits and round step lengths lie on round numbers. A state on a cell's edge would be stored on one side
-# of it and looked up, one rounding error later, on the other: for ever without effect.
+# States lie on round numbers: on a cell's edge one would be stored on one side of it and looked up on the other.
 CELL_OFFSET = 0.4142
 MAX_VISITS = 10
 VISIT_TABLE_SIZE = 1 << 14
@@ -145,8 +144,7 @@ def corrected_value(values, corrections, grid, scratch):
 @part
 def cap_value(value, m, values, corrections, grid, scratch):
     """``value``, lowered by as much as the interpolated value at corrected state ``m`` is too high."""
-    for k in range(len(scratch.corrected)):
-        scratch.corrected[k] = corrections.state[m, k] * grid.cells[k] + grid.margin[k]
+    grid_coordinates(corrections.state[m], grid, scratch.corrected)
     there = interpolate(values, scratch.corrected, grid, scratch.corner_index, scratch.corner_weight)
     return value + min(0.0, corrections.value[m] - there)
 
@@ -167,11 +165,10 @@ def count_visit(corrections, key, episode):
 def visit(values, corrections, state, best_q, visitor, grid, scratch):
     """Count a visit to ``state``, whose largest action value is ``best_q``; renew the correction of its cell, or add one.
 
-    :param visitor: (episode, tolerance, max_visits): a number that tells episodes (of all environments) apart; the excess
-        of the interpolated value that is not corrected; visits in an episode before which nothing is
+    :param visitor: (number of the episode, of all environments, excess that is not corrected, visits in an episode before
+        which nothing is)
     """
-    for k in range(len(state)):
-        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
+    grid_coordinates(state, grid, scratch.position)
     key = cell_key(scratch.position, grid)
     at = find_cell(corrections.table, corrections.key, key)
     m = corrections.table[at]

@@ -75,6 +75,13 @@ def corners_of(position, grid, corner_index, corner_weight):
 
 
 @inlined
+def grid_coordinates(state, grid, position):
+    """Write the grid coordinates of a state to ``position``."""
+    for k in range(len(state)):
+        position[k] = state[k] * grid.cells[k] + grid.margin[k]
+
+
+@inlined
 def interpolate(values, position, grid, corner_index, corner_weight):
     """The value at ``position`` (see :func:`corners_of`), multilinear between the grid points."""
     value = 0.0
@@ -90,8 +97,7 @@ def interpolate_once(values, position, grid, corner_index, corner_weight):
 
 
 class StateGrid:
-    """
-    A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
+    """A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
 
     In the margin a predicted successor outside the box has a value of its own; beyond that it counts as the nearest point.
     Along a periodic variable there are 2**resolution points and no margin.
@@ -139,12 +145,6 @@ class StateGrid:
         return interpolate_once(values, position, self.arrays, self._corner_index, self._corner_weight)
 
 
-def default_resolution(n_variables: int, reach: float) -> int:
-    """As fine as is cheap, and a cell's diagonal no longer than the kernel's reach, or points may stay optimistic for ever."""
-    finest_that_is_cheap = {1: 6, 2: 6, 3: 4}.get(n_variables, 3)
-    return max(finest_that_is_cheap, coarsest_in_reach(n_variables, reach))
-
-
 def coarsest_in_reach(n_variables: int, reach: float) -> int:
     """The coarsest resolution at which a cell's diagonal does not exceed ``reach``."""
     return max(1, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
@@ -164,18 +164,15 @@ def fitting_grid(
     min_weight: float,
     periodic: Sequence[bool] | None = None,
 ) -> StateGrid:
-    """The grid for a task: of the given resolution, or of one that suits the kernel.
+    """The grid for a task: of the given resolution, or of one that suits the kernel; for up to two variables with a margin.
 
-    Up to two variables it has a margin of one cell, as the original has states outside the box; with more it would double the
-    grid for little.
-
-    :param periodic: one bool for each state variable; None: none is periodic
     :raises ValueError: if the grid would not fit in memory
     """
     reach = model_breadth * np.sqrt(-np.log(min_weight))
     margin = 1 if n_variables <= 2 else 0
     if resolution is None:
-        resolution = default_resolution(n_variables, reach)
+        # As fine as is cheap, and a cell's diagonal no longer than the reach, or points may stay optimistic for ever.
+        resolution = max({1: 6, 2: 6, 3: 4}.get(n_variables, 3), coarsest_in_reach(n_variables, reach))
         while resolution > 1 and _n_points(n_variables, resolution, margin, periodic) * n_actions > MAX_PAIRS_BY_DEFAULT:
             resolution -= 1
     n_points = _n_points(n_variables, resolution, margin, periodic)

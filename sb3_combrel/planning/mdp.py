@@ -50,8 +50,7 @@ class RowScratch(NamedTuple):
 
 
 class FiniteMDP:
-    """
-    The finite MDP, all of whose pairs are optimistic at first.
+    """The finite MDP, all of whose pairs are optimistic at first.
 
     :param grid: the finite sample of states
     :param n_actions: number of actions
@@ -92,10 +91,8 @@ class FiniteMDP:
     def write_rows(
         self, pairs: np.ndarray, modelled: np.ndarray, probability: np.ndarray, effect: np.ndarray, reward: np.ndarray
     ) -> None:
-        """
-        Write the rows of pairs from predictions.
+        """Write the rows of pairs, int64, shape (n,), from predictions.
 
-        :param pairs: int64, shape (n,)
         :param modelled: bool, shape (n,): whether each has a model; the others become optimistic
         :param probability: shape (n, n_successors); what is missing to 1 ends the episode
         :param effect: shape (n, n_successors, n_variables): displacements, unit coordinates
@@ -170,13 +167,18 @@ def add_successor(p, effect, scratch, grid, n_touched):
     return n_touched
 
 
+@inlined
+def infinite_reward(reward):
+    """What staying for ever with a reward each step is worth; values are cut to their bounds."""
+    return 0.0 if reward == 0.0 else np.inf * reward
+
+
 @part
 def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
     """Turn the successors in ``scratch.dense`` into the row of a pair; False if there is no room, and nothing is written.
 
-    A grid point is often its own successor. Staying is summed as the geometric series it is: reward and probabilities are
-    divided by 1 - gamma * P(stay), which leaves the fixed point of the value function as it was and saves most of the
-    sweeps. A pair that never leaves gets an infinite reward (of the reward's sign), which the planner cuts to its bounds.
+    Staying is summed as the geometric series it is: reward and probabilities are divided by 1 - gamma * P(stay), which leaves
+    the fixed point as it was and saves most sweeps. A pair that never leaves gets an infinite reward of the reward's sign.
     """
     if not reserve(mdp.rows, pair, n_touched):
         for t in range(n_touched):
@@ -187,10 +189,7 @@ def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
     discount = 0.0 if never_leaves else gamma / leave
     if not store_row(mdp, pair, point, n_touched, discount, scratch):
         return False
-    if never_leaves:
-        mdp.reward[pair] = 0.0 if reward == 0.0 else np.inf * reward
-    else:
-        mdp.reward[pair] = reward / leave
+    mdp.reward[pair] = infinite_reward(reward) if never_leaves else reward / leave
     return True
 
 
@@ -198,7 +197,7 @@ def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
 def store_row(mdp, pair, point, n_touched, discount, scratch):
     """Write the probabilities in ``scratch.dense``, discounted, to a pair's row, and note its point as a predecessor.
 
-    False, and the row is empty, if there is no room for the predecessors; it is left empty if ``discount`` is 0, too.
+    False, and the row is empty, if there is no room; it is empty if ``discount`` is 0, too.
     """
     slot = mdp.rows.start[pair]
     n_old = mdp.rows.length[pair]

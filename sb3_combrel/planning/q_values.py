@@ -7,8 +7,8 @@ import numpy as np
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.planning.corrections import CorrectionArrays, ValueScratch, corrected_value, visit
-from sb3_combrel.planning.grid import GridArrays, corners_of
-from sb3_combrel.planning.mdp import NEVER_LEAVES
+from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates
+from sb3_combrel.planning.mdp import NEVER_LEAVES, infinite_reward
 
 
 class Prediction(NamedTuple):
@@ -87,12 +87,7 @@ def q_values(prediction, state, function, q, scratch):
                 stay += p
         leave = 1.0 - function.gamma * stay
         reward = prediction.reward[action]
-        if leave >= NEVER_LEAVES:
-            value = (reward + function.gamma * after) / leave
-        elif reward == 0.0:
-            value = 0.0
-        else:
-            value = np.inf * reward
+        value = infinite_reward(reward) if leave < NEVER_LEAVES else (reward + function.gamma * after) / leave
         q[action] = min(max(value, function.bounds[0]), function.bounds[1])
     if n_optimistic > 0:
         upper = optimistic_value(state, function, scratch)
@@ -104,8 +99,7 @@ def q_values(prediction, state, function, q, scratch):
 @inlined
 def optimistic_value(state, function, scratch):
     """The value of an action without a model at ``state``: exactly ``max_value`` where that is the bound all around."""
-    for k in range(len(state)):
-        scratch.position[k] = state[k] * function.grid.cells[k] + function.grid.margin[k]
+    grid_coordinates(state, function.grid, scratch.position)
     value = function.bounds[1]
     for c in range(corners_of(scratch.position, function.grid, scratch.corner_index, scratch.corner_weight)):
         value += scratch.corner_weight[c] * (function.upper[scratch.corner_index[c]] - function.bounds[1])
@@ -114,11 +108,7 @@ def optimistic_value(state, function, scratch):
 
 @compiled
 def evaluate_actions(prediction, state, function, q, visitor, scratch):
-    """Compute the action values at a state, count and correct the visit there; the best action, -1 if several are.
-
-    :param q: receives the values, shape (n_actions,); plain tuples for the rest
-    :param visitor: see ``corrections.visit``; an episode of -1: the agent is not there, nothing is counted or corrected
-    """
+    """See :meth:`QValues.compute`; ``q`` receives the values, shape (n_actions,), and the rest are plain tuples."""
     prediction, scratch = Prediction(*prediction), ValueScratch(*scratch)
     values, corrections, grid, gamma, bounds, upper = function
     function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds, upper)
@@ -137,7 +127,7 @@ def evaluate_actions(prediction, state, function, q, visitor, scratch):
 
 
 _evaluate_actions = EntryPoint(evaluate_actions)
-# An episode that is none: see ``visitor``.
+# An episode of -1: the agent is not there, and nothing is counted or corrected.
 NOBODY = (-1, 0.0, 0)
 
 
@@ -155,12 +145,11 @@ class QValues:
         function: PlainValueFunction,
         visitor: tuple[int, float, int] = NOBODY,
     ) -> int:
-        """
-        Compute :attr:`q` at a state from what the model predicts there.
+        """Compute :attr:`q` at a state from what the model predicts there.
 
         :param state: unit coordinates, shape (n_variables,)
         :param function: a ValueFunction as plain tuples
-        :param visitor: who is there: (episode, tolerance, max_visits), see ``corrections.visit``
+        :param visitor: whose visit is counted: (episode, tolerance, max_visits), see ``corrections.visit``
         :return: the best action, -1 if several are
         """
         best: int = _evaluate_actions.call(tuple(prediction), state, function, self.q, visitor, self._scratch)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
-from sb3_combrel.planning.grid import GridArrays, corners_of
+from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates
 from sb3_combrel.planning.mdp import FiniteMDP, RowScratch, as_mdp
 
 EXPLOITATION_SWEEPS = 300
@@ -19,8 +19,7 @@ class SweepQueue(NamedTuple):
     ends: np.ndarray  # int64, (2,): where in the ring the first point is, and how many are queued
     queued: np.ndarray  # bool, (n_points,)
     propagated: np.ndarray  # float64, (n_points,): the value of a point that was last propagated to its predecessors
-    # Sum of the changes propagated to a point since its last backup, each times its probability: a bound on the change that a
-    # backup would make.
+    # Changes propagated to a point since its last backup, each times its probability: a bound on what a backup would change.
     priority: np.ndarray  # float64, (n_points,)
     greedy: np.ndarray  # int16, (n_points,): the action that gave the point its value, -1 if none did
     q: np.ndarray  # float64, (n_points, n_actions): Q of each pair when it was last computed
@@ -66,13 +65,19 @@ def pop(queue):
 
 
 @inlined
-def compute_q(values, mdp, queue, point, action):
-    """Compute Q of a pair that has a model from its row."""
-    pair = point + action * len(values)
+def value_of_row(values, mdp, pair):
+    """Reward of a pair that has a model, and the values of its successors."""
     q = mdp.reward[pair]
     start = mdp.rows.start[pair]
     for k in range(start, start + mdp.rows.length[pair]):
         q += mdp.rows.weight[k] * values[mdp.rows.item[k]]
+    return q
+
+
+@inlined
+def compute_q(values, mdp, queue, point, action):
+    """Compute Q of a pair that has a model from its row."""
+    q = value_of_row(values, mdp, point + action * len(values))
     queue.q[point, action] = q
     queue.slack[point, action] = 0.0
     return q
@@ -143,8 +148,7 @@ def propagate(values, mdp, queue, point, tolerance):
 @part
 def backup_around(values, mdp, queue, state, grid, bounds, tolerance, scratch):
     """Back up the grid points around ``state`` that a change has been propagated to, or the agent stays; how many."""
-    for k in range(len(state)):
-        scratch.position[k] = state[k] * grid.cells[k] + grid.margin[k]
+    grid_coordinates(state, grid, scratch.position)
     backups = 0
     for c in range(corners_of(scratch.position, grid, scratch.corner_index, scratch.corner_weight)):
         point = scratch.corner_index[c]
@@ -162,9 +166,8 @@ def sweep(values, mdp, queue, grid, limits, changed, around, scratch):
     With the largest change first, states from which no known way leads on would be backed up again and again, their
     values falling by a step's reward each time, before any other.
 
-    :param values: float64, shape (n_points,), updated in place; then plain tuples
-    :param limits: ((min_value, max_value), tolerance, max_backups: of points in the queue, the others stay there)
-    :param around: a state around which all is backed up, unit coordinates; or nothing, shape (0,)
+    :param values: updated in place; plain tuples for ``mdp``, ``queue``, ``grid`` and ``scratch``
+    :param limits: ((min_value, max_value), tolerance, max_backups); ``around``: see :meth:`Planner.update`
     """
     mdp, queue, grid, scratch = as_mdp(mdp), SweepQueue(*queue), GridArrays(*grid), RowScratch(*scratch)
     bounds, tolerance, max_backups = limits
@@ -189,10 +192,7 @@ def sweep(values, mdp, queue, grid, limits, changed, around, scratch):
 
 @compiled
 def sweep_all(values, mdp, queue, bounds, tolerance, max_passes):
-    """Back up all points, up and down the grid in turn, until little changes; predecessors of the rest are queued.
-
-    Points in the order in which their rows lie in memory: where most of the model is new this is quicker than :func:`sweep`.
-    """
+    """Back up all points, up and down the grid in turn, until little changes; predecessors of the rest are queued."""
     n_points = len(values)
     backups = 0
     for n in range(max_passes):
@@ -222,8 +222,7 @@ def sweep_all(values, mdp, queue, bounds, tolerance, max_passes):
 def exploitation_sweep(values, mdp, n_actions, grid, bounds, downwards):
     """One Gauss-Seidel sweep for evaluation, over the pairs that have a model, without optimism; the largest change.
 
-    A grid point without any such pair takes the least value of its neighbours along the axes: no better than what is
-    known next to it, and so far no worse.
+    A grid point without any such pair takes the least value of its neighbours along the axes.
     """
     n_points = len(values)
     largest = 0.0
@@ -247,13 +246,8 @@ def exploitation_sweep(values, mdp, n_actions, grid, bounds, downwards):
         else:
             best = bounds[0]
             for pair in range(point, len(mdp.reward), n_points):
-                if not mdp.modelled[pair]:
-                    continue
-                q = mdp.reward[pair]
-                start = mdp.rows.start[pair]
-                for k in range(start, start + mdp.rows.length[pair]):
-                    q += mdp.rows.weight[k] * values[mdp.rows.item[k]]
-                best = max(best, q)
+                if mdp.modelled[pair]:
+                    best = max(best, value_of_row(values, mdp, pair))
             best = min(best, bounds[1])
         largest = max(largest, abs(best - values[point]))
         values[point] = best
@@ -264,8 +258,7 @@ _sweep, _sweep_all, _exploitation_sweep = EntryPoint(sweep), EntryPoint(sweep_al
 
 
 class Planner:
-    """
-    The value function at the grid points, kept near the fixed point of the MDP's Bellman backups.
+    """The value function at the grid points, kept near the fixed point of the MDP's Bellman backups.
 
     :param mdp: the finite MDP; pairs whose rows change are given to :meth:`update`
     :param max_value: value of an optimistic pair, and upper bound of all values; lower ones: see :meth:`set_upper`
@@ -289,8 +282,7 @@ class Planner:
         self.queue, self._plain_queue = queue, tuple(queue)
 
     def update(self, pairs: np.ndarray, max_backups: int, around: np.ndarray = NOWHERE) -> int:
-        """
-        Back up the points of pairs whose rows have changed, and points in the queue.
+        """Back up the points of pairs whose rows have changed, and points in the queue.
 
         :param pairs: int64
         :param max_backups: of points in the queue; the others stay there
@@ -298,10 +290,9 @@ class Planner:
         :return: backups done
         """
         self._exploitation = None
-        mdp = self.mdp
-        limits = (self.bounds, self.tolerance, max_backups)
-        grid, scratch = mdp.grid.plain, mdp.plain_scratch
-        return int(_sweep.call(self.values, mdp.plain, self._plain_queue, grid, limits, pairs, around, scratch))
+        mdp, limits = self.mdp, (self.bounds, self.tolerance, max_backups)
+        changed = pairs, around, mdp.plain_scratch
+        return int(_sweep.call(self.values, mdp.plain, self._plain_queue, mdp.grid.plain, limits, *changed))
 
     def sweep_all(self, max_passes: int) -> int:
         """Back up all points up to ``max_passes`` times, where most of the MDP is new; backups done."""
@@ -321,8 +312,7 @@ class Planner:
         return self._exploitation
 
     def set_upper(self, upper: np.ndarray | None) -> None:
-        """
-        Bound the values of grid points, and so what is optimistic, by less than ``max_value``; every point is queued.
+        """Bound the values of grid points, and so what is optimistic, by less than ``max_value``; every point is queued.
 
         :param upper: shape (n_points,), no more than ``max_value`` counts; None: ``max_value`` everywhere
         :raises ValueError: if there is not one number for each grid point

@@ -8,7 +8,7 @@ counts as known from what instances it has.
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled
-from sb3_combrel.planning.grid import GridArrays, corners_of
+from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates
 
 ENOUGH_VISITS = 3
 
@@ -17,18 +17,14 @@ ENOUGH_VISITS = 3
 def note_visit(state, weight, threshold, n_optimistic, visits, grid, scratch):
     """Count a visit to the grid points around ``state`` that have an optimistic action, if every action is known there.
 
-    :param weight: float64, shape (n_actions,): of the own instances at ``state``
-    :param n_optimistic: int64, shape (n_points,): optimistic actions of each point; ``visits``: int32, same shape
-    :param scratch: position, corner_index, corner_weight (see ``corners_of``)
-    :return: how many points have been visited often enough; they are moved to the front of ``corner_index``
+    Of how many that was often enough; they are moved to the front of ``corner_index``. See :meth:`Visits.note`.
     """
     for action in range(len(weight)):
         if weight[action] < threshold:
             return 0
     grid = GridArrays(*grid)
     position, corner_index, corner_weight = scratch
-    for k in range(len(state)):
-        position[k] = state[k] * grid.cells[k] + grid.margin[k]
+    grid_coordinates(state, grid, position)
     found = 0
     for c in range(corners_of(position, grid, corner_index, corner_weight)):
         point = corner_index[c]
@@ -54,10 +50,7 @@ class Visits:
     def note(
         self, state: np.ndarray, weight: np.ndarray, threshold: float, n_optimistic: np.ndarray, grid: tuple
     ) -> np.ndarray:
-        """
-        Count a visit.
-
-        :param state: unit coordinates, shape (n_variables,)
+        """:param state: unit coordinates, shape (n_variables,)
         :param weight: of the own instances of each action there, shape (n_actions,); ``threshold``: what makes one known
         :param n_optimistic: optimistic actions of each grid point, shape (n_points,)
         :param grid: ``StateGrid.plain``

@@ -148,11 +148,3 @@ def test_mappings_and_sets_are_written_and_read_in_the_format_of_files(written, 
 def test_the_message_of_damage_names_the_kind_and_what_is_wrong(written, message):
     with pytest.raises(ValueError, match=message):
         from_plain(written)
-
-
-def test_data_nested_without_end_is_refused():
-    nested = []
-    for _ in range(100_000):
-        nested = [nested]
-    with pytest.raises(ValueError, match="nested too deeply"):
-        from_plain(nested)

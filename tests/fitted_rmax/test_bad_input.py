@@ -41,19 +41,10 @@ class Scripted(gym.Env):
         return observation, reward, bool(self.at[0] >= 0.99), self.steps >= 12, {}
 
 
-@pytest.mark.parametrize(
-    ("space", "message"),
-    [
-        (spaces.Dict({"a": spaces.Box(0.0, 1.0, (2,))}), "FlattenObservation"),
-        (spaces.Box(0, 255, (64, 64, 3), dtype=np.uint8), "images"),
-        (spaces.Box(0.0, 1.0, (2, 2)), "shape"),
-        (spaces.Discrete(4), "Box"),
-        (spaces.Box(0, 9, (2,), dtype=np.int64), "floating-point numbers, got dtype int64"),
-    ],
-)
-def test_fitted_rmax_refuses_observations_that_are_no_vector_of_real_numbers(space, message):
-    with pytest.raises(ValueError, match=message):
-        FittedRMax(Scripted(space=space))
+# What is refused as a space or as bounds is tested in common/test_scaling.py; here that it is refused from here as well.
+def test_fitted_rmax_refuses_observations_that_are_no_vector_of_real_numbers():
+    with pytest.raises(ValueError, match="images"):
+        FittedRMax(Scripted(space=spaces.Box(0, 255, (64, 64, 3), dtype=np.uint8)))
 
 
 @pytest.mark.parametrize(("n", "n_discrete"), [(1, 5), (2, 9)])
@@ -85,14 +76,8 @@ def test_infinite_observation_bounds_need_the_bounds_argument():
 @pytest.mark.parametrize(
     ("bounds", "expected"),
     [
-        (([-1.0], [1.0]), "2"),
         (([-1.0, 0.0], [1.0]), "2"),
-        (([-1.0, 0.0],), "low, high"),
-        (([1.0, 1.0], [0.0, 2.0]), "bounds"),
-        (([0.0, 0.0], [np.inf, 1.0]), "bounds"),
-        (([0.0, np.nan], [1.0, 1.0]), "bounds"),
         (("low", "high"), "bounds"),
-        (3.0, "bounds"),
         ((False, True), "bounds must be"),
         (([-1.0, False], [1.0, 2.0]), "bounds must be"),
     ],
@@ -155,22 +140,23 @@ def test_wrong_arguments_of_the_constructor_are_refused_by_name(name, value):
         FittedRMax(Scripted(), **{name: value})
 
 
+@pytest.fixture(scope="module")
+def unlearned():
+    return small()
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *[
-            ("total_timesteps", value)
-            for value in (0, -5, 0.5, 1e308, 1e16, 10**400, np.inf, np.nan, True, "many", [10], None)
-        ],
+        *[("total_timesteps", value) for value in (0, 0.5, 1e16, np.nan, True, "many", None)],
         *[("log_interval", value) for value in (0, -4, True, 2.5)],
         *[("tb_log_name", 3), ("reset_num_timesteps", "False"), ("progress_bar", 1)],
     ],
 )
-def test_wrong_arguments_of_learn_are_refused_by_name(name, value):
-    model = small()
+def test_wrong_arguments_of_learn_are_refused_by_name(unlearned, name, value):
     with pytest.raises(ValueError, match=f"{name} must be"):
-        model.learn(**{"total_timesteps": 10, name: value})
-    assert model.num_timesteps == 0
+        unlearned.learn(**{"total_timesteps": 10, name: value})
+    assert unlearned.num_timesteps == 0
 
 
 @pytest.mark.parametrize("policy", [DQNPolicy, "NoSuchPolicy"])

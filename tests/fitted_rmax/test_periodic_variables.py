@@ -6,12 +6,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers.agents import assert_same_state, make_agent
-from helpers.dashboard import events, run_folder
 from helpers.ring import PERIODIC, Ring, ring_transitions, shifted
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_combrel import COMBREL, FittedRMax, SourceInstances
-from sb3_combrel.callbacks import DashboardCallback
+from sb3_combrel import FittedRMax
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.loop_detection import small_cell
 from sb3_combrel.planning.grid import StateGrid, fitting_grid
@@ -144,12 +142,3 @@ def test_a_plane_through_the_end_of_a_periodic_variable_goes_through_its_beginni
     plane = plane_through(grid, scaling, ("a", "b", "c"), (1, 2), at=[0.99, 0.5, 0.5])
     assert plane.held == "a = 0"
     assert (grid.states_of(plane.points.ravel())[:, 0] == 0.0).all()
-
-
-def test_the_dashboard_shows_periodic_variables(tmp_path):
-    transfer = COMBREL(SourceInstances.record(None, TellingRing(), 200, seed=0))
-    arguments = dict(seed=0, resolution=4, model_breadth=0.12, transfer=transfer, tensorboard_log=str(tmp_path))
-    FittedRMax(TellingRing(), **arguments).learn(60, DashboardCallback(picture_freq=30), log_interval=1)
-    found = events(run_folder(tmp_path))
-    assert len(found.Images("value_and_policy/angle_speed")) == 2
-    assert "source_action/angle_speed" in found.Tags()["images"]

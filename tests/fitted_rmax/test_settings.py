@@ -91,16 +91,12 @@ def test_breadth_and_backups_depend_on_degree_and_number_of_variables_unless_giv
     assert (given.model_settings(n_variables).model_breadth, given.backups_for(n_variables)) == (0.3, 0)
 
 
-@pytest.mark.parametrize(("n_variables", "n_neighbors"), [(1, 16), (2, 16), (3, 24), (4, 30), (5, 40), (6, 60), (9, 60)])
-def test_the_number_of_neighbors_depends_on_the_number_of_variables_unless_given(n_variables, n_neighbors):
-    assert FittedRMaxSettings().model_settings(n_variables).n_neighbors == n_neighbors
-    assert FittedRMaxSettings(n_neighbors=7).model_settings(n_variables).n_neighbors == 7
-
-
-@pytest.mark.parametrize(("degree", "min_weight"), [(0, 0.01), (1, 0.05)])
-def test_the_least_weight_that_counts_depends_on_the_degree_unless_given(degree, min_weight):
-    assert FittedRMaxSettings(degree=degree).model_settings(2).min_weight == min_weight
-    assert FittedRMaxSettings(degree=degree, min_weight=0.2).model_settings(2).min_weight == 0.2
+def test_neighbors_depend_on_the_number_of_variables_and_the_least_weight_on_the_degree_unless_given():
+    found = [FittedRMaxSettings().model_settings(d).n_neighbors for d in (1, 2, 3, 4, 5, 6, 9)]
+    assert found == [16, 16, 24, 30, 40, 60, 60]
+    assert [FittedRMaxSettings(degree=degree).model_settings(2).min_weight for degree in (0, 1)] == [0.01, 0.05]
+    given = FittedRMaxSettings(n_neighbors=7, min_weight=0.2).model_settings(3)
+    assert (given.n_neighbors, given.min_weight) == (7, 0.2)
 
 
 def test_the_original_looks_one_step_ahead():

@@ -43,7 +43,7 @@ class NaiveLists:
         return sum(slot in one for one in self.lists)
 
 
-@settings(deadline=None, derandomize=True, max_examples=8)
+@settings(deadline=None, derandomize=True, max_examples=6)
 @given(
     st.sampled_from([((3,), 1), ((2, 2), 0), ((1, 1, 1), 0), ((3,), 0, (True,)), ((2, 2), 0, (False, True))]),
     st.sampled_from(KERNELS),
@@ -89,15 +89,15 @@ def assert_same_to_the_last_bit(one, other):
             np.testing.assert_array_equal(lists.entries(pair), same.entries(pair))
 
 
-@pytest.mark.parametrize(("grid", "kernel"), [(grid, KERNELS[i % 4]) for i, grid in enumerate(GRIDS)], ids=str)
+@pytest.mark.parametrize(("grid", "kernel"), [(grid, KERNELS[i % 4]) for i, grid in enumerate(GRIDS) if i % 3 == 2], ids=str)
 def test_a_restored_model_is_and_learns_on_as_the_original_to_the_last_bit(grid, kernel):
     model = make_model(grid, kernel)
-    transitions = random_transitions(3, len(grid[0]), 180)
-    learn(model, transitions[:150])
+    transitions = random_transitions(3, len(grid[0]), 130)
+    learn(model, transitions[:100])
     fresh = restored(model, grid, kernel)
     assert model.arrays.lists.length.max() > 1
     assert_same_to_the_last_bit(fresh, model)
-    for transition in transitions[150:]:
+    for transition in transitions[100:]:
         changed = model.add(*transition)
         np.testing.assert_array_equal(fresh.add(*transition), changed)
         for one in (model, fresh):

@@ -30,7 +30,7 @@ def assert_same_as_definition(model, naive):
     return assert_same_fits(model, naive)
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(deadline=None, derandomize=True, max_examples=6)
 @given(
     st.sampled_from(SMALL_GRIDS),
     st.sampled_from(LINEAR_KERNELS),
@@ -56,9 +56,9 @@ def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_eve
 
 
 @pytest.mark.parametrize("grid", [((3,), 1), ((2, 2), 0, (False, True))], ids=str)
-def test_sums_and_rows_stay_right_over_hundreds_of_replacements(grid):
+def test_sums_and_rows_stay_right_over_many_replacements(grid):
     model, naive = linear_model_and_definition(grid, LINEAR_KERNELS[1], max_instances=12)
-    learn_linear(model, NaiveReplacement(naive, 12), random_transitions(4, len(grid[0]), 400))
+    learn_linear(model, NaiveReplacement(naive, 12), random_transitions(4, len(grid[0]), 150))
     assert assert_same_as_definition(model, naive) > 0
 
 
@@ -67,7 +67,7 @@ def test_sums_and_rows_stay_right_where_many_instances_have_the_same_state():
     states = rng.random((3, 2))
     model, naive = linear_model_and_definition(((2, 2), 0), LINEAR_KERNELS[1], max_instances=20)
     expected = NaiveReplacement(naive, 20)
-    for _ in range(300):
+    for _ in range(120):
         state = states[rng.integers(3)]
         learn_linear(model, expected, [(state, 0, rng.normal(), state + 0.1 * rng.normal(size=2), rng.random() < 0.2)])
     assert assert_same_as_definition(model, naive) > 0
@@ -118,12 +118,12 @@ def test_rewards_far_from_all_instances_are_numbers_however_narrow_their_kernel_
     assert model.predict_at(np.array([0.5]))[0].reward[0] == pytest.approx(-2.0)
 
 
-@settings(deadline=None, derandomize=True, max_examples=15)
+@settings(deadline=None, derandomize=True, max_examples=8)
 @given(
     st.sampled_from(SMALL_GRIDS),
     st.sampled_from(LINEAR_KERNELS),
     st.integers(0, 10**6),
-    st.integers(1, 80),
+    st.integers(1, 60),
     st.booleans(),
     st.booleans(),
 )

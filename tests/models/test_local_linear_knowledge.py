@@ -43,9 +43,10 @@ def assert_same_knowledge(model, naive):
     assert narrowing_of(model) == naive.narrowing and model.exploration_threshold == naive.threshold
 
 
-@pytest.mark.parametrize("max_instances", [None, 25, 10])
-@pytest.mark.parametrize(("threshold", "outcome"), [(0.3, AN_END), (3.0, ANOTHER_REWARD)])
-def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outcome(max_instances, threshold, outcome):
+@pytest.mark.parametrize(
+    ("threshold", "outcome", "max_instances"), [(0.3, AN_END, None), (3.0, ANOTHER_REWARD, 25), (3.0, AN_END, 10)]
+)
+def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outcome(threshold, outcome, max_instances):
     # At 25 there are 50 instances for ever, at 10 never so many: transitions count, not instances.
     model, naive = linear_model_and_definition(GRID, KERNEL, threshold=threshold, max_instances=max_instances)
     learner = naive if max_instances is None else NaiveReplacement(naive, max_instances)

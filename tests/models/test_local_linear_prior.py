@@ -74,20 +74,3 @@ def test_a_model_with_a_prior_asks_for_no_transferred_instances():
     learn(model, random_transitions(0, 2, 20))
     assert model.predict_at(np.array([0.5, 0.5]))[1] is None and len(model.outdated()) > 0
     model.update_rows(model.outdated())
-
-
-class BlindBetweenPoints(StubPrior):
-    """Says nothing of effects at single states."""
-
-    def prior(self, states, actions):
-        found = super().prior(states, actions)
-        return found if len(states) > N_ACTIONS else found._replace(effect=None)
-
-
-def test_at_an_exact_state_the_effects_of_the_source_are_not_needed():
-    dynamics, state = LinearDynamics(1, 2), np.array([0.37, 0.81])
-    expected, found = (
-        model_with_prior(kind(dynamics.effect)).predict_at(state)[0] for kind in (StubPrior, BlindBetweenPoints)
-    )
-    for array, same in zip(expected, found, strict=True):
-        np.testing.assert_array_equal(array, same)

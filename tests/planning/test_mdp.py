@@ -42,7 +42,7 @@ def random_predictions(rng, n, n_successors, n_variables):
     return probability, rng.normal(0.0, 0.4, moves.shape) * moves, rng.normal(size=n)
 
 
-@settings(deadline=None, derandomize=True, max_examples=20)
+@settings(deadline=None, derandomize=True, max_examples=12)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6), st.integers(1, 5), st.sampled_from([1.0, 0.9]))
 def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
     np.testing.assert_array_equal(mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
 
 
-@settings(deadline=None, derandomize=True, max_examples=12)
+@settings(deadline=None, derandomize=True, max_examples=8)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6))
 def test_predecessors_include_every_point_that_a_row_leads_from_with_at_least_its_probability(grid, seed):
     rng = np.random.default_rng(seed)

@@ -35,7 +35,7 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     return agent, naive
 
 
-@settings(deadline=None, derandomize=True, max_examples=25)
+@settings(deadline=None, derandomize=True, max_examples=15)
 @given(
     st.integers(0, 10**6),
     st.integers(1, 3),

@@ -93,7 +93,7 @@ def test_predictions_in_a_callback_or_in_between_do_not_change_what_is_learned(m
     assert_learned_the_same(plain, predicting)
 
 
-@pytest.mark.parametrize("n_steps", [300, pytest.param(5000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("n_steps", [150, pytest.param(5000, marks=pytest.mark.long)])
 def test_predictions_in_a_thread_while_learning_change_nothing_that_is_learned(n_steps):
     plain, predicting = (small(transfer=METHODS["COMBREL"]()) for _ in range(2))
     thread, interval = AskingThread(predicting), sys.getswitchinterval()

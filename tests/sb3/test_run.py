@@ -65,6 +65,7 @@ def test_the_learned_policy_walks_to_the_goal(make):
     np.testing.assert_array_equal(model.predict(OBSERVATIONS[3:18], deterministic=True)[0], 1)
 
 
+@pytest.mark.long
 def test_importing_is_light_and_compiles_nothing():
     code = (
         "import sys, sb3_combrel\n"
