@@ -85,7 +85,7 @@ class TransitionLog:
             self._rows[position] = row
 
     def transitions(
-        self, scaling: StateScaling, n_actions: int, names: Mapping[str, tuple[Any, ...]], origin: Mapping[str, Any]
+        self, scaling: StateScaling, n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
     ) -> Transitions:
         """
         What is in the log; ``ValueError`` if that is nothing.
@@ -97,7 +97,7 @@ class TransitionLog:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
         _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
         kinds = np.float64, np.int64, np.float64, np.float64, np.bool_
-        arrays = [np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)]
+        arrays: list[Any] = [np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)]
         return Transitions(*arrays, scaling.low, scaling.high, n_actions, origin=origin, **names)
 
 

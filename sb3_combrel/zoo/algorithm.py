@@ -60,7 +60,8 @@ class ZooFittedRMax(FittedRMax):
         """Compute the resolution for "coarser" or "finer"."""
         if wanted not in ("coarser", "finer"):
             raise ValueError(f'resolution must be a whole number, one for each variable, "coarser" or "finer", got {wanted!r}')
-        n_actions = check_actions(self.action_space)
+        check_actions(self.action_space)
+        n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
         n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
         settings = self.settings.model_settings(n_variables)
         suited, *_ = fitting_grid(n_variables, n_actions, None, settings.model_breadth, settings.min_weight).resolution
