@@ -97,7 +97,7 @@ class TransitionLog:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
         _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
         kinds = np.float64, np.int64, np.float64, np.float64, np.bool_
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.array(column, dtype=kind)
             for name, column, kind in zip(Transitions._fields[: len(kinds)], columns, kinds, strict=True)
         }
