@@ -239,7 +239,7 @@ class TestBadInput:
             (("--methods", "failing.py:NoMethod"), "methods: failing.py:NoMethod lacks observe, transferred"),
             (("--pairs", "failing.py"), "pairs: failing.py defines no PAIR"),
             (("--pairs", "raising.py"), "pairs: raising.py cannot be imported: FileNotFoundError: .*table.csv"),
-            (("--methods", "none", "none"), "methods must have different names, got none, none"),
+            (("--methods", "none", "none"), "methods must be .* different names, got none, none"),
             (("--seeds", "0"), "seeds must be .* got 0"),
             (("--first-seed", "-1"), "first_seed must be .* got -1"),
             (("--jobs", "0"), "jobs must be .* got 0"),

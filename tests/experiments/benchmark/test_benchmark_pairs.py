@@ -195,7 +195,14 @@ class TestStepsToAMapping:
             found = carried_out(pair, METHODS[name], sources)
             assert found.more["mapping_steps"] in steps and found.n_steps == 250
 
-    @pytest.mark.parametrize(("name", "steps"), [("MASTER", 100), ("soft-homomorphism", 10), ("three-way-RBM", 200)])
+    @pytest.mark.parametrize(
+        ("name", "steps"),
+        [
+            ("MASTER", 100),
+            pytest.param("soft-homomorphism", 10, marks=pytest.mark.long),
+            pytest.param("three-way-RBM", 200, marks=pytest.mark.long),
+        ],
+    )
     def test_of_methods_that_learn_a_mapping_are_those_of_their_sample(self, name, steps, sources):
         pair = replace(PAIRS["mirrored-car"], n_steps=250)
         assert carried_out(pair, METHODS[name], sources).more["mapping_steps"] == steps
