@@ -159,8 +159,7 @@ class SourceInstances:
         :param total_timesteps: steps of learning
         :param method: how to choose the instances, see :meth:`subset`
         :param learner: further arguments of :class:`~sb3_combrel.sources.q_learning.QLearning`
-        :raises ValueError: if the spaces do not fit, if ``n_instances`` exceeds ``total_timesteps``, if either is not a
-            whole number, or if the environment returns something that is not finite
+        :raises ValueError: as of :meth:`record`, or if ``n_instances`` exceeds ``total_timesteps``
         """
         total_timesteps = as_transition_count("total_timesteps", total_timesteps)
         n_instances = as_count("n_instances", n_instances, max=total_timesteps, why_max="total_timesteps")
@@ -182,15 +181,11 @@ class SourceInstances:
         """
         Learn the source task with Fitted R-Max and keep a choice of all its experience, as in Section 5.2 of the paper.
 
-        :param env: a task, or its id, e.g. "combrel/ICubTorsoStrike-v0"
-        :param n_instances: number of instances to keep
-        :param seed: seed of the learner, its environment and the choice
+        :param env: a task, or its id; ``n_instances``, ``seed``: see :meth:`from_q_learning`
         :param n_episodes: episodes of learning
-        :param method: how to choose the instances, see :meth:`subset`; most of the experience is of one path, so by default
-            those that cover most
+        :param method: see :meth:`subset`; most of the experience is of one path, so by default those that cover most
         :param learner: arguments of :class:`~sb3_combrel.FittedRMax`, such as ``max_value``
-        :raises ValueError: if the spaces do not fit, if a number is not a whole number of at least 1, or if the
-            environment returns something that is not finite
+        :raises ValueError: as of :meth:`record`
         """
         n_instances = as_transition_count("n_instances", n_instances)
         check_method(method)
@@ -216,8 +211,6 @@ class SourceInstances:
         :raises ImportError: if Minari is missing
         :raises ValueError: as of :meth:`record`
         """
-        if n_instances is not None:
-            n_instances = as_count("n_instances", n_instances)
         source = cls(*minari_datasets.read_dataset(dataset, bounds))
         return source if n_instances is None else source.subset(n_instances, seed=seed)
 

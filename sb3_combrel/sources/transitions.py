@@ -97,12 +97,9 @@ class TransitionLog:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
         _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
         kinds = np.float64, np.int64, np.float64, np.float64, np.bool_
-        arrays: dict[str, Any] = {
-            name: np.array(column, dtype=kind)
-            for name, column, kind in zip(Transitions._fields[: len(kinds)], columns, kinds, strict=True)
-        }
-        bounds = {"low": scaling.low, "high": scaling.high}
-        return Transitions(**{**arrays, **bounds, "n_actions": n_actions, "origin": origin, **names})
+        arrays: list[Any] = [np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)]
+        fields: dict[str, Any] = {**dict(zip(Transitions._fields, arrays, strict=False)), **names}
+        return Transitions(**fields, low=scaling.low, high=scaling.high, n_actions=n_actions, origin=origin)
 
 
 def check_observation(observation: Any, when: str) -> None:
