@@ -38,12 +38,7 @@ class EpisodeMemory:
         return self._n_loops % len(ORDER)
 
     def note(self, cell: Hashable, value: float, reward: float, gamma: float) -> None:
-        """Note a step that is about to be made.
-
-        :param cell: where (see :func:`small_cell`)
-        :param value: Q of the chosen action
-        :param reward: what the model predicts of it
-        """
+        """Note a step that is about to be made: its small cell, Q of the action, and the reward that the model predicts."""
         visits, before = self._seen.get(cell, (0, (value, self._expected, self._at_stake)))
         self._seen[cell] = visits + 1, before
         if visits >= MAX_VISITS and (self.attempt > 0 or self._no_progress(value, *before)):
@@ -65,10 +60,7 @@ def manner(memory: EpisodeMemory | None, is_bounded: bool) -> int:
 
 
 def memories(state: Sequence[Any] | None, episode_start: np.ndarray | None, n: int) -> list[EpisodeMemory]:
-    """Read the memories of ``n`` episodes from what ``predict`` returned as its state; new ones where an episode begins.
-
-    :raises ValueError: if ``state`` is something else
-    """
+    """Memories of ``n`` episodes from what ``predict`` returned, new where one begins; a ValueError if it did not."""
     if state is None:
         return [EpisodeMemory() for _ in range(n)]
     given = list(state[0]) if len(state) == 1 else []

@@ -18,8 +18,6 @@ class ProgressWatch:
       ``max_value`` of what is unknown, and nothing draws the agent to the unknown.
     - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time: nothing that
       exploration reaches makes a difference.
-
-    :param tolerance: what is too small to matter for values
     """
 
     def __init__(self, max_value: float, gamma: float, tolerance: float):

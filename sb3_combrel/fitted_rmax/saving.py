@@ -43,10 +43,7 @@ class SavedAlgorithm(BaseAlgorithm):
     _generator_state: dict[str, Any] | None
 
     def save(
-        self,
-        path: str | Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
+        self, path: str | Path | io.BufferedIOBase, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
     ) -> None:
         """
         Save all attributes of the object and the model's parameters in a zip-file, which is written completely or not at all.

@@ -42,11 +42,7 @@ def refuse_normalized_observations(env: VecEnv) -> None:
 
 
 def true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Where each step led before environments reset themselves, and whether that was a terminal state, which a time limit is not.
-
-    :param new_obs: observations after the step, those of the next episode where one is done
-    """
+    """Where each step led before environments reset themselves, and whether that was terminal, which a time limit is not."""
     next_obs, terminated = np.array(new_obs), np.array(dones, dtype=bool)
     for e in np.flatnonzero(dones):
         next_obs[e] = infos[e]["terminal_observation"]

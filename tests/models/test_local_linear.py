@@ -31,7 +31,7 @@ problems = st.tuples(
     st.sampled_from(SMALL_GRIDS),
     st.sampled_from(LINEAR_KERNELS),
     st.integers(0, 10**6),
-    st.integers(1, 25),
+    st.integers(1, 16),
     st.sampled_from([0.3, 1.0, 4.0]),
 )
 # What a prior claims, by and by; without any there is no prior.

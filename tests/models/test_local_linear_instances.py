@@ -30,12 +30,12 @@ def assert_same_as_definition(model, naive):
     return assert_same_fits(model, naive)
 
 
-@settings(deadline=None, derandomize=True, max_examples=6)
+@settings(deadline=None, derandomize=True, max_examples=5)
 @given(
     st.sampled_from(SMALL_GRIDS),
     st.sampled_from(LINEAR_KERNELS),
     st.integers(0, 10**6),
-    st.integers(1, 12),
+    st.integers(1, 8),
     st.sampled_from([0.3, 1.0]),
 )
 def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_everywhere(
@@ -43,7 +43,7 @@ def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_eve
 ):
     model, naive = linear_model_and_definition(grid, kernel, max_instances=max_instances, threshold=threshold)
     expected = NaiveReplacement(naive, max_instances)
-    for transition in random_transitions(seed, len(grid[0]), 4 * max_instances + 10):
+    for transition in random_transitions(seed, len(grid[0]), 3 * max_instances + 8):
         learn_linear(model, expected, [transition])
         np.testing.assert_array_equal(model.known.reshape(N_ACTIONS, -1), naive.known)
         np.testing.assert_array_equal(model.mdp.arrays.modelled, model.known)

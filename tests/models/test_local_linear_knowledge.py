@@ -51,7 +51,7 @@ def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outc
     model, naive = linear_model_and_definition(GRID, KERNEL, threshold=threshold, max_instances=max_instances)
     learner = naive if max_instances is None else NaiveReplacement(naive, max_instances)
     highest = 1.0
-    for transition in [*uninformative(2, 200), outcome_at(0.5, *outcome), *uninformative(3, 40)]:
+    for transition in [*uninformative(2, 120), outcome_at(0.5, *outcome), *uninformative(3, 20)]:
         learn_linear(model, learner, [transition])
         assert_same_knowledge(model, naive)
         highest = max(highest, naive.narrowing)
