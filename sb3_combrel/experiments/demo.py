@@ -122,6 +122,8 @@ def run_demo(
         for name in OUTPUTS:
             path = output / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        # By this folder the next line knows it as one of results, whatever else is in it.
+        (output / FOLDER).mkdir()
     prepare_folder(output)
     source = load_or_learn(output / SOURCE, mountain_car.learn_source, console)
     learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
