@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rich.console import Console
@@ -151,7 +151,7 @@ def transfer_of(method: str, domain: Domain, setting: Setting, sources: Sources,
         TIMBREL_RANDOM: lambda: of_set("random"),
         ONE_RANDOM: lambda: of_set("random") if with_prior else one_random(),
         TIMBREL_FREQUENT: lambda: timbrel(sources.frequent),
-        ORACLE: lambda: timbrel(best_mappings(own, sources.target, all_mappings())),
+        ORACLE: lambda: timbrel(best_mappings(own, cast(SourceInstances, sources.target), all_mappings())),
         UNRELATED: lambda: combrel(sources.unrelated, any_source),
         NO_TRANSFER_BEST: lambda: None,
     }
