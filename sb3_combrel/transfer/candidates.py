@@ -26,8 +26,7 @@ MAX_WHOLE_MAPPINGS = 20_000
 
 
 class Candidate(NamedTuple):
-    """
-    What a candidate stands for.
+    """What a candidate stands for.
 
     :param target_action: number of the target action; ``source_action``: name of what it is mapped to
     :param state_mapping: the pairs of target and source variables, as text
@@ -41,8 +40,7 @@ class Candidate(NamedTuple):
 
 
 class MappedVariables(NamedTuple):
-    """
-    What a candidate makes of each target variable under its target action, in numbers; -1 for no source variable.
+    """What a candidate makes of each target variable under its target action, in numbers; -1 for no source variable.
 
     :param source: number of the source task, int64, shape (n_target_variables,)
     :param variable: variable of that source; ``action``: action of it that moves the variable; int64, same shape
@@ -63,42 +61,31 @@ class MappedVariables(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Where a candidate comes from: numbers of source task, target action, state mapping of its set, and its action."""
+    """Where a candidate comes from, in numbers."""
 
     source: int
     target_action: int
-    state_index: int
+    state_index: int  # state mapping of its set
     source_action: int
 
 
 class CandidateArrays(NamedTuple):
-    """
-    The candidates of all target actions: ``first[a]`` to ``first[a + 1]`` are those of action a.
+    """The candidates of all target actions: ``first[a]`` to ``first[a + 1]`` are those of action a."""
 
-    :param first: int64, shape (n_target_actions + 1,)
-    :param row: int64, shape (n_candidates,): state mapping, a row of the mapping table; ``action``: source action
-    """
-
-    first: np.ndarray
-    row: np.ndarray
-    action: np.ndarray
+    first: np.ndarray  # int64, shape (n_target_actions + 1,)
+    row: np.ndarray  # int64, shape (n_candidates,): state mapping, a row of the mapping table
+    action: np.ndarray  # int64, same shape: source action
 
 
 class MappingTable(NamedTuple):
-    """
-    State mappings for compiled code, one a row.
+    """State mappings for compiled code, one a row; shape (n_state_mappings, n_target_variables)."""
 
-    :param variable: int64, shape (n_state_mappings, n_target_variables): source variable of each target variable, -1 for none
-    :param sign: float64, same shape: -1 where the variable is mirrored
-    """
-
-    variable: np.ndarray
-    sign: np.ndarray
+    variable: np.ndarray  # int64: source variable of each target variable, -1 for none
+    sign: np.ndarray  # float64: -1 where the variable is mirrored
 
 
 class Candidates:
-    """
-    The candidates of each target action: pairs of a state mapping and a source action.
+    """The candidates of each target action: pairs of a state mapping and a source action.
 
     Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
     of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished:
@@ -224,8 +211,7 @@ class Candidates:
 
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
-    """
-    Return the source instances that a user means, as :func:`~sb3_combrel.sources.recipes.find_source`, of one or of several.
+    """Return the instances that a user means (:func:`~sb3_combrel.sources.recipes.find_source`), of one source or of several.
 
     :raises FileNotFoundError: if there is neither a file nor a task of that name
     :raises ValueError: if it is something else, or the task cannot be learned
@@ -238,8 +224,7 @@ def load_sources(source: SourceLike) -> list[SourceInstances]:
 
 
 def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:
-    """
-    Return the set of mappings that a user means for each source, with names.
+    """Return the set of mappings that a user means for each source, with names.
 
     :raises ValueError: if it is factored, or does not fit the tasks
     """
@@ -254,10 +239,8 @@ def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, ta
 
 
 def load_one_source(source: SourceLike, method: str) -> SourceInstances:
-    """
-    Return the source instances of a method that takes those of one task, as :func:`load_sources`.
+    """Return what :func:`load_sources` does, of one source; ``method``: for the message.
 
-    :param method: its name, for the message
     :raises ValueError: also if there are several
     """
     found = load_sources(source)
@@ -267,8 +250,7 @@ def load_one_source(source: SourceLike, method: str) -> SourceInstances:
 
 
 def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
-    """
-    Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
+    """Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
 
     They are sorted along a curve that fills the space. A variable is periodic if it is in all sources that have it.
     """

@@ -27,20 +27,13 @@ ROUNDING = 1e-12
 
 
 class Transitions(NamedTuple):
-    """Experience of one task: the tuples (s, a, r, s') of the paper, one a row.
+    """Experience of one task: the tuples (s, a, r, s') of the paper, one a row."""
 
-    :param state: unit coordinates of that task, shape (n, n_variables)
-    :param action: int64, shape (n,)
-    :param effect: s' - s, shape (n, n_variables)
-    :param reward: raw, shape (n,)
-    :param terminated: bool, shape (n,): whether s' is terminal (not by a time limit)
-    """
-
-    state: Floats
-    action: Ints
-    effect: Floats
-    reward: Floats
-    terminated: Bools
+    state: Floats  #: unit coordinates of that task, shape (n, n_variables)
+    action: Ints  #: int64, shape (n,)
+    effect: Floats  #: s' - s, shape (n, n_variables)
+    reward: Floats  #: raw, shape (n,)
+    terminated: Bools  #: bool, shape (n,): whether s' is terminal (not by a time limit)
 
     def with_action(self, action: int) -> "Transitions":
         """Select the transitions with one action, in their order."""
@@ -49,47 +42,33 @@ class Transitions(NamedTuple):
 
 
 class Bandwidths(NamedTuple):
-    """Bandwidths delta of the kernel :func:`phi`, in squared units of the distances: unit coordinates, rewards raw.
+    """Bandwidths delta of the kernel :func:`phi`, in squared units of the distances: unit coordinates, rewards raw."""
 
-    :param start: delta_sa, of the distance between the states where two transitions start
-    :param outcome: delta_s', of the distance between an outcome and the predicted one
-    :param reward: delta_r, of the difference of two raw rewards
-    """
-
-    start: float
-    outcome: float
-    reward: float
+    start: float  #: delta_sa, of the distance between the states where two transitions start
+    outcome: float  #: delta_s', of the distance between an outcome and the predicted one
+    reward: float  #: delta_r, of the difference of two raw rewards
 
 
 class VirtualSource(NamedTuple):
     """Source instances of one target action, translated to the target task and seen from t target states.
 
-    :param start: where each instance starts, shape (t, m, d). A target variable mapped to None has the value of the state
-        from which it is seen, and so adds nothing to any distance
-    :param effect: s'_j - s_j, shape (m, d); 0 for variables mapped to None: they are predicted not to change
-    :param reward: shape (m,)
-    :param terminated: bool, shape (m,)
+    A target variable mapped to None has the value of the state from which an instance is seen, and so adds nothing to any
+    distance; it is predicted not to change.
     """
 
-    start: Floats
-    effect: Floats
-    reward: Floats
-    terminated: Bools
+    start: Floats  #: where each instance starts, shape (t, m, d)
+    effect: Floats  #: s'_j - s_j, shape (m, d); 0 for variables mapped to None
+    reward: Floats  #: shape (m,)
+    terminated: Bools  #: bool, shape (m,)
 
 
 class TransferRules(NamedTuple):
-    """When the model knows a state-action pair, and which instances count (the parameters of Table 1).
+    """When the model knows a state-action pair, and which instances count (the parameters of Table 1)."""
 
-    :param breadth: b, kernel breadth of transferred instances in unit coordinates
-    :param threshold: sum of weights from which on a pair is known
-    :param min_weight: an instance that weighs less does not count
-    :param min_fraction: nor does one, nearest first, with less than this fraction of the weight before it
-    """
-
-    breadth: float
-    threshold: float
-    min_weight: float
-    min_fraction: float
+    breadth: float  #: b, kernel breadth of transferred instances in unit coordinates
+    threshold: float  #: sum of weights from which on a pair is known
+    min_weight: float  #: an instance that weighs less does not count
+    min_fraction: float  #: nor does one, nearest first, with less than this fraction of the weight before it
 
 
 def phi(x: Floats, delta: float) -> Floats:

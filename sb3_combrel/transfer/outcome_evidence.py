@@ -27,12 +27,7 @@ TRANSITIONS_BEFORE_WARNING = 300
 
 
 def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> None:
-    """
-    Warn that what was transferred predicts the target worse than "no change".
-
-    :param n: transitions that the error is of
-    :param error: mean squared error of the predicted effects, over that of "no change"
-    """
+    """Warn that what was transferred predicts ``n`` transitions worse than "no change", by ``error`` times."""
     names = ", ".join(str(source.origin.get("env", source)) for source in sources)
     warnings.warn(
         f"what was transferred from {names} predicts the target worse than that nothing changes: on {n} "
@@ -42,8 +37,7 @@ def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> N
 
 
 class OutcomeEvidence:
-    """
-    Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
+    """Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
 
     *Ends.* An episode that ends where that is predicted confirms it. An episode that ends where none is predicted contradicts
     it, and so does each visit to where one is predicted that leaves without an end or stays for long. Visits are counted, not
@@ -82,13 +76,7 @@ class OutcomeEvidence:
         self.reward_range = (np.inf, -np.inf)
 
     def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
-        """
-        Take in a transition of the target.
-
-        :param weight: of the source's data there
-        :param end: probability of termination that it predicts
-        :param reward: raw
-        """
+        """Take in a transition; ``weight``: of the source's data there, ``end``: probability of termination it predicts."""
         self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
         has_data = weight >= self.threshold
         if has_data:

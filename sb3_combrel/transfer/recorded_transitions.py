@@ -8,11 +8,7 @@ import numpy as np
 
 
 class RecordedTransitions:
-    """
-    Transitions of the target task in growing arrays, in the order in which they were observed (unit coordinates).
-
-    :param n_variables: number of state variables of the target
-    """
+    """Transitions of the target task in growing arrays, in the order in which they were observed (unit coordinates)."""
 
     #: The arrays, which grow together.
     columns: ClassVar[tuple[str, ...]] = ("states", "effects", "rewards", "actions")
@@ -25,13 +21,7 @@ class RecordedTransitions:
         self.actions = np.empty(64, dtype=np.int64)
 
     def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> int:
-        """
-        Record one transition.
-
-        :param state: shape (n_variables,); ``effect``: next state minus state, same shape
-        :param reward: raw
-        :return: its number
-        """
+        """Record one transition; ``effect``: next state minus state; return its number."""
         if self.n == len(self.rewards):
             for name in self.columns:
                 old = getattr(self, name)
@@ -47,11 +37,7 @@ class RecordedTransitions:
         return np.column_stack([getattr(self, name)[: self.n] for name in self.columns])
 
     def restore(self, rows: np.ndarray, n_actions: int) -> None:
-        """
-        Record what :meth:`rows` returned once more; for a new object.
-
-        :param n_actions: number of target actions; whatever a file says, only these are recorded
-        """
+        """Record what :meth:`rows` returned once more, in a new object, whatever a file says with target actions alone."""
         d = self.states.shape[1]
         for row in rows:
             self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])

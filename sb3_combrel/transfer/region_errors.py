@@ -21,11 +21,7 @@ _N, _ERROR, _EFFECT, _WORSE = range(4)
 
 
 class RegionErrors:
-    """
-    Sums of squared prediction errors and squared effects, by target action and by part of each state variable's range.
-
-    :param task: the target task
-    """
+    """Sums of squared prediction errors and squared effects, by target action and by part of each state variable's range."""
 
     def __init__(self, task: TargetTask):
         self.task = task
@@ -35,11 +31,7 @@ class RegionErrors:
         self._variables = np.arange(task.n_variables)
 
     def note(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray) -> None:
-        """
-        Add a transition whose effect was predicted.
-
-        :param state: unit coordinates; ``effect``: next state minus state; ``predicted``: what was predicted of it
-        """
+        """Add a transition whose effect was ``predicted``; unit coordinates."""
         part = np.clip((state * N_PARTS).astype(np.int64), 0, N_PARTS - 1)
         error, moved = (float((each * each).sum()) for each in (effect - predicted, effect))
         self.sums[action, self._variables, part] += 1.0, error, moved, error > moved

@@ -19,11 +19,9 @@ _TOLERANCE = 0.001
 
 
 def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadth: float, min_weight: float) -> FiniteMDP:
-    """
-    Write what each action, held until the cell is left, does at each point of a grid over the source's states.
+    """Write what each action, held until the cell is left, does at each point of a grid over the source's states.
 
-    :param model: of the source's instances
-    :param breadth: kernel breadth of the model, in unit coordinates of the source; the grid is chosen for it
+    :param model: of the source's instances; ``breadth``: its kernel breadth, for which the grid is chosen
     :param min_weight: weight of the model's prediction from which on a pair has a model; the others are optimistic
     """
     grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)

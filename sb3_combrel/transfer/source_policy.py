@@ -17,8 +17,7 @@ MIN_WEIGHT = 1.0
 
 
 class SourcePolicy:
-    """
-    What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
+    """What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
 
     An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst
     of its neighbours.
@@ -46,12 +45,7 @@ class SourcePolicy:
         self._length = np.ones(n, dtype=np.int64)
 
     def q_values(self, state: np.ndarray) -> np.ndarray:
-        """
-        Compute the action values at a state of the source.
-
-        :param state: unit coordinates of the source, shape (n_variables,)
-        :return: shape (n_actions,); -inf for actions with too few instances near the state
-        """
+        """Action values at a state of the source, unit coordinates; -inf for actions with too few instances near it."""
         found = self.model.predict(np.repeat(state[None], len(self._actions), axis=0), self._actions)
         modelled = found.weight >= MIN_WEIGHT
         successors = (1.0 - found.end)[:, None], found.effect[:, None]

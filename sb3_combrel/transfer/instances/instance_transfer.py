@@ -26,16 +26,11 @@ class MeasureRelevance(Protocol):
 
 
 class InstanceTransfer:
-    """
-    Transfers source instances through mappings: a selector chooses the mappings, a translator the instances.
+    """Transfers source instances through mappings: a selector chooses the mappings, a translator the instances.
 
-    Methods of the same name mean what they do of :class:`~sb3_combrel.transfer.base.Transfer` and of
-    :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
+    Methods of the same name mean what they do of ``Transfer`` and of ``MappingTransfer``.
 
-    :param selector: it holds the candidates, the target task and the recorded transitions
-    :param translator: of the candidates' instances
-    :param breadth_decay: factor on the translator's breadth whenever the target's own transitions have contradicted what was
-        transferred (see :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`)
+    :param breadth_decay: factor on the translator's breadth whenever the target has contradicted what was transferred
     :param measure_relevance: used where the translator's instances come in the order of their relevance
     """
 
@@ -108,11 +103,7 @@ class InstanceTransfer:
                 self._renew_relevance(n_used)
 
     def end_episode(self, truncated: bool) -> None:
-        """
-        Narrow the kernel after an episode that reached its time limit, if the target has contradicted what was transferred.
-
-        Where wrong instances reach the threshold everywhere, nothing would ever be explored.
-        """
+        """Narrow the kernel if the target has contradicted what was transferred: else nothing would ever be explored."""
         if self.check.end_episode(truncated) and self.breadth_decay < 1.0:
             self.translator.set_breadth(self.translator.rules.breadth * self.breadth_decay)
             self.all_changed = True

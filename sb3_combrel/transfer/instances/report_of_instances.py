@@ -12,13 +12,7 @@ from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_
 
 
 def report_of_instances(method: str, transfer: InstanceTransfer, statistics: Mapping[str, float]) -> TransferReport:
-    """
-    Report what was transferred as instances.
-
-    :param method: the method with its arguments, as text
-    :param transfer: after one step at least
-    :param statistics: the method's figures of the log, by name
-    """
+    """Report what was transferred as instances; ``method``: with its arguments; ``statistics``: its figures of the log."""
     return TransferReport(
         method=method,
         use="instances",

@@ -11,10 +11,8 @@ from sb3_combrel.transfer.instances.selectors import PooledSelector, SelectorPar
 
 
 class TaskComplianceSelector(PooledSelector):
-    """
-    Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
+    """Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
 
-    :param bandwidths: of compliance
     :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
     :param max_transitions: how many are recorded
     """
@@ -37,11 +35,9 @@ class TaskComplianceSelector(PooledSelector):
         self.sums[:, int(self.transitions.actions[i])] += self._table.values
 
     def task_compliance(self, source: int, mapping: InterTaskMapping) -> float:
-        """
-        Return the compliance of a virtual source task, Lambda_X of Eq. 6; 0 before the first transition.
+        """Return the compliance Lambda_X (Eq. 6) of the virtual source task of a mapping to source number ``source``.
 
-        :param source: number of the source
-        :param mapping: from the target to it
+        :return: 0 before the first transition
         :raises ValueError: if the set has no such state mapping
         """
         sets, sources = self.candidates.sets, self.candidates.sources

@@ -19,12 +19,7 @@ Moves = Sequence[tuple[int, int]]
 
 
 class PriorCandidates:
-    """
-    The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up.
-
-    :param copies: the copies that can be chosen
-    :param task: the target task
-    """
+    """The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up."""
 
     def __init__(self, copies: Copies, task: TargetTask):
         self.copies = copies

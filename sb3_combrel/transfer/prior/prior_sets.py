@@ -48,8 +48,7 @@ def make_prior(
     max_transitions: int,
     transfer_terminals: bool,
 ) -> SourcePrior:
-    """
-    Make the prior of a target task.
+    """Make the prior of a target task.
 
     :param breadth: kernel breadth of the source's model, in unit coordinates of the source
     :param given: ``mappings`` is one mapping, or one for each target action, and is used as it is
