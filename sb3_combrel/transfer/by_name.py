@@ -59,11 +59,9 @@ def _own_methods() -> dict[str, type[Transfer]]:
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
-    """Describe a transfer object as plain data, for a file; :func:`restore_transfer` makes it again.
+    """Describe a transfer object, bound or not, as plain data for a file; :func:`restore_transfer` makes it again.
 
     Of an object that plain data cannot describe only the name is kept, with a warning.
-
-    :param transfer: the object, as it was before it was bound or later
     """
     if transfer is None:
         return None

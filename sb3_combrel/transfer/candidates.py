@@ -26,38 +26,34 @@ MAX_WHOLE_MAPPINGS = 20_000
 
 
 class Candidate(NamedTuple):
-    """What a candidate stands for.
+    """What a candidate stands for, by name."""
 
-    :param target_action: number of the target action; ``source_action``: name of what it is mapped to
-    :param state_mapping: the pairs of target and source variables, as text
-    :param action_mapping: names of the source actions of all target actions, where whole mappings are candidates; else ()
-    """
-
-    target_action: int
-    source_action: str
-    state_mapping: str
-    action_mapping: tuple[str, ...] = ()
+    target_action: int  #: its number
+    source_action: str  #: what it is mapped to
+    state_mapping: str  #: the pairs of target and source variables, as text
+    action_mapping: tuple[str, ...] = ()  #: source actions of all target actions, where whole mappings are candidates
 
 
 class MappedVariables(NamedTuple):
-    """What a candidate makes of each target variable under its target action, in numbers; -1 for no source variable.
-
-    :param source: number of the source task, int64, shape (n_target_variables,)
-    :param variable: variable of that source; ``action``: action of it that moves the variable; int64, same shape
-    :param sign: -1 for a mirrored variable, 1 for others, 0 for no source variable, int64, same shape
-    """
+    """What a candidate makes of each target variable under its target action; int64, shape (n_target_variables,)."""
 
     target_action: int
-    source: np.ndarray
-    variable: np.ndarray
-    sign: np.ndarray
-    action: np.ndarray
+    source: np.ndarray  #: number of the source task; -1 for no source variable
+    variable: np.ndarray  #: variable of that source; -1 for none
+    sign: np.ndarray  #: -1 for a mirrored variable, 1 for others, 0 for no source variable
+    action: np.ndarray  #: source action that moves the variable; -1 for none
 
     @classmethod
     def none(cls, target_action: int, n_variables: int) -> MappedVariables:
         """No variable is mapped."""
         none = np.full(n_variables, -1, dtype=np.int64)
         return cls(target_action, none, none.copy(), np.zeros_like(none), none.copy())
+
+    def map(self, source: int, variable: np.ndarray, sign: np.ndarray, action: int) -> None:
+        """Write what the variables with a source variable (not -1) are mapped to, and the source action that moves them."""
+        mapped = variable >= 0
+        self.source[mapped], self.action[mapped] = source, action
+        self.variable[mapped], self.sign[mapped] = variable[mapped], np.where(sign[mapped] < 0, -1, 1)
 
 
 class Origin(NamedTuple):
@@ -88,13 +84,9 @@ class Candidates:
     """The candidates of each target action: pairs of a state mapping and a source action.
 
     Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
-    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished:
-    then each is a candidate of every action, in the same order.
+    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished
+    (``whole``): then each is a candidate of every action, in the same order.
 
-    :param source: instances, a path to them, or a list of several
-    :param mappings: mappings from the target to the source (see ``resolve``)
-    :param task: the target task
-    :param whole: whether whole mappings are the candidates
     :raises ValueError: if source or mappings do not fit the target, or if there are too many whole mappings
     """
 
@@ -176,18 +168,17 @@ class Candidates:
         mappings = self.sets[number]
         whole = repr(mappings[mappings.find(state_index, action, source_action)])
         variables = whole[whole.index("(") + 1 : whole.index(";")]
-        actions = tuple(self._whole_action_names(candidate)) if self.whole else ()
-        return Candidate(action, self.sources[number].action_names[source_action], variables, actions)
+        names, whole_actions = self.sources[number].action_names, []
+        if self.whole:
+            place = candidate - self.arrays.first[action] - sum(map(len, self.sets[:number]))
+            whole_actions = self._action_mappings[number][1][place]
+        return Candidate(action, names[source_action], variables, tuple(names[each] for each in whole_actions))
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""
         origin, row = self.origins[candidate], self.arrays.row[candidate]
         found = MappedVariables.none(origin.target_action, self.task.n_variables)
-        mapped = self.table.variable[row] >= 0
-        found.source[mapped] = origin.source
-        found.variable[mapped] = self.table.variable[row][mapped]
-        found.sign[mapped] = np.where(self.table.sign[row][mapped] < 0, -1, 1)
-        found.action[mapped] = origin.source_action
+        found.map(origin.source, self.table.variable[row], self.table.sign[row], origin.source_action)
         return found
 
     def describe(self, candidate: int) -> str:
@@ -197,13 +188,6 @@ class Candidates:
         if self.whole:
             words += f", of the actions {', '.join(parts.action_mapping)}"
         return words if len(self.sources) == 1 else f"source {self.origins[candidate].source}: {words}"
-
-    def _whole_action_names(self, candidate: int) -> list[str]:
-        """Return the names of the source actions of all target actions, in their order."""
-        origin = self.origins[candidate]
-        place = candidate - self.arrays.first[origin.target_action] - sum(map(len, self.sets[: origin.source]))
-        names = self.sources[origin.source].action_names
-        return [names[action] for action in self._action_mappings[origin.source][1][place]]
 
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions of all sources, each name once."""

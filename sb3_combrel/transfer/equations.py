@@ -97,11 +97,7 @@ def virtual_source(source: Transitions, mapping: InterTaskMapping, action: int, 
 
 
 def start_distances(states: Floats, virtual: VirtualSource) -> Floats:
-    """Measure d(<s_i, a_i>, <s_j, a_j>) between transitions with the same action.
-
-    :param states: target states from which ``virtual`` is seen, shape (t, d)
-    :return: Euclidean distances over the mapped variables, shape (t, m)
-    """
+    """Measure d(<s_i, a_i>, <s_j, a_j>) of transitions with the same action, over the mapped variables, shape (t, m)."""
     return np.linalg.norm(states[:, None, :] - virtual.start, axis=2)
 
 
@@ -119,24 +115,17 @@ def normalized_weights(distances: Floats, delta: float, axis: int = 1) -> Floats
 
 
 def transition_compliances(weights: Floats, effects: Floats, virtual: VirtualSource, delta: float) -> Floats:
-    """Compute lambda^P_ij = w_ij phi(d(s'_i, s_i + (s'_j - s_j))), Eq. 2.
+    """Compute lambda^P_ij = w_ij phi(d(s'_i, s_i + (s'_j - s_j))), Eq. 2, shape (t, m).
 
     The distance between the outcome and the predicted one is that between the two effects.
 
-    :param weights: w_ij, shape (t, m)
     :param effects: s'_i - s_i of the target transitions, shape (t, d)
-    :return: shape (t, m)
     """
     return weights * phi(np.linalg.norm(effects[:, None, :] - virtual.effect, axis=2), delta)
 
 
 def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource, delta: float) -> Floats:
-    """Compute ``lambda^R_ij = w_ij phi(|r_i - r_j|)``, the formula below Eq. 2.
-
-    :param weights: w_ij, shape (t, m)
-    :param rewards: r_i of the target transitions, shape (t,)
-    :return: shape (t, m)
-    """
+    """Compute ``lambda^R_ij = w_ij phi(|r_i - r_j|)``, the formula below Eq. 2, shape (t, m); ``rewards``: r_i, shape (t,)."""
     return weights * phi(np.abs(rewards[:, None] - virtual.reward), delta)
 
 
@@ -236,10 +225,7 @@ def near_relevances(with_target: Floats, evidence: Floats) -> Floats:
 def instance_compliances(
     source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths
 ) -> tuple[Floats, Floats, Floats]:
-    """Compute lambda_{T,sigma_j} of the source instances of one target action, for Eq. 7.
-
-    :return: distances d_ij and weights w_ji, shape (t, m), and the compliances, shape (m,)
-    """
+    """Compute d_ij and w_ji, shape (t, m), and lambda_{T,sigma_j}, shape (m,), of one target action's instances, for Eq. 7."""
     states, _, effects, rewards, _ = transitions.with_action(action)
     virtual = virtual_source(source, mapping, action, states)
     distances = start_distances(states, virtual)

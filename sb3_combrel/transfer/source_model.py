@@ -128,6 +128,7 @@ class SourceModel:
         outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
     ):
         n_actions, _, d = instances.state.shape
+        self.n_variables = d
         self.instances = instances
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
@@ -153,11 +154,6 @@ class SourceModel:
         )
         #: For compiled code, see :func:`source_arrays`.
         self.plain = tuple(instances), effect_range, tuple(self.kernel), tuple(near)
-
-    @property
-    def n_variables(self) -> int:
-        """Number of state variables of the source."""
-        return int(self.instances.state.shape[2])
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> SourcePredictions:
         """Predict n states and actions of the source; unit coordinates of it, and int64."""

@@ -151,21 +151,17 @@ class ComplianceSelector(Selector):
         return changed
 
     def _use(self, i: int) -> None:
-        """Make transition ``i`` a neighbour for its action, or for all."""
+        """Make transition ``i`` a neighbour for its action, or for all, also of sample states."""
         if i >= len(self._cache.required):
             self._set_cache(self._cache.grown())
         for action in range(self.task.n_actions) if self.options.all_actions else [int(self.transitions.actions[i])]:
-            self._use_for(i, action)
-
-    def _use_for(self, i: int, action: int) -> None:
-        """List transition ``i`` under ``action``, and among the nearest of sample states."""
-        n = self._n_listed[action]
-        if n == self._listed.shape[1]:
-            self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)
-        self._listed[action, n] = i
-        self._n_listed[action] += 1
-        near, distance, due = self._near[action], self._distance[action], self._due[action]
-        _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
+            n = self._n_listed[action]
+            if n == self._listed.shape[1]:
+                self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)
+            self._listed[action, n] = i
+            self._n_listed[action] += 1
+            near, distance, due = self._near[action], self._distance[action], self._due[action]
+            _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
 
     def _renew(self, pairs: np.ndarray) -> np.ndarray:
         """Renew the choices of pairs of the sample; return those that changed."""

@@ -29,9 +29,7 @@ class ComplianceCache(NamedTuple):
     def grown(self) -> "ComplianceCache":
         """Return a copy of twice the size."""
         return self._replace(
-            compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
-            required=np.concatenate([self.required, np.empty_like(self.required)]),
-            measured=np.concatenate([self.measured, np.zeros_like(self.measured)]),
+            **{name: np.concatenate([old, np.zeros_like(old)]) for name, old in self._asdict().items() if name != "total"}
         )
 
 

@@ -1,7 +1,5 @@
 """Relevance: which source instances are to be transferred first (Eqs. 4 and 7, and one of this package)."""
 
-from functools import partial
-
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inner
@@ -40,9 +38,6 @@ def renew_relevance(
             _near_relevance.call(target, candidates.instances, source_action, mapping, of_row, weight, evidence, values[c])
         else:
             _relevance.call(target, candidates.instances, source_action, mapping, of_row, mu, weight, values[c])
-
-
-renew_near_relevance = partial(renew_relevance, mu=None)
 
 
 @compiled

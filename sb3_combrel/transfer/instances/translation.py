@@ -56,20 +56,6 @@ class TranslationScratch(NamedTuple):
     full: np.ndarray  # bool, shape (1,): an instance that was needed did not fit
     enters: np.ndarray  # float64, shape (1,): an instance of no higher rank than this is not needed
 
-    @classmethod
-    def empty(cls, max_instances: int, n_variables: int, n_blocks: int) -> TranslationScratch:
-        """Make work space for ``max_instances`` a state."""
-        return cls(
-            number=np.empty((max_instances + 1, 2), dtype=np.int64),
-            value=np.empty((max_instances + 1, 2)),
-            variable=np.empty(n_variables, dtype=np.int64),
-            at=np.empty(n_variables),
-            periodic=np.zeros(n_variables, dtype=np.bool_),
-            gap=np.empty(n_blocks),
-            full=np.zeros(1, dtype=np.bool_),
-            enters=np.zeros(1),
-        )
-
 
 class TranslationArrays(NamedTuple):
     """All that the translator's loops read, and their work space."""
@@ -297,24 +283,25 @@ class Translator:
     def _set_arrays(self, arrays: TranslationArrays) -> None:
         # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
         self._arrays, self._plain_arrays = arrays, arrays.plain()
+        #: When and how instances are translated; and their relevance, which is written to from outside.
+        self.rules, self.relevance = arrays.rules, arrays.relevance
 
     def _make_scratch(self) -> TranslationScratch:
-        return TranslationScratch.empty(self._max_instances, self._n_variables, self._n_blocks)
+        return TranslationScratch(
+            number=np.empty((self._max_instances + 1, 2), dtype=np.int64),
+            value=np.empty((self._max_instances + 1, 2)),
+            variable=np.empty(self._n_variables, dtype=np.int64),
+            at=np.empty(self._n_variables),
+            periodic=np.zeros(self._n_variables, dtype=np.bool_),
+            gap=np.empty(self._n_blocks),
+            full=np.zeros(1, dtype=np.bool_),
+            enters=np.zeros(1),
+        )
 
     def _make_room(self, n: int) -> None:
         self._room = n
         self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
         self._plain_transferred = tuple(self._transferred)
-
-    @property
-    def rules(self) -> TranslationRules:
-        """When and how instances are translated."""
-        return self._arrays.rules
-
-    @property
-    def relevance(self) -> np.ndarray:
-        """See ``TranslationArrays``; to be written to."""
-        return self._arrays.relevance
 
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""

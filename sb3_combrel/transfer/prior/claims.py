@@ -7,7 +7,7 @@ import numpy as np
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.outcome_evidence import GOES_ON, OutcomeEvidence
-from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # What is predicted through, and what is claimed, is renewed first after so many transitions of the target, and whenever this
 # many times as much has been observed as at the last time.
@@ -73,11 +73,8 @@ class Claims:
         self._noted = self._believed()
 
     def _believed(self) -> tuple[bool, bool]:
-        return self.evidence.doubted, self._ends_believed
-
-    @property
-    def _ends_believed(self) -> bool:
-        return self.transfer_terminals and self.evidence.ends_believed
+        """Whether ends and rewards are doubted, and whether ends are believed."""
+        return self.evidence.doubted, self.transfer_terminals and self.evidence.ends_believed
 
     def renew(self, unexplained: np.ndarray, n_covered: np.ndarray, predicted: np.ndarray | bool = True) -> bool:
         """Renew trust and explains, see ``part_explained``; whether either changed. ``predicted``: which effects count."""
@@ -99,10 +96,11 @@ class Claims:
 
     def weight(self, end: np.ndarray, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Return the weight that is claimed; ``end``: predicted termination, ``coverage``: weight of the source's data."""
-        if self.evidence.doubted:
+        doubted, ends_believed = self._believed()
+        if doubted:
             return np.zeros(len(actions))
         weight = CLAIMED_WEIGHT * coverage * self.trust[actions]
-        if not self._ends_believed:
+        if not ends_believed:
             weight[end >= GOES_ON] = 0.0
         return weight
 
@@ -114,7 +112,7 @@ class Claims:
             effect *= self.explains[actions]
         return PriorPredictions(effect, reward, np.where(end < GOES_ON, 0.0, end), self.weight(end, coverage, actions))
 
-    def replay(self, seen: RecordedEpisodes, reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> None:
+    def replay(self, seen: RecordedTransitions, reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> None:
         """Count anew what confirms and contradicts the ends and rewards predicted now of transitions ``seen``."""
         self.evidence.forget()
         for i, ended in enumerate(seen.ended[: seen.n].tolist()):

@@ -79,16 +79,13 @@ class Copies:
             n_actions=np.array([sources[s].n_actions for s in source], dtype=np.int64),
         )
         self._plain_table = tuple(self.table)
+        #: Number of actions of the source that has most.
+        self.most_actions = int(self.table.n_actions.max())
         d = state.shape[1]
         self._scratch = tuple(CopyScratch(np.empty(n_variables), np.empty(n_variables), np.empty(d), np.empty(d)))
 
     def __len__(self) -> int:
         return len(self.source)
-
-    @property
-    def most_actions(self) -> int:
-        """Number of actions of the source that has most."""
-        return int(self.table.n_actions.max())
 
     def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums, whole: bool) -> None:
         """Add a target transition to the sums; ``whole``: variables that a copy does not have count as well, as staying."""

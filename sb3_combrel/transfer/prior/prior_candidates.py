@@ -61,11 +61,7 @@ class PriorCandidates:
         action, moves = self._made_of(candidate)
         found = MappedVariables.none(action, self.task.n_variables)
         for copy, used in moves:
-            has = self.copies.state[copy] >= 0
-            found.source[has] = self.copies.source[copy]
-            found.variable[has] = self.copies.state[copy, has]
-            found.sign[has] = np.where(self.copies.sign[copy, has] < 0, -1, 1)
-            found.action[has] = used
+            found.map(self.copies.source[copy], self.copies.state[copy], self.copies.sign[copy], used)
         return found
 
     def describe(self, candidate: int) -> str:

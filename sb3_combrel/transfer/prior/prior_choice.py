@@ -76,10 +76,8 @@ def choose_factored(copies: Copies, sums: CopySums) -> Choice:
 def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) -> list[int]:
     """Find the disjoint copies whose scores, with those of the variables in none, add up to most; by their first variable.
 
-    By dynamic programming over the subsets of the variables that are divided already.
-
-    :param members: bool, shape (n_copies, n_variables): the variables of each copy
-    :param scores: shape (n_copies,); ``stays``: shape (n_variables,): of each variable in no copy
+    By dynamic programming over the subsets of the variables that are divided already. ``members``: the variables of each copy,
+    bool, shape (n_copies, n_variables); ``scores``: of each copy; ``stays``: of each variable in no copy.
     """
     n_variables = members.shape[1]
     masks = members @ (1 << np.arange(n_variables))
@@ -118,10 +116,10 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
     source actions, each copy's and each target action's on its own.
     """
     members = copies.state >= 0
-    ways = _count_divisions(members)
     n_variables = members.shape[1]
-    taken, chosen = 0, []
     masks = (members @ (1 << np.arange(n_variables))).tolist()
+    ways = _count_divisions(masks, n_variables)
+    taken, chosen = 0, []
     while taken < (1 << n_variables) - 1:
         options = _options(taken, masks, ways)
         counts = np.array([n for *_, n in options], dtype=np.float64)
@@ -138,10 +136,8 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
 Ways = dict[int, tuple[int, int, int]]
 
 
-def _count_divisions(members: np.ndarray) -> Ways:
+def _count_divisions(masks: list[int], n_variables: int) -> Ways:
     """Count how many ways there are to divide the remaining variables, with as few left out and in as few copies as can be."""
-    n_variables = members.shape[1]
-    masks = (members @ (1 << np.arange(n_variables))).tolist()
     full = (1 << n_variables) - 1
     ways: Ways = {full: (0, 0, 1)}
     for taken in range(full - 1, -1, -1):

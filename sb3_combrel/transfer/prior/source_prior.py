@@ -9,15 +9,14 @@ import numpy as np
 
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, warn_of_error
+from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, RegionErrors, warn_of_error
 from sb3_combrel.transfer.prior.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.value_bound import ValueBound
-from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
-from sb3_combrel.transfer.region_errors import RegionErrors
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
 SMALLEST_MOVE = 0.005
@@ -72,7 +71,7 @@ class SourcePrior:
         self.errors = RegionErrors(task)
         #: Transitions whose outcome the source claimed to know.
         self.n_claimed = 0
-        self.transitions = RecordedEpisodes(task.n_variables)
+        self.transitions = RecordedTransitions(task.n_variables)
         self._renewal_due = float(first_renewal)
         self._all_measured = max(ALL_MEASURED, first_renewal)
         self._warned = False

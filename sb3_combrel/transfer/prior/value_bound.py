@@ -9,8 +9,8 @@ from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.prior.copies import Copies, distinct_rows
 from sb3_combrel.transfer.prior.prior_choice import Choice
-from sb3_combrel.transfer.source_mdp import MAX_STEPS, planning_tolerance, source_mdp
 from sb3_combrel.transfer.source_model import SourceModel
+from sb3_combrel.transfer.source_policy import MAX_STEPS, planning_tolerance, source_mdp
 
 MAX_SWEEPS = 300
 
