@@ -30,37 +30,22 @@ FOR_THE_ALGORITHM = frozenset(
 
 @dataclass(frozen=True)
 class TargetTask:
-    """
-    The target task, as a transfer method sees it.
+    """The target task, as a transfer method sees it."""
 
-    :param scaling: raw <-> unit coordinates
-    :param n_actions: number of actions
-    :param sample_states: the finite sample of states that is planned with, unit coordinates, shape (n_points, n_variables)
-    :param exploration_threshold: weight that own and transferred instances of a state-action pair must reach together. It
-        stays where the model lowers its own: time limits, which are evidence against a source, must not extend its reach
-    :param min_weight: instances with less weight do not count
-    :param min_fraction: nearest first, an instance counts while it has this fraction of the weight before it
-    :param state_names: names of the state variables, for display
-    :param action_names: names of the actions, for display
-    :param periodic: which state variables are periodic, so that 0 and 1 are the same unit coordinate: one bool for each,
-        None for none
-    :param takes_prior: whether the target's model takes a prior (``use="prior"``)
-    :param gamma: discount factor
-    :param max_value: upper bound on the return from any state
-    """
-
-    scaling: StateScaling
+    scaling: StateScaling  #: raw <-> unit coordinates
     n_actions: int
-    sample_states: np.ndarray
+    sample_states: np.ndarray  #: states that are planned with, unit coordinates, shape (n_points, n_variables)
+    #: Weight that own and transferred instances of a state-action pair must reach together. It stays where the model lowers
+    #: its own: time limits, which are evidence against a source, must not extend its reach.
     exploration_threshold: float
-    min_weight: float
-    min_fraction: float
+    min_weight: float  #: instances with less weight do not count
+    min_fraction: float  #: nearest first, an instance counts while it has this fraction of the weight before it
     state_names: tuple[str, ...]
     action_names: tuple[str, ...]
-    periodic: Sequence[bool] | None = None
-    takes_prior: bool = False
-    gamma: float = 1.0
-    max_value: float = 0.0
+    periodic: Sequence[bool] | None = None  #: which state variables wrap, 0 and 1 being the same; None: none
+    takes_prior: bool = False  #: whether the target's model takes a prior (``use="prior"``)
+    gamma: float = 1.0  #: discount factor
+    max_value: float = 0.0  #: upper bound on the return from any state
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "periodic", periodic_flags(self.periodic, self.n_variables))
@@ -72,8 +57,7 @@ class TargetTask:
 
 
 class Transfer(ABC):
-    """
-    A transfer method: it observes transitions of the target task, and returns instances for states and actions of it.
+    """A transfer method: it observes transitions of the target task, and returns instances for states and actions of it.
 
     It is asked where the target's own instances do not suffice. A transfer object given to an algorithm is a description: the
     algorithm binds a copy of it to its task. Only :meth:`transferred` and :meth:`observe` have to be written. States and
@@ -92,8 +76,7 @@ class Transfer(ABC):
     environment: int = 0
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
-        """
-        Prepare for a target task; what was learned of another one is forgotten.
+        """Prepare for a target task; what was learned of another one is forgotten.
 
         :param task: the target task
         :param rng: generator of all random numbers that the method draws; predictions must draw none
@@ -104,8 +87,7 @@ class Transfer(ABC):
 
     @abstractmethod
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        """
-        Return instances for states and actions.
+        """Return instances for states and actions.
 
         :param states: unit coordinates, shape (n, n_variables)
         :param actions: int64, shape (n,)
@@ -115,8 +97,7 @@ class Transfer(ABC):
         """
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        """
-        Return instances for states of the finite sample, as :meth:`transferred`; a method may store results by state.
+        """As :meth:`transferred`, for states of the finite sample; a method may store results by state.
 
         :param points: rows of ``task.sample_states``, int64, shape (n,)
         """
@@ -129,8 +110,7 @@ class Transfer(ABC):
         return self.use != "actions"
 
     def action(self, state: np.ndarray) -> int | None:
-        """
-        Decide an action for the agent while it learns, or leave it to the agent.
+        """Decide an action for the agent while it learns, or leave it to the agent.
 
         Called once for each step of learning, never for predictions, and only of a method that overrides it.
 
@@ -141,8 +121,7 @@ class Transfer(ABC):
 
     @abstractmethod
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
-        """
-        Take in a transition of the target task.
+        """Take in a transition of the target task.
 
         :param state: unit coordinates, shape (n_variables,)
         :param action: from 0 on
@@ -152,15 +131,10 @@ class Transfer(ABC):
         """
 
     def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it
-        """
-        Take in the end of an episode.
-
-        :param truncated: it ended by its time limit, not in a terminal state
-        """
+        """Take in the end of an episode; ``truncated``: by its time limit, not in a terminal state."""
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
-        """
-        Say where the instances may differ from those returned before; called after each transition and each episode.
+        """Say where the instances may differ from those returned before; called after each transition and each episode.
 
         :param known: bool, shape (n_actions, n_points): pairs whose own instances suffice, which may be left out
         :return: True: everywhere; False: nowhere; or bool, shape (n_actions, n_points). By default everywhere
@@ -168,8 +142,7 @@ class Transfer(ABC):
         return True
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        """
-        Predict states and actions of the target; asked only if :attr:`use` is "prior".
+        """Predict states and actions of the target; asked only if :attr:`use` is "prior".
 
         It must depend on nothing but its arguments while :meth:`prior_version` stays the same.
 
@@ -181,16 +154,14 @@ class Transfer(ABC):
         raise NotImplementedError(f'{type(self).__name__} has use="prior", but no method prior(states, actions)')
 
     def prior_version(self) -> int:
-        """
-        Return a number that grows whenever what :meth:`prior` returns may have changed.
+        """Return a number that grows whenever what :meth:`prior` returns may have changed.
 
         All pairs of the sample and all of the target's own instances are then asked for again: not at every step.
         """
         return 0
 
     def value_bound(self) -> np.ndarray | None:
-        """
-        Return an upper bound on the return from each state of the sample, the value of what is not known there.
+        """Return an upper bound on the return from each state of the sample, the value of what is not known there.
 
         Asked only if :attr:`use` is "prior", and again whenever :meth:`prior_version` has grown. If it is too low, the best
         may never be tried (Asmuth, Littman & Zinkov, "Potential-based shaping in model-based RL", AAAI 2008).
@@ -200,8 +171,7 @@ class Transfer(ABC):
         return None
 
     def check_degree(self, degree: int) -> None:
-        """
-        Check that a model of this degree can take what is transferred.
+        """Check that a model of this degree can take what is transferred.
 
         :param degree: 0 for a kernel average, 1 for a local linear model
         :raises ValueError: if it cannot
@@ -213,17 +183,14 @@ class Transfer(ABC):
             )
 
     def note_use(self, transferred: TransferredInstances) -> None:  # noqa: B027 - a method may well ignore it
-        """
-        Take in that the agent acts on the instances last returned by :meth:`transferred`, at one state with every action.
-        """
+        """Take in that the agent acts on what :meth:`transferred` returned last, for one state with every action."""
 
     def lowest_reward(self) -> float:
         """Return the lowest reward among all instances that may be transferred; called once bound."""
         return 0.0
 
     def arguments(self) -> dict[str, Any]:
-        """
-        Return the constructor's arguments that make this object, unbound; from them a saved model is rebuilt.
+        """Return the constructor's arguments that make this object, unbound; from them a saved model is rebuilt.
 
         By default the attributes that bear their names: numbers, text, arrays, source instances, mappings, sets of mappings,
         and sequences and dicts of these. Arrays and tuples come back as lists.
@@ -233,16 +200,14 @@ class Transfer(ABC):
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """
-        Return what was learned since it was bound, float64, to be saved with a model.
+        """Return what was learned since it was bound, float64, to be saved with a model.
 
         Names and shapes stay the same, but for the number of rows of arrays with several axes.
         """
         return {}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:  # noqa: B027 - nothing saved, nothing to restore
-        """
-        Restore what :meth:`get_state` returned; called on an object that was just bound.
+        """Restore what :meth:`get_state` returned; called on an object that was just bound.
 
         Afterwards every pair of the sample is asked for once more: :meth:`changed` need not report this.
         """
@@ -252,8 +217,7 @@ class Transfer(ABC):
         return {}
 
     def report(self) -> TransferReport:
-        """
-        Say what was transferred, as far as the method knows it; by default its arguments and its figures for the logger.
+        """Say what was transferred, as far as the method knows it; by default its arguments and its figures for the logger.
 
         :return: a report to print, with all its figures as fields
         :raises NotBoundError: (a ValueError) if no algorithm uses this object
@@ -262,9 +226,7 @@ class Transfer(ABC):
         return TransferReport(method=repr(self), use=self.use, statistics=self.statistics())
 
     def _check_bound(self, name: str) -> None:
-        """
-        :raises NotBoundError: if results are asked for under ``name``, and the object is a description only
-        """
+        """:raises NotBoundError: if results are asked for under ``name``, and the object is a description only"""
         if self.task is None and not name.startswith("__"):
             what = "" if name.startswith("_") else f" ({name})"
             raise NotBoundError(

@@ -17,8 +17,7 @@ METHODS = f"{PACKAGE}.transfer.methods."
 
 
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
-    """
-    Make a transfer object of the algorithm's own from what the user gave.
+    """Make a transfer object of the algorithm's own from what the user gave.
 
     :param transfer: None; a transfer object, which is copied; a class or its name; or a dict of one entry, from the name to
         the arguments, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``. Methods of this package may go by their
@@ -60,12 +59,9 @@ def _own_methods() -> dict[str, type[Transfer]]:
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
-    """
-    Describe a transfer object as plain data, for a file; :func:`restore_transfer` makes it again.
+    """Describe a transfer object, bound or not, as plain data for a file; :func:`restore_transfer` makes it again.
 
     Of an object that plain data cannot describe only the name is kept, with a warning.
-
-    :param transfer: the object, as it was before it was bound or later
     """
     if transfer is None:
         return None
@@ -83,8 +79,7 @@ def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
 
 
 def restore_transfer(transfer: Any) -> Any:
-    """
-    Make the transfer object that :func:`describe_transfer` described; anything else is returned as it is.
+    """Make the transfer object that :func:`describe_transfer` described; anything else is returned as it is.
 
     A file may come from anyone: nothing is imported, only classes that are defined already are considered.
 

@@ -26,34 +26,22 @@ MAX_WHOLE_MAPPINGS = 20_000
 
 
 class Candidate(NamedTuple):
-    """
-    What a candidate stands for.
+    """What a candidate stands for, by name."""
 
-    :param target_action: number of the target action; ``source_action``: name of what it is mapped to
-    :param state_mapping: the pairs of target and source variables, as text
-    :param action_mapping: names of the source actions of all target actions, where whole mappings are candidates; else ()
-    """
-
-    target_action: int
-    source_action: str
-    state_mapping: str
-    action_mapping: tuple[str, ...] = ()
+    target_action: int  #: its number
+    source_action: str  #: what it is mapped to
+    state_mapping: str  #: the pairs of target and source variables, as text
+    action_mapping: tuple[str, ...] = ()  #: source actions of all target actions, where whole mappings are candidates
 
 
 class MappedVariables(NamedTuple):
-    """
-    What a candidate makes of each target variable under its target action, in numbers; -1 for no source variable.
-
-    :param source: number of the source task, int64, shape (n_target_variables,)
-    :param variable: variable of that source; ``action``: action of it that moves the variable; int64, same shape
-    :param sign: -1 for a mirrored variable, 1 for others, 0 for no source variable, int64, same shape
-    """
+    """What a candidate makes of each target variable under its target action; int64, shape (n_target_variables,)."""
 
     target_action: int
-    source: np.ndarray
-    variable: np.ndarray
-    sign: np.ndarray
-    action: np.ndarray
+    source: np.ndarray  #: number of the source task; -1 for no source variable
+    variable: np.ndarray  #: variable of that source; -1 for none
+    sign: np.ndarray  #: -1 for a mirrored variable, 1 for others, 0 for no source variable
+    action: np.ndarray  #: source action that moves the variable; -1 for none
 
     @classmethod
     def none(cls, target_action: int, n_variables: int) -> MappedVariables:
@@ -61,53 +49,44 @@ class MappedVariables(NamedTuple):
         none = np.full(n_variables, -1, dtype=np.int64)
         return cls(target_action, none, none.copy(), np.zeros_like(none), none.copy())
 
+    def map(self, source: int, variable: np.ndarray, sign: np.ndarray, action: int) -> None:
+        """Write what the variables with a source variable (not -1) are mapped to, and the source action that moves them."""
+        mapped = variable >= 0
+        self.source[mapped], self.action[mapped] = source, action
+        self.variable[mapped], self.sign[mapped] = variable[mapped], np.where(sign[mapped] < 0, -1, 1)
+
 
 class Origin(NamedTuple):
-    """Where a candidate comes from: numbers of source task, target action, state mapping of its set, and its action."""
+    """Where a candidate comes from, in numbers."""
 
     source: int
     target_action: int
-    state_index: int
+    state_index: int  # state mapping of its set
     source_action: int
 
 
 class CandidateArrays(NamedTuple):
-    """
-    The candidates of all target actions: ``first[a]`` to ``first[a + 1]`` are those of action a.
+    """The candidates of all target actions: ``first[a]`` to ``first[a + 1]`` are those of action a."""
 
-    :param first: int64, shape (n_target_actions + 1,)
-    :param row: int64, shape (n_candidates,): state mapping, a row of the mapping table; ``action``: source action
-    """
-
-    first: np.ndarray
-    row: np.ndarray
-    action: np.ndarray
+    first: np.ndarray  # int64, shape (n_target_actions + 1,)
+    row: np.ndarray  # int64, shape (n_candidates,): state mapping, a row of the mapping table
+    action: np.ndarray  # int64, same shape: source action
 
 
 class MappingTable(NamedTuple):
-    """
-    State mappings for compiled code, one a row.
+    """State mappings for compiled code, one a row; shape (n_state_mappings, n_target_variables)."""
 
-    :param variable: int64, shape (n_state_mappings, n_target_variables): source variable of each target variable, -1 for none
-    :param sign: float64, same shape: -1 where the variable is mirrored
-    """
-
-    variable: np.ndarray
-    sign: np.ndarray
+    variable: np.ndarray  # int64: source variable of each target variable, -1 for none
+    sign: np.ndarray  # float64: -1 where the variable is mirrored
 
 
 class Candidates:
-    """
-    The candidates of each target action: pairs of a state mapping and a source action.
+    """The candidates of each target action: pairs of a state mapping and a source action.
 
     Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
-    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished:
-    then each is a candidate of every action, in the same order.
+    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished
+    (``whole``): then each is a candidate of every action, in the same order.
 
-    :param source: instances, a path to them, or a list of several
-    :param mappings: mappings from the target to the source (see ``resolve``)
-    :param task: the target task
-    :param whole: whether whole mappings are the candidates
     :raises ValueError: if source or mappings do not fit the target, or if there are too many whole mappings
     """
 
@@ -189,18 +168,17 @@ class Candidates:
         mappings = self.sets[number]
         whole = repr(mappings[mappings.find(state_index, action, source_action)])
         variables = whole[whole.index("(") + 1 : whole.index(";")]
-        actions = tuple(self._whole_action_names(candidate)) if self.whole else ()
-        return Candidate(action, self.sources[number].action_names[source_action], variables, actions)
+        names, whole_actions = self.sources[number].action_names, []
+        if self.whole:
+            place = candidate - self.arrays.first[action] - sum(map(len, self.sets[:number]))
+            whole_actions = self._action_mappings[number][1][place]
+        return Candidate(action, names[source_action], variables, tuple(names[each] for each in whole_actions))
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""
         origin, row = self.origins[candidate], self.arrays.row[candidate]
         found = MappedVariables.none(origin.target_action, self.task.n_variables)
-        mapped = self.table.variable[row] >= 0
-        found.source[mapped] = origin.source
-        found.variable[mapped] = self.table.variable[row][mapped]
-        found.sign[mapped] = np.where(self.table.sign[row][mapped] < 0, -1, 1)
-        found.action[mapped] = origin.source_action
+        found.map(origin.source, self.table.variable[row], self.table.sign[row], origin.source_action)
         return found
 
     def describe(self, candidate: int) -> str:
@@ -211,21 +189,13 @@ class Candidates:
             words += f", of the actions {', '.join(parts.action_mapping)}"
         return words if len(self.sources) == 1 else f"source {self.origins[candidate].source}: {words}"
 
-    def _whole_action_names(self, candidate: int) -> list[str]:
-        """Return the names of the source actions of all target actions, in their order."""
-        origin = self.origins[candidate]
-        place = candidate - self.arrays.first[origin.target_action] - sum(map(len, self.sets[: origin.source]))
-        names = self.sources[origin.source].action_names
-        return [names[action] for action in self._action_mappings[origin.source][1][place]]
-
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions of all sources, each name once."""
         return list(dict.fromkeys(name for source in self.sources for name in source.action_names))
 
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
-    """
-    Return the source instances that a user means, as :func:`~sb3_combrel.sources.recipes.find_source`, of one or of several.
+    """Return the instances that a user means (:func:`~sb3_combrel.sources.recipes.find_source`), of one source or of several.
 
     :raises FileNotFoundError: if there is neither a file nor a task of that name
     :raises ValueError: if it is something else, or the task cannot be learned
@@ -238,8 +208,7 @@ def load_sources(source: SourceLike) -> list[SourceInstances]:
 
 
 def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:
-    """
-    Return the set of mappings that a user means for each source, with names.
+    """Return the set of mappings that a user means for each source, with names.
 
     :raises ValueError: if it is factored, or does not fit the tasks
     """
@@ -254,10 +223,8 @@ def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, ta
 
 
 def load_one_source(source: SourceLike, method: str) -> SourceInstances:
-    """
-    Return the source instances of a method that takes those of one task, as :func:`load_sources`.
+    """Return what :func:`load_sources` does, of one source; ``method``: for the message.
 
-    :param method: its name, for the message
     :raises ValueError: also if there are several
     """
     found = load_sources(source)
@@ -267,8 +234,7 @@ def load_one_source(source: SourceLike, method: str) -> SourceInstances:
 
 
 def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
-    """
-    Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
+    """Return the instances of all sources in unit coordinates of each, by action, the sources' actions numbered on.
 
     They are sorted along a curve that fills the space. A variable is periodic if it is in all sources that have it.
     """

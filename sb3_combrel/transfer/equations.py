@@ -27,20 +27,13 @@ ROUNDING = 1e-12
 
 
 class Transitions(NamedTuple):
-    """Experience of one task: the tuples (s, a, r, s') of the paper, one a row.
+    """Experience of one task: the tuples (s, a, r, s') of the paper, one a row."""
 
-    :param state: unit coordinates of that task, shape (n, n_variables)
-    :param action: int64, shape (n,)
-    :param effect: s' - s, shape (n, n_variables)
-    :param reward: raw, shape (n,)
-    :param terminated: bool, shape (n,): whether s' is terminal (not by a time limit)
-    """
-
-    state: Floats
-    action: Ints
-    effect: Floats
-    reward: Floats
-    terminated: Bools
+    state: Floats  #: unit coordinates of that task, shape (n, n_variables)
+    action: Ints  #: int64, shape (n,)
+    effect: Floats  #: s' - s, shape (n, n_variables)
+    reward: Floats  #: raw, shape (n,)
+    terminated: Bools  #: bool, shape (n,): whether s' is terminal (not by a time limit)
 
     def with_action(self, action: int) -> "Transitions":
         """Select the transitions with one action, in their order."""
@@ -49,47 +42,33 @@ class Transitions(NamedTuple):
 
 
 class Bandwidths(NamedTuple):
-    """Bandwidths delta of the kernel :func:`phi`, in squared units of the distances: unit coordinates, rewards raw.
+    """Bandwidths delta of the kernel :func:`phi`, in squared units of the distances: unit coordinates, rewards raw."""
 
-    :param start: delta_sa, of the distance between the states where two transitions start
-    :param outcome: delta_s', of the distance between an outcome and the predicted one
-    :param reward: delta_r, of the difference of two raw rewards
-    """
-
-    start: float
-    outcome: float
-    reward: float
+    start: float  #: delta_sa, of the distance between the states where two transitions start
+    outcome: float  #: delta_s', of the distance between an outcome and the predicted one
+    reward: float  #: delta_r, of the difference of two raw rewards
 
 
 class VirtualSource(NamedTuple):
     """Source instances of one target action, translated to the target task and seen from t target states.
 
-    :param start: where each instance starts, shape (t, m, d). A target variable mapped to None has the value of the state
-        from which it is seen, and so adds nothing to any distance
-    :param effect: s'_j - s_j, shape (m, d); 0 for variables mapped to None: they are predicted not to change
-    :param reward: shape (m,)
-    :param terminated: bool, shape (m,)
+    A target variable mapped to None has the value of the state from which an instance is seen, and so adds nothing to any
+    distance; it is predicted not to change.
     """
 
-    start: Floats
-    effect: Floats
-    reward: Floats
-    terminated: Bools
+    start: Floats  #: where each instance starts, shape (t, m, d)
+    effect: Floats  #: s'_j - s_j, shape (m, d); 0 for variables mapped to None
+    reward: Floats  #: shape (m,)
+    terminated: Bools  #: bool, shape (m,)
 
 
 class TransferRules(NamedTuple):
-    """When the model knows a state-action pair, and which instances count (the parameters of Table 1).
+    """When the model knows a state-action pair, and which instances count (the parameters of Table 1)."""
 
-    :param breadth: b, kernel breadth of transferred instances in unit coordinates
-    :param threshold: sum of weights from which on a pair is known
-    :param min_weight: an instance that weighs less does not count
-    :param min_fraction: nor does one, nearest first, with less than this fraction of the weight before it
-    """
-
-    breadth: float
-    threshold: float
-    min_weight: float
-    min_fraction: float
+    breadth: float  #: b, kernel breadth of transferred instances in unit coordinates
+    threshold: float  #: sum of weights from which on a pair is known
+    min_weight: float  #: an instance that weighs less does not count
+    min_fraction: float  #: nor does one, nearest first, with less than this fraction of the weight before it
 
 
 def phi(x: Floats, delta: float) -> Floats:
@@ -118,11 +97,7 @@ def virtual_source(source: Transitions, mapping: InterTaskMapping, action: int, 
 
 
 def start_distances(states: Floats, virtual: VirtualSource) -> Floats:
-    """Measure d(<s_i, a_i>, <s_j, a_j>) between transitions with the same action.
-
-    :param states: target states from which ``virtual`` is seen, shape (t, d)
-    :return: Euclidean distances over the mapped variables, shape (t, m)
-    """
+    """Measure d(<s_i, a_i>, <s_j, a_j>) of transitions with the same action, over the mapped variables, shape (t, m)."""
     return np.linalg.norm(states[:, None, :] - virtual.start, axis=2)
 
 
@@ -140,24 +115,17 @@ def normalized_weights(distances: Floats, delta: float, axis: int = 1) -> Floats
 
 
 def transition_compliances(weights: Floats, effects: Floats, virtual: VirtualSource, delta: float) -> Floats:
-    """Compute lambda^P_ij = w_ij phi(d(s'_i, s_i + (s'_j - s_j))), Eq. 2.
+    """Compute lambda^P_ij = w_ij phi(d(s'_i, s_i + (s'_j - s_j))), Eq. 2, shape (t, m).
 
     The distance between the outcome and the predicted one is that between the two effects.
 
-    :param weights: w_ij, shape (t, m)
     :param effects: s'_i - s_i of the target transitions, shape (t, d)
-    :return: shape (t, m)
     """
     return weights * phi(np.linalg.norm(effects[:, None, :] - virtual.effect, axis=2), delta)
 
 
 def reward_compliances(weights: Floats, rewards: Floats, virtual: VirtualSource, delta: float) -> Floats:
-    """Compute ``lambda^R_ij = w_ij phi(|r_i - r_j|)``, the formula below Eq. 2.
-
-    :param weights: w_ij, shape (t, m)
-    :param rewards: r_i of the target transitions, shape (t,)
-    :return: shape (t, m)
-    """
+    """Compute ``lambda^R_ij = w_ij phi(|r_i - r_j|)``, the formula below Eq. 2, shape (t, m); ``rewards``: r_i, shape (t,)."""
     return weights * phi(np.abs(rewards[:, None] - virtual.reward), delta)
 
 
@@ -257,10 +225,7 @@ def near_relevances(with_target: Floats, evidence: Floats) -> Floats:
 def instance_compliances(
     source: Transitions, mapping: InterTaskMapping, action: int, transitions: Transitions, bandwidths: Bandwidths
 ) -> tuple[Floats, Floats, Floats]:
-    """Compute lambda_{T,sigma_j} of the source instances of one target action, for Eq. 7.
-
-    :return: distances d_ij and weights w_ji, shape (t, m), and the compliances, shape (m,)
-    """
+    """Compute d_ij and w_ji, shape (t, m), and lambda_{T,sigma_j}, shape (m,), of one target action's instances, for Eq. 7."""
     states, _, effects, rewards, _ = transitions.with_action(action)
     virtual = virtual_source(source, mapping, action, states)
     distances = start_distances(states, virtual)

@@ -1,13 +1,16 @@
-"""Whether the target's own transitions bear out what a source predicts: ends and rewards, and a warning of wrong effects."""
+"""Whether and where the target's own transitions bear out what a source predicts: effects, ends and rewards."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.transfer.report import Contradiction
 
 # Above the first probability a transition is predicted to end the episode, below the second not to: between them, at the
 # border of where episodes end, a kernel average decides nothing.
@@ -24,15 +27,18 @@ MIN_ABSENT = 3
 COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "in_vain", "steps_of_visit")
 # Transitions from which on predictions worse than "no change" are warned of.
 TRANSITIONS_BEFORE_WARNING = 300
+# Each state variable's range is divided into so many parts.
+N_PARTS = 4
+# A part with fewer transitions says nothing.
+MIN_IN_PART = 10
+MAX_CONTRADICTIONS = 8
+# Effects are squared unit coordinates; less than this is no movement.
+NO_MOVEMENT = 1e-18
+_N, _ERROR, _EFFECT, _WORSE = range(4)
 
 
 def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> None:
-    """
-    Warn that what was transferred predicts the target worse than "no change".
-
-    :param n: transitions that the error is of
-    :param error: mean squared error of the predicted effects, over that of "no change"
-    """
+    """Warn that what was transferred predicts ``n`` transitions worse than "no change", by ``error`` times."""
     names = ", ".join(str(source.origin.get("env", source)) for source in sources)
     warnings.warn(
         f"what was transferred from {names} predicts the target worse than that nothing changes: on {n} "
@@ -42,8 +48,7 @@ def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> N
 
 
 class OutcomeEvidence:
-    """
-    Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
+    """Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
 
     *Ends.* An episode that ends where that is predicted confirms it. An episode that ends where none is predicted contradicts
     it, and so does each visit to where one is predicted that leaves without an end or stays for long. Visits are counted, not
@@ -82,13 +87,7 @@ class OutcomeEvidence:
         self.reward_range = (np.inf, -np.inf)
 
     def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
-        """
-        Take in a transition of the target.
-
-        :param weight: of the source's data there
-        :param end: probability of termination that it predicts
-        :param reward: raw
-        """
+        """Take in a transition; ``weight``: of the source's data there, ``end``: probability of termination it predicts."""
         self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
         has_data = weight >= self.threshold
         if has_data:
@@ -150,3 +149,72 @@ class OutcomeEvidence:
         for name, value in zip(COUNTS, state.tolist(), strict=False):
             setattr(self, name, int(value))
         self.reward_range = float(state[-2]), float(state[-1])
+
+
+class RegionErrors:
+    """Sums of squared prediction errors and squared effects, by target action and by part of each state variable's range."""
+
+    def __init__(self, task: TargetTask):
+        self.task = task
+        #: Number of transitions, squared errors, squared effects, and number of those whose error is the larger one; shape
+        #: (n_actions, n_variables, N_PARTS, 4).
+        self.sums = np.zeros((task.n_actions, task.n_variables, N_PARTS, 4))
+        self._variables = np.arange(task.n_variables)
+
+    def note(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray) -> None:
+        """Add a transition whose effect was ``predicted``; unit coordinates."""
+        part = np.clip((state * N_PARTS).astype(np.int64), 0, N_PARTS - 1)
+        error, moved = (float((each * each).sum()) for each in (effect - predicted, effect))
+        self.sums[action, self._variables, part] += 1.0, error, moved, error > moved
+
+    def forget(self) -> None:
+        """Forget all transitions."""
+        self.sums[:] = 0.0
+
+    @property
+    def of_actions(self) -> np.ndarray:
+        """Sums by target action: number, squared error, squared effect, number that are worse; shape (n_actions, 4)."""
+        # Each transition is in one part of every variable.
+        return self.sums[:, 0].sum(axis=1)
+
+    def errors(self) -> np.ndarray:
+        """Return the mean squared error over that of "no change", by target action, NaN where nothing moved."""
+        sums = self.of_actions
+        moved = sums[:, _EFFECT] > NO_MOVEMENT
+        return np.where(moved, sums[:, _ERROR] / np.where(moved, sums[:, _EFFECT], 1.0), np.nan)
+
+    def error(self) -> float:
+        """Return the same over all actions."""
+        _, error, effect, _ = self.of_actions.sum(axis=0).tolist()
+        return error / effect if effect > NO_MOVEMENT else np.nan
+
+    def contradictions(self) -> tuple[Contradiction, ...]:
+        """Return the parts in which predictions are worse than "no change", the largest excess of squared error first."""
+        excess = self.sums[..., _ERROR] - self.sums[..., _EFFECT]
+        worse = (self.sums[..., _N] >= MIN_IN_PART) & (excess > NO_MOVEMENT)
+        order = sorted(map(tuple, np.argwhere(worse).tolist()), key=lambda cell: -excess[cell])
+        return tuple(self._contradiction(*cell) for cell in order[:MAX_CONTRADICTIONS])
+
+    def report_fields(self, evidence: OutcomeEvidence) -> dict[str, Any]:
+        """Return the fields of a report that say how the target's transitions compare with what was predicted of them."""
+        totals = self.of_actions.sum(axis=0)
+        return dict(
+            n_compared=int(totals[_N]),
+            n_worse=int(totals[_WORSE]),
+            contradictions=self.contradictions(),
+            ends=(evidence.confirmed, evidence.contradicted),
+            rewards=(evidence.rewards_right, evidence.rewards_wrong),
+        )
+
+    def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
+        n, error, effect, _ = self.sums[action, variable, part].tolist()
+        low, high = (float(bound[variable]) for bound in (self.task.scaling.low, self.task.scaling.high))
+        width = (high - low) / N_PARTS
+        return Contradiction(
+            target_action=self.task.action_names[action],
+            variable=self.task.state_names[variable],
+            low=low + part * width,
+            high=low + (part + 1) * width,
+            n_compared=int(n),
+            error=error / effect if effect > NO_MOVEMENT else np.inf,
+        )

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
+
+# The arrays, which grow together.
+_COLUMNS = ("states", "effects", "rewards", "actions", "ended")
 
 
 class RecordedTransitions:
-    """
-    Transitions of the target task in growing arrays, in the order in which they were observed (unit coordinates).
+    """Transitions of the target task in growing arrays, in the order in which they were observed (unit coordinates)."""
 
-    :param n_variables: number of state variables of the target
-    """
-
-    #: The arrays, which grow together.
-    columns: ClassVar[tuple[str, ...]] = ("states", "effects", "rewards", "actions")
+    #: How the episode went on after a transition, see :attr:`ended`.
+    GOES_ON, TERMINATED, TIME_LIMIT = 0, 1, 2
 
     def __init__(self, n_variables: int):
         self.n = 0
@@ -23,53 +20,19 @@ class RecordedTransitions:
         self.effects = np.empty((64, n_variables))
         self.rewards = np.empty(64)
         self.actions = np.empty(64, dtype=np.int64)
+        self.ended = np.empty(64, dtype=np.int64)
 
-    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray) -> int:
-        """
-        Record one transition.
-
-        :param state: shape (n_variables,); ``effect``: next state minus state, same shape
-        :param reward: raw
-        :return: its number
-        """
+    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
+        """Record one transition; ``effect``: next state minus state; return its number."""
         if self.n == len(self.rewards):
-            for name in self.columns:
+            for name in _COLUMNS:
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.empty_like(old)]))
         i = self.n
         self.states[i], self.effects[i] = state, effect
         self.rewards[i], self.actions[i] = reward, action
-        self.n += 1
-        return i
-
-    def rows(self) -> np.ndarray:
-        """Return all of them, one a row: state, effect, reward, action; shape (n, 2 * n_variables + 2)."""
-        return np.column_stack([getattr(self, name)[: self.n] for name in self.columns])
-
-    def restore(self, rows: np.ndarray, n_actions: int) -> None:
-        """
-        Record what :meth:`rows` returned once more; for a new object.
-
-        :param n_actions: number of target actions; whatever a file says, only these are recorded
-        """
-        d = self.states.shape[1]
-        for row in rows:
-            self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])
-
-
-class RecordedEpisodes(RecordedTransitions):
-    """Recorded transitions, and how the episode of each went on: ``GOES_ON``, ``TERMINATED`` or ``TIME_LIMIT``."""
-
-    columns = (*RecordedTransitions.columns, "ended")
-    GOES_ON, TERMINATED, TIME_LIMIT = 0, 1, 2
-
-    def __init__(self, n_variables: int):
-        super().__init__(n_variables)
-        self.ended = np.empty(64, dtype=np.int64)
-
-    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
-        i = super().add(state, action, reward, effect)
         self.ended[i] = self.TERMINATED if terminated else self.GOES_ON
+        self.n += 1
         return i
 
     def note_time_limit(self) -> None:
@@ -77,6 +40,13 @@ class RecordedEpisodes(RecordedTransitions):
         if self.n:
             self.ended[self.n - 1] = self.TIME_LIMIT
 
+    def rows(self) -> np.ndarray:
+        """Return all of them, one a row: state, effect, reward, action, ended; shape (n, 2 * n_variables + 3)."""
+        return np.column_stack([getattr(self, name)[: self.n] for name in _COLUMNS])
+
     def restore(self, rows: np.ndarray, n_actions: int) -> None:
-        super().restore(rows, n_actions)
+        """Record what :meth:`rows` returned once more, in a new object, whatever a file says with target actions alone."""
+        d = self.states.shape[1]
+        for row in rows:
+            self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])
         self.ended[: self.n] = rows[:, -1]

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
 
 class NotBoundError(ValueError, AttributeError):
-    """
-    Results were asked of a transfer object that no algorithm uses.
+    """Results were asked of a transfer object that no algorithm uses.
 
     It is both errors, as scikit-learn's ``NotFittedError`` is, so that ``hasattr`` works.
     """
@@ -23,59 +22,36 @@ class NotBoundError(ValueError, AttributeError):
 
 @dataclass(frozen=True)
 class MappingReport:
-    """
-    What one target action was taken for.
+    """What one target action was taken for.
 
     Compliance is the mean of exp(-squared error / scale) over the target's own transitions with this action; errors are mean
     squared errors of predicted effects over those of "no change". What cannot be told is NaN.
-
-    :param target_action: name of the target action
-    :param mapping: source action and variables, by name; with ``use="instances"`` of the mapping used most
-    :param share: fraction of this action's transfers that used this mapping
-    :param n_mappings: number of mappings that were used for this action
-    :param compliance: of this mapping; with ``use="instances"`` of what was chosen, averaged over states
-    :param next_best: the mapping of the highest compliance among the others, by name; "" for none or another in each state
-    :param next_best_compliance: its compliance
-    :param no_change_compliance: compliance of the prediction that no variable changes
-    :param error: prediction error of what was transferred
-    :param next_best_error: prediction error of the next best
-    :param n_compared: transitions that ``error`` is of
-    :param trust: with ``use="prior"``, how far what the source claims to know is believed, from 0 to 1; else NaN
     """
 
     target_action: str
-    mapping: str
-    share: float = np.nan
-    n_mappings: int = 1
-    compliance: float = np.nan
-    next_best: str = ""
+    mapping: str  #: source action and variables, by name; with ``use="instances"`` of the mapping used most
+    share: float = np.nan  #: fraction of this action's transfers that used this mapping
+    n_mappings: int = 1  #: number of mappings that were used for this action
+    compliance: float = np.nan  #: of this mapping; with ``use="instances"`` of what was chosen, averaged over states
+    next_best: str = ""  #: the mapping of the highest compliance among the others; "" for none or another in each state
     next_best_compliance: float = np.nan
-    no_change_compliance: float = np.nan
-    error: float = np.nan
+    no_change_compliance: float = np.nan  #: compliance of the prediction that no variable changes
+    error: float = np.nan  #: prediction error of what was transferred
     next_best_error: float = np.nan
-    n_compared: int = 0
-    trust: float = np.nan
+    n_compared: int = 0  #: transitions that ``error`` is of
+    trust: float = np.nan  #: with ``use="prior"``, how far what the source claims to know is believed, from 0 to 1
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """
-    A part of the state space where the target's own transitions contradict what was transferred.
-
-    :param target_action: name of the target action
-    :param variable: name of the state variable
-    :param low: where the part begins along it, raw units
-    :param high: where it ends
-    :param n_compared: transitions there
-    :param error: mean squared error of the predicted effects over that of "no change", above 1; infinite where nothing moved
-    """
+    """A part of the state space where the target's own transitions contradict what was transferred."""
 
     target_action: str
-    variable: str
-    low: float
-    high: float
-    n_compared: int
-    error: float
+    variable: str  #: name of the state variable
+    low: float  #: where the part begins along it, raw units
+    high: float  #: where it ends
+    n_compared: int  #: transitions there
+    error: float  #: mean squared error of the effects over that of "no change", above 1; infinite where nothing moved
 
     def __str__(self) -> str:
         times = "nothing moved there, the source says it does" if np.isinf(self.error) else f"{self.error:.2f}"
@@ -85,45 +61,26 @@ class Contradiction:
 
 @dataclass(frozen=True)
 class TransferReport:
-    """
-    What a transfer method did: print it, or read its fields.
+    """What a transfer method did: print it, or read its fields."""
 
-    :param method: the method with its arguments
-    :param use: "instances" or "prior"
-    :param sources: the source tasks
-    :param n_steps: steps of the target that were observed; None if the method does not count them
-    :param n_rested: of these, steps whose action transferred instances predicted, or whose outcome the source, as a prior,
-        claimed to know; None as above
-    :param mappings: one for each target action that was mapped
-    :param next_best: with a factored mapping, the next best division of the target's variables, by name; else ""
-    :param next_best_error: its prediction error; ``error``: that of what was transferred, over all actions
-    :param n_compared: steps on which predictions of the source were compared with what happened
-    :param n_worse: of these, steps on which they were worse than "no change"
-    :param contradictions: where they were worse on average, the worst first
-    :param not_used: pairs of a target action and a variable for which the source explains so little that it is not used
-    :param ends: episode ends where the source predicts them (confirmed), and ends predicted or not, wrongly (contradicted)
-    :param rewards: transitions whose reward the source predicts rightly, and wrongly
-    :param bounds_values: whether what is unknown counts as worth no more than the source's state that it is taken for
-    :param statistics: the figures of the log, by name
-    """
-
-    method: str
-    use: str
+    method: str  #: with its arguments
+    use: str  #: "instances" or "prior"
     sources: tuple[str, ...] = ()
-    n_steps: int | None = None
+    n_steps: int | None = None  #: steps of the target that were observed; None if the method does not count them
+    #: Of these, steps whose action transferred instances predicted, or whose outcome the source, as a prior, claimed to know.
     n_rested: int | None = None
-    mappings: tuple[MappingReport, ...] = ()
-    error: float = np.nan
-    next_best: str = ""
+    mappings: tuple[MappingReport, ...] = ()  #: one for each target action that was mapped
+    error: float = np.nan  #: prediction error of what was transferred, over all actions
+    next_best: str = ""  #: with a factored mapping, the next best division of the target's variables, by name
     next_best_error: float = np.nan
-    n_compared: int = 0
-    n_worse: int = 0
-    contradictions: tuple[Contradiction, ...] = ()
-    not_used: tuple[tuple[str, str], ...] = ()
-    ends: tuple[int, int] = (0, 0)
-    rewards: tuple[int, int] = (0, 0)
-    bounds_values: bool = False
-    statistics: Mapping[str, float] = field(default_factory=dict)
+    n_compared: int = 0  #: steps on which predictions of the source were compared with what happened
+    n_worse: int = 0  #: of these, steps on which they were worse than "no change"
+    contradictions: tuple[Contradiction, ...] = ()  #: where they were worse on average, the worst first
+    not_used: tuple[tuple[str, str], ...] = ()  #: target actions and variables that the source explains too little of
+    ends: tuple[int, int] = (0, 0)  #: episode ends where the source predicts them, and ends predicted or not, wrongly
+    rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
+    bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
+    statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
 
     def __str__(self) -> str:
         parts = [self._heading(), self._mappings(), self._contradictions()]

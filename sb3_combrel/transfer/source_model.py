@@ -21,18 +21,12 @@ DEFAULT_OUTCOME_BREADTH = 0.05
 
 
 class SourcePredictions(NamedTuple):
-    """What a source predicts of n state-action pairs of its own. Unit coordinates of the source.
+    """What a source predicts of n state-action pairs of its own, float64."""
 
-    :param effect: float64, shape (n, n_variables): predicted displacement
-    :param reward: float64, shape (n,), raw
-    :param end: float64, shape (n,): probability of termination
-    :param weight: float64, shape (n,): how well founded the prediction is, see :class:`SourceModel`
-    """
-
-    effect: np.ndarray
-    reward: np.ndarray
-    end: np.ndarray
-    weight: np.ndarray
+    effect: np.ndarray  # shape (n, n_variables): predicted displacement, unit coordinates of the source
+    reward: np.ndarray  # shape (n,), raw
+    end: np.ndarray  # shape (n,): probability of termination
+    weight: np.ndarray  # shape (n,): how well founded the prediction is, see SourceModel
 
 
 @inlined
@@ -85,10 +79,7 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
 
 @inner
 def beyond_data(sums, factor, state, scratch):
-    """The squared distance of a state from the mean of the instances of a fit, in units of their spread along that way.
-
-    :param factor: Cholesky factor of the spread, as :func:`solve_regression` leaves it
-    """
+    """The squared distance of a state from the mean of a fit's instances, in units of their spread along that way."""
     distance = 0.0
     for j in range(len(state)):
         entry = state[j] - sums[1 + j] / sums[0]
@@ -112,8 +103,7 @@ _predict_many = EntryPoint(predict_many)
 
 
 class SourceModel:
-    """
-    Local linear regression on the instances of a source, one model for each action.
+    """Local linear regression on the instances of a source, one model for each action.
 
     The effect at a state is fitted, as a linear function of the state, to the ``n_neighbors`` nearest instances of the
     action, with the kernel exp(-d^2 / breadth^2), narrowed where they lie closer so that the last of them weighs 0.05; it
@@ -138,6 +128,7 @@ class SourceModel:
         outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
     ):
         n_actions, _, d = instances.state.shape
+        self.n_variables = d
         self.instances = instances
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
@@ -164,18 +155,8 @@ class SourceModel:
         #: For compiled code, see :func:`source_arrays`.
         self.plain = tuple(instances), effect_range, tuple(self.kernel), tuple(near)
 
-    @property
-    def n_variables(self) -> int:
-        """Number of state variables of the source."""
-        return int(self.instances.state.shape[2])
-
     def predict(self, states: np.ndarray, actions: np.ndarray) -> SourcePredictions:
-        """
-        Predict states and actions of the source.
-
-        :param states: unit coordinates of the source, float64, shape (n, n_variables)
-        :param actions: source actions, int64, shape (n,)
-        """
+        """Predict n states and actions of the source; unit coordinates of it, and int64."""
         n = len(actions)
         found = SourcePredictions(np.empty((n, self.n_variables)), np.empty(n), np.empty(n), np.empty(n))
         _predict_many.call(self.plain, np.ascontiguousarray(states), actions, tuple(found))

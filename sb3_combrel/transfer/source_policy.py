@@ -1,31 +1,72 @@
-"""The greedy policy of a source task, planned from its instances."""
+"""A source task as a finite MDP, by what its local linear model predicts at the states of a grid, and its greedy policy."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sb3_combrel.planning.corrections import CorrectionArrays
+from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction, QValues
 from sb3_combrel.planning.sweeping import Planner
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
-from sb3_combrel.transfer.source_mdp import planning_tolerance, source_mdp
 from sb3_combrel.transfer.source_model import SourceModel
 
 # Weight of instances from which on a prediction counts, as by default in Fitted R-Max.
 MIN_WEIGHT = 1.0
+# An action is held until its cell of the grid is left, but for no more than so many steps: values that are interpolated at
+# every step would spread over the grid.
+MAX_STEPS = 50
+# What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
+LEAST_WEIGHT_ON_GRID = 0.05
+# Changes of value up to this part of the range of a step's rewards end the planning.
+_TOLERANCE = 0.001
+
+
+def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadth: float, min_weight: float) -> FiniteMDP:
+    """Write what each action, held until the cell is left, does at each point of a grid over the source's states.
+
+    :param model: of the source's instances; ``breadth``: its kernel breadth, for which the grid is chosen
+    :param min_weight: weight of the model's prediction from which on a pair has a model; the others are optimistic
+    """
+    grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
+    mdp = FiniteMDP(grid, source.n_actions, gamma)
+    n_points, cells = grid.n_points, grid.arrays.cells
+    states = np.tile(grid.points(), (mdp.n_actions, 1))
+    actions = np.repeat(np.arange(mdp.n_actions), n_points)
+    at, reward, weight = states.copy(), np.zeros(len(states)), np.zeros(len(states))
+    # The probability that the episode goes on, discounted for all steps but one, which the MDP discounts itself.
+    goes_on = np.ones(len(states))
+    going = np.arange(len(states))
+    for step in range(MAX_STEPS):
+        goes_on[going] *= 1.0 if step == 0 else mdp.gamma
+        found = model.predict(at[going], actions[going])
+        reward[going] += goes_on[going] * found.reward
+        goes_on[going] *= 1.0 - found.end
+        at[going] += found.effect
+        if step == 0:
+            weight[:] = found.weight
+        left = (np.abs(at[going] - states[going]) * cells).max(axis=1) >= 1.0
+        # Of those that have no model it does not matter.
+        going = going[~left & (goes_on[going] > 0.0) & (weight[going] >= min_weight)]
+    pairs = np.arange(len(states))
+    mdp.write_rows(pairs, weight >= min_weight, goes_on[:, None], (at - states)[:, None], reward)
+    return mdp
+
+
+def planning_tolerance(source: SourceInstances) -> float:
+    """Return the change of value that is too small to matter."""
+    lowest, highest = float(source.rewards.min()), float(source.rewards.max())
+    return _TOLERANCE * max(highest - lowest, abs(highest), 1e-6)
 
 
 class SourcePolicy:
-    """
-    What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
+    """What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
 
-    An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst
-    of its neighbours.
-
-    :param source: instances of the source task
-    :param gamma: discount factor, below 1, as the least and the largest value are computed with it
-    :param breadth: kernel breadth of the source's model, in unit coordinates of the source
+    An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst of
+    its neighbours. ``gamma`` is below 1: the least and the largest value follow from it; ``breadth`` is that of the source's
+    model, in unit coordinates of the source.
     """
 
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):
@@ -46,12 +87,7 @@ class SourcePolicy:
         self._length = np.ones(n, dtype=np.int64)
 
     def q_values(self, state: np.ndarray) -> np.ndarray:
-        """
-        Compute the action values at a state of the source.
-
-        :param state: unit coordinates of the source, shape (n_variables,)
-        :return: shape (n_actions,); -inf for actions with too few instances near the state
-        """
+        """Action values at a state of the source, unit coordinates; -inf for actions with too few instances near it."""
         found = self.model.predict(np.repeat(state[None], len(self._actions), axis=0), self._actions)
         modelled = found.weight >= MIN_WEIGHT
         successors = (1.0 - found.end)[:, None], found.effect[:, None]

@@ -64,7 +64,7 @@ def slow_compliance(model):
     task, source, candidates = transfer.task, transfer.sources[0], transfer.candidates
     bandwidths, d = default_bandwidths(candidates.instances), task.n_variables
     transitions = [
-        naive.Transition(row[:d], int(row[-1]), float(row[-2]), row[:d] + row[d : 2 * d])
+        naive.Transition(row[:d], int(row[2 * d + 1]), float(row[2 * d]), row[:d] + row[d : 2 * d])
         for row in transfer.get_state()["transitions"]
     ]
 

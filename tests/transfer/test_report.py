@@ -11,7 +11,7 @@ from helpers.walk import METHODS as ON_WALK
 from helpers.walk import Walk, small, walk_source
 
 from sb3_combrel import COMBREL, MASTER, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances
-from sb3_combrel.transfer.region_errors import MIN_IN_PART, N_PARTS, RegionErrors
+from sb3_combrel.transfer.outcome_evidence import MIN_IN_PART, N_PARTS, RegionErrors
 from sb3_combrel.transfer.report import NotBoundError, TransferReport
 
 TWO = f.copies_mapping(2)

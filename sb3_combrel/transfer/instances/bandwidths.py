@@ -16,15 +16,10 @@ N_SHARING = 20
 
 
 class CandidateBandwidths(NamedTuple):
-    """
-    Bandwidths of Eq. 2, of all candidates.
+    """Bandwidths of Eq. 2, of all candidates."""
 
-    :param of_all: but for ``start``
-    :param starts: the start bandwidth of each state mapping, float64, shape (n_state_mappings,)
-    """
-
-    of_all: Bandwidths
-    starts: np.ndarray
+    of_all: Bandwidths  # but for ``start``
+    starts: np.ndarray  # float64, shape (n_state_mappings,): the start bandwidth of each state mapping
 
 
 def candidate_bandwidths(candidates: Candidates, given: Sequence[float] | None) -> CandidateBandwidths:
@@ -37,8 +32,7 @@ def candidate_bandwidths(candidates: Candidates, given: Sequence[float] | None) 
 
 
 def default_bandwidths(source: Instances) -> Bandwidths:
-    """
-    Choose bandwidths from a source's instances.
+    """Choose bandwidths from a source's instances.
 
     Of starts: the median squared distance to about the 20th instance of the same action. Of outcomes: the mean squared effect.
     Of rewards: their variance; 1 where they are all alike.
@@ -67,14 +61,11 @@ def default_bandwidths(source: Instances) -> Bandwidths:
 
 
 def start_bandwidths(candidates: Candidates, start: float) -> np.ndarray:
-    """
-    Choose the start bandwidth of every state mapping, in proportion to how many variables it compares.
+    """Choose the start bandwidth of every state mapping, in proportion to how many variables it compares.
 
-    A squared distance over more variables has more terms. With this bandwidth an instance that is equally far along each
-    variable weighs the same, however many there are.
+    An instance equally far along each variable then weighs the same, however many there are.
 
-    :param start: start bandwidth for mappings that compare as many variables as their source has
-    :return: float64, shape (n_state_mappings,)
+    :param start: for mappings that compare as many variables as their source has
     """
     fractions = [
         (mappings.state_mappings >= 0).sum(axis=1) / source.n_variables

@@ -23,45 +23,30 @@ DEFAULT_MIN_EVIDENCE = 0.1
 
 
 class ComplianceScratch(NamedTuple):
-    """
-    Work space, and the state mappings in the form that the inner loop reads.
+    """Work space, and the state mappings in the form that the inner loop reads; n is the most instances of an action.
 
     A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses; a *start
     factor* is one with a start bandwidth.
-
-    :param variable: int64, shape (n_factors,): target variable; ``source``: source variable; ``mirrored``: bool, same shape
-    :param first: int64, shape (n_state_mappings + 1,): the factors of mapping m are ``factors[first[m] : first[m + 1]]``
-    :param factors: int64; ``starts``: same shape, the same for start factors
-    :param start_factor: int64, shape (n_start_factors,): the factor of each; ``start_bandwidth``: float64, same shape
-    :param state: float64, shape (n_source_actions, n_source_variables, n): the source instances' states, variable by
-        variable, as the inner loops read them; ``effect``: the same of their effects
-    :param start: float64, shape (n_start_factors, n): kernel of where a transition and each source instance start
-    :param outcome: float64, shape (n_factors, n): the same for outcomes
-    :param reward: float64, shape (n,): the same for rewards
-    :param weight: float64, shape (n,): product of a mapping's start kernels; ``hit``: of its outcome kernels
-    :param still: float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
-    :param min_evidence: sum of start kernels below which a mapping has no compliance
-    :param periodic: bool, shape (n_target_variables,): which variables of the target are periodic
     """
 
-    variable: np.ndarray
-    source: np.ndarray
-    mirrored: np.ndarray
-    first: np.ndarray
-    factors: np.ndarray
-    starts: np.ndarray
-    start_factor: np.ndarray
-    start_bandwidth: np.ndarray
-    state: np.ndarray
-    effect: np.ndarray
-    start: np.ndarray
-    outcome: np.ndarray
-    reward: np.ndarray
-    weight: np.ndarray
-    hit: np.ndarray
-    still: np.ndarray
-    min_evidence: float
-    periodic: np.ndarray
+    variable: np.ndarray  # int64, shape (n_factors,): target variable
+    source: np.ndarray  # int64, same shape: source variable
+    mirrored: np.ndarray  # bool, same shape
+    first: np.ndarray  # int64, shape (n_state_mappings + 1,): mapping m has factors[first[m] : first[m + 1]]
+    factors: np.ndarray  # int64
+    starts: np.ndarray  # int64, same shape: the same for start factors
+    start_factor: np.ndarray  # int64, shape (n_start_factors,): the factor of each
+    start_bandwidth: np.ndarray  # float64, same shape
+    state: np.ndarray  # float64, shape (n_source_actions, n_source_variables, n): the instances' states by variable
+    effect: np.ndarray  # the same of their effects
+    start: np.ndarray  # float64, shape (n_start_factors, n): kernel of where a transition and each instance start
+    outcome: np.ndarray  # float64, shape (n_factors, n): the same for outcomes
+    reward: np.ndarray  # float64, shape (n,): the same for rewards
+    weight: np.ndarray  # float64, shape (n,): product of a mapping's start kernels
+    hit: np.ndarray  # the same of its outcome kernels
+    still: np.ndarray  # float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
+    min_evidence: float  # sum of start kernels below which a mapping has no compliance
+    periodic: np.ndarray  # bool, shape (n_target_variables,)
 
     @classmethod
     def for_mappings(
@@ -72,11 +57,7 @@ class ComplianceScratch(NamedTuple):
         min_evidence: float = DEFAULT_MIN_EVIDENCE,
         periodic: Sequence[bool] | None = None,
     ) -> "ComplianceScratch":
-        """
-        Make work space for a table of state mappings and the instances of a source.
-
-        :param start: start bandwidth, of all mappings or of each, shape (n_state_mappings,)
-        """
+        """Make work space; ``start``: start bandwidth, of all mappings or of each, shape (n_state_mappings,)."""
         largest = int(source.size.max())
         number: dict[tuple[int, int, bool], int] = {}
         start_number: dict[tuple[int, float], int] = {}
@@ -118,7 +99,7 @@ FARTHEST = 40.0
 def _exponentiate(row, n):
     """Replace the first ``n`` entries x >= 0 by exp(-min(x, FARTHEST)), to 12 digits.
 
-    The Taylor polynomial of exp(-x / 64), squared six times: multiplications only, so the loop runs in vector registers.
+    By the Taylor polynomial of exp(-x / 64), squared six times: multiplications alone run in vector registers.
     """
     for j in range(n):
         x = row[j]
@@ -220,16 +201,12 @@ def _still_factors(effect, mappings, bandwidth, still):
 
 @compiled
 def transition_compliance(state, effect, reward, source, mappings, bandwidths, scratch, table):
-    """
-    Compute the compliance of one target transition through every state mapping, for every source action (Eq. 5).
+    """Compute the compliance of one target transition through every state mapping, for every source action (Eq. 5).
 
-    The transition function's factor is the mean of phi(d(s', s + (s_j' - s_j))) weighted by w_ij (Eq. 2), the reward
-    function's the mean of phi(|r - r_j|), both over the source instances of one action. An unmapped variable adds nothing to
-    where a transition starts, and is predicted not to change.
+    An unmapped variable adds nothing to where a transition starts, and is predicted not to change.
 
     :param state: unit coordinates of the target, shape (n_target_variables,); ``effect``: next state minus state
-    :param source: Instances; ``mappings``: MappingTable; ``bandwidths``: Bandwidths; ``scratch``: ComplianceScratch for
-        ``mappings``, which has the start bandwidths; plain tuples
+    :param scratch: ComplianceScratch for ``mappings``; plain tuple, as the other structures
     :param table: receives the compliances, shape (n_state_mappings, n_source_actions); 0 where no instance is near
     """
     source, mappings, scratch = Instances(*source), MappingTable(*mappings), ComplianceScratch(*scratch)
@@ -245,13 +222,10 @@ _transition_compliance = EntryPoint(transition_compliance)
 
 
 class ComplianceTable:
-    """
-    Computes compliance with all candidates of a set, one transition after the other.
+    """Computes compliance with all candidates of a set, one transition after the other.
 
-    :param candidates: the candidates of every target action
     :param bandwidths: of Eq. 2, but for those of starts
     :param starts: start bandwidth of each state mapping, shape (n_state_mappings,)
-    :param min_evidence: see ``ComplianceScratch``; ``periodic``: the same
     """
 
     def __init__(
@@ -280,11 +254,7 @@ class ComplianceTable:
         _transition_compliance.call(*transition, *self._given)
 
     def no_change(self, transitions: RecordedTransitions, i: int) -> float:
-        """
-        Return the compliance of transition ``i`` with the no-change baseline.
-
-        It predicts that no variable changes, and any of the source's rewards, each as often as it occurs there.
-        """
+        """Compliance with the prediction of no change, and of each of the source's rewards as often as it occurs there."""
         effect, reward = transitions.effects[i], float(transitions.rewards[i])
         rewarded = self._fraction @ np.exp(-((reward - self._rewards) ** 2) / self._bandwidths.reward)
         return float(np.exp(-(effect @ effect) / self._bandwidths.outcome) * rewarded)

@@ -24,36 +24,24 @@ _add_to_sample, _choose, _select = EntryPoint(add_to_sample), EntryPoint(choose)
 
 @dataclass(frozen=True)
 class SelectionOptions:
-    """
-    How candidates are selected by compliance.
-
-    Those that are not named here are arguments of :class:`~sb3_combrel.transfer.methods.combrel.COMBREL`.
-
-    :param bandwidths: of compliance; ``starts``: the start bandwidth of each state mapping, shape (n_state_mappings,)
-    :param all_actions: transitions of all actions are neighbours, not those with the same action; for whole mappings
-    :param drawn: candidates are drawn in proportion to their mean compliance, instead of line 20
-    :param online: transitions of all episodes are recorded and used at once, not those of the first after its end
-    """
+    """How candidates are selected by compliance; most are arguments of COMBREL."""
 
     bandwidths: Bandwidths
-    starts: np.ndarray
+    starts: np.ndarray  # start bandwidth of each state mapping, shape (n_state_mappings,)
     n_neighbors: int
-    all_actions: bool
+    all_actions: bool  # transitions of all actions are neighbours, not those with the same action; for whole mappings
     neighbor_radius: float | None
-    drawn: bool
-    online: bool
+    drawn: bool  # candidates are drawn in proportion to their mean compliance, instead of line 20
+    online: bool  # transitions of all episodes are recorded and used at once, not those of the first after its end
     max_transitions: int
     min_evidence: float
     min_compliance: float
 
 
 class ComplianceSelector(Selector):
-    """
-    Selects the candidate with the highest mean compliance with the nearest recorded transitions (Algorithm 1).
+    """Selects the candidate with the highest mean compliance with the nearest recorded transitions (Algorithm 1).
 
     The compliance of a transition (lines 9-13) is computed when a choice first needs it.
-
-    :param options: how candidates are selected
     """
 
     makes_choices = True
@@ -163,21 +151,17 @@ class ComplianceSelector(Selector):
         return changed
 
     def _use(self, i: int) -> None:
-        """Make transition ``i`` a neighbour for its action, or for all."""
+        """Make transition ``i`` a neighbour for its action, or for all, also of sample states."""
         if i >= len(self._cache.required):
             self._set_cache(self._cache.grown())
         for action in range(self.task.n_actions) if self.options.all_actions else [int(self.transitions.actions[i])]:
-            self._use_for(i, action)
-
-    def _use_for(self, i: int, action: int) -> None:
-        """List transition ``i`` under ``action``, and among the nearest of sample states."""
-        n = self._n_listed[action]
-        if n == self._listed.shape[1]:
-            self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)
-        self._listed[action, n] = i
-        self._n_listed[action] += 1
-        near, distance, due = self._near[action], self._distance[action], self._due[action]
-        _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
+            n = self._n_listed[action]
+            if n == self._listed.shape[1]:
+                self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)
+            self._listed[action, n] = i
+            self._n_listed[action] += 1
+            near, distance, due = self._near[action], self._distance[action], self._due[action]
+            _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
 
     def _renew(self, pairs: np.ndarray) -> np.ndarray:
         """Renew the choices of pairs of the sample; return those that changed."""

@@ -3,47 +3,38 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Protocol
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
-from sb3_combrel.transfer.instances.selectors import Ranges, Selector
+from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector
 from sb3_combrel.transfer.instances.translation import Translator
-from sb3_combrel.transfer.region_errors import RegionErrors
+from sb3_combrel.transfer.outcome_evidence import RegionErrors
+from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 
 # Relevance is renewed whenever this many times as many transitions are used as at the last time, from so many on.
 RELEVANCE_GROWTH = 1.2
 MIN_TRANSITIONS_FOR_RELEVANCE = 50
 
 
-class MeasureRelevance(Protocol):
-    """Writes to ``values`` the relevance of each candidate's instances to the first ``n_used`` recorded transitions."""
-
-    def __call__(self, *, n_used: int, values: np.ndarray) -> None: ...
-
-
 class InstanceTransfer:
-    """
-    Transfers source instances through mappings: a selector chooses the mappings, a translator the instances.
+    """Transfers source instances through mappings: a selector chooses the mappings, a translator the instances.
 
-    Methods of the same name mean what they do of :class:`~sb3_combrel.transfer.base.Transfer` and of
-    :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
+    Methods of the same name mean what they do of ``Transfer`` and of ``MappingTransfer``.
 
-    :param selector: it holds the candidates, the target task and the recorded transitions
-    :param translator: of the candidates' instances
-    :param breadth_decay: factor on the translator's breadth whenever the target's own transitions have contradicted what was
-        transferred (see :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`)
-    :param measure_relevance: used where the translator's instances come in the order of their relevance
+    :param breadth_decay: factor on the translator's breadth whenever the target has contradicted what was transferred
+    :param measure_relevance: writes to ``values`` the relevance of each candidate's instances to the first ``n_used``
+        recorded transitions; used where the translator's instances come in the order of it
     """
 
     #: There is no prior.
     version = 0
 
     def __init__(
-        self, selector: Selector, translator: Translator, *, breadth_decay: float, measure_relevance: MeasureRelevance
+        self, selector: Selector, translator: Translator, *, breadth_decay: float, measure_relevance: Callable[..., None]
     ):
         self.task = task = selector.task
         self.candidates: Candidates = selector.candidates
@@ -52,6 +43,7 @@ class InstanceTransfer:
         self.n_observed = 0
         self.transitions = selector.transitions
         self.selector = selector
+        self.makes_choices = selector.makes_choices
         self.translator = translator
         self.breadth_decay = breadth_decay
         self.measure_relevance = measure_relevance
@@ -108,11 +100,7 @@ class InstanceTransfer:
                 self._renew_relevance(n_used)
 
     def end_episode(self, truncated: bool) -> None:
-        """
-        Narrow the kernel after an episode that reached its time limit, if the target has contradicted what was transferred.
-
-        Where wrong instances reach the threshold everywhere, nothing would ever be explored.
-        """
+        """Narrow the kernel if the target has contradicted what was transferred: else nothing would ever be explored."""
         if self.check.end_episode(truncated) and self.breadth_decay < 1.0:
             self.translator.set_breadth(self.translator.rules.breadth * self.breadth_decay)
             self.all_changed = True
@@ -133,10 +121,6 @@ class InstanceTransfer:
         # Another order, for all states: one that is asked for when it is loaded must not differ from the others.
         self.all_changed = True
 
-    @property
-    def makes_choices(self) -> bool:
-        return self.selector.makes_choices
-
     def choices(self) -> np.ndarray:
         return self.selector.choices()
 
@@ -156,6 +140,43 @@ class InstanceTransfer:
             "transfer/breadth": self.translator.rules.breadth,
             **self.selector.statistics(),
         }
+
+    def report(self, method: str, statistics: Mapping[str, float]) -> TransferReport:
+        """Report what was transferred; ``method``: with its arguments, ``statistics``: its figures of the log."""
+        return TransferReport(
+            method=method,
+            use="instances",
+            sources=describe_sources(self.sources),
+            n_steps=self.n_observed,
+            n_rested=self.check.n_compared,
+            mappings=tuple(map(self._mapping_report, range(self.task.n_actions))),
+            error=self.errors.error(),
+            statistics=statistics,
+            **self.errors.report_fields(self.check.evidence),
+        )
+
+    def _mapping_report(self, action: int) -> MappingReport:
+        """Report the mapping of a target action whose instances were used most."""
+        parts_of = {each: self.candidates.parts(each) for each in self._uses}
+        of_action = {each: n for each, n in self._uses.items() if parts_of[each].target_action == action}
+        compared = int(self.errors.of_actions[action, 0])
+        words, share = "many mappings at once" if compared else "nothing was transferred", np.nan
+        if of_action:
+            best = max(of_action, key=lambda each: of_action[each])
+            words = f"{parts_of[best].source_action} with {parts_of[best].state_mapping}"
+            share = of_action[best] / sum(of_action.values())
+        sure = self.selector.confidence(action) or Confidence(np.nan, np.nan, np.nan)
+        return MappingReport(
+            target_action=self.task.action_names[action],
+            mapping=words,
+            share=share,
+            n_mappings=len(of_action),
+            compliance=sure.chosen,
+            next_best_compliance=sure.next_best,
+            no_change_compliance=sure.no_change,
+            error=float(self.errors.errors()[action]),
+            n_compared=compared,
+        )
 
     def get_state(self) -> dict[str, np.ndarray]:
         uses = np.zeros(len(self.candidates))

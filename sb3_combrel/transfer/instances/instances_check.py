@@ -21,11 +21,9 @@ MAX_PENDING = 1024
 
 
 class InstancesCheck:
-    """
-    Compares what transferred instances predict with what the target then does, wherever the agent acted on them.
+    """Compares what transferred instances predict, their mean by weight, with what the target then does.
 
-    Their prediction is the mean of the instances that were transferred to a state and action, by weight. After an episode that
-    ran into its time limit they are contradicted if, since they last were,
+    After an episode that ran into its time limit they are contradicted if, since they last were,
 
     - at least ``MIN_COMPARED`` transitions were compared, and the error of the effects is larger than that of "no change"; or
     - the ends that they predict did not come on at least ``MIN_CONTRADICTIONS`` visits (see :class:`OutcomeEvidence`), and
@@ -34,9 +32,6 @@ class InstancesCheck:
       their time limit without one step on transferred instances, and all rewards are alike and not above 0.
 
     Wrong rewards do not count: the target's own transitions correct them where the agent goes.
-
-    :param sources: the source tasks' instances
-    :param threshold: weight that own and transferred instances of a pair must reach together
     """
 
     def __init__(self, sources: Sequence[SourceInstances], threshold: float):

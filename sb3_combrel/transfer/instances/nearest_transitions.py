@@ -10,19 +10,12 @@ from sb3_combrel.common.periodic import difference
 
 
 class ComplianceCache(NamedTuple):
-    """
-    Compliance of target transitions, computed once; that of transition i is with the candidates of its action only.
+    """Compliance of target transitions, computed once; that of transition i is with the candidates of its action only."""
 
-    :param compliance: float64, shape (n_transitions, most candidates of an action): with each of them, in their order
-    :param required: float64, shape (n_transitions,): what the mean compliance of the nearest transitions must exceed
-    :param measured: bool, shape (n_transitions,): whether the compliance has been computed
-    :param total: float64 scratch, shape (most candidates of an action,)
-    """
-
-    compliance: np.ndarray
-    required: np.ndarray
-    measured: np.ndarray
-    total: np.ndarray
+    compliance: np.ndarray  # float64, shape (n_transitions, most candidates of an action): with each, in their order
+    required: np.ndarray  # float64, shape (n_transitions,): what the mean compliance of the nearest must exceed
+    measured: np.ndarray  # bool, shape (n_transitions,): whether the compliance has been computed
+    total: np.ndarray  # float64 scratch, shape (most candidates of an action,)
 
     @classmethod
     def empty(cls, max_candidates: int, capacity: int = 64) -> "ComplianceCache":
@@ -36,22 +29,17 @@ class ComplianceCache(NamedTuple):
     def grown(self) -> "ComplianceCache":
         """Return a copy of twice the size."""
         return self._replace(
-            compliance=np.concatenate([self.compliance, np.empty_like(self.compliance)]),
-            required=np.concatenate([self.required, np.empty_like(self.required)]),
-            measured=np.concatenate([self.measured, np.zeros_like(self.measured)]),
+            **{name: np.concatenate([old, np.zeros_like(old)]) for name, old in self._asdict().items() if name != "total"}
         )
 
 
 @compiled
 def add_to_sample(i, state, sample, near, distance, due, apart):
-    """
-    Add transition ``i`` to the nearest ones of every sample state that has it among them.
+    """Add transition ``i`` to the nearest ones of every sample state that has it among them.
 
-    :param sample: (states of the sample, one variable a row, shape (n_variables, n_points): many at once in vector registers;
-        which variables are periodic, bool, shape (n_variables,))
-    :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none, updated
-    :param distance: squared distances to them, the limit for none, updated
-    :param due: bool, shape (n_points,): becomes True where it was added
+    :param sample: (its states, shape (n_variables, n_points): many at once in vector registers; periodic, (n_variables,))
+    :param near: int64, shape (n_points, n_neighbors): nearest transitions, -1 for none; ``distance``: squared, the limit for
+        none; ``due``: bool, shape (n_points,): becomes True where it was added
     :param apart: float64 scratch, shape (n_points,)
     """
     n_points = len(apart)
@@ -89,16 +77,13 @@ def add_neighbor(i, apart, near, distance):
 
 @part
 def find_nearest(query, recorded, limits, near, distance):
-    """
-    Find the nearest transitions of exact states and actions (line 17).
+    """Find the nearest transitions of exact states and actions (line 17).
 
-    :param query: (states, actions, own_weight), shapes (n, n_variables), (n,) and (n,): none are found where ``own_weight``
-        reaches the threshold
-    :param recorded: (states of the recorded transitions; those that count for each action, int64, shape (n_actions,
-        capacity); how many these are, shape (n_actions,); which state variables are periodic, bool, shape (n_variables,))
+    :param query: (states, actions, own_weight), n of each: none are found where ``own_weight`` reaches the threshold
+    :param recorded: (states of the transitions; those that count for each action, int64, shape (n_actions, capacity); how many
+        these are, shape (n_actions,); periodic, bool, shape (n_variables,))
     :param limits: (threshold, squared distance from which on a transition does not count)
     :param near: receives the transitions, the nearest first, -1 for none, int64, shape (at least n, n_neighbors)
-    :param distance: float64 scratch, same shape
     """
     states, actions, own_weight = query
     at, listed, n_listed, periodic = recorded
@@ -121,13 +106,10 @@ def find_nearest(query, recorded, limits, near, distance):
 
 @inner
 def choose_one(near, compliance, required, n_candidates, draw, total):
-    """
-    Choose a candidate by the mean compliance of the transitions ``near``; -1 if none exceeds what is required (lines 19-20).
+    """Choose a candidate by the mean compliance of ``near``; -1 if none exceeds what is required (lines 19-20).
 
-    :param n_candidates: of the action
     :param draw: a random number from [0, 1): each candidate that exceeds what is required is chosen with a probability in
         proportion to its mean compliance; below 0: the one with the highest is (of equal ones the first)
-    :param total: see ``ComplianceCache``
     """
     bar = 0.0
     total[:n_candidates] = 0.0
@@ -169,14 +151,10 @@ def same_neighbors(near, others):
 
 @compiled
 def choose(rows, actions, near, cache, first, draws, choice):
-    """
-    Renew the choices of some rows; those for which it changed are moved to the front of ``rows``.
+    """Renew the choices of some rows; those for which it changed are moved to the front of ``rows``.
 
-    :param rows: int64, shape (n,): rows of ``near`` and ``choice``
-    :param actions: int64, shape (n,): their actions
-    :param near: int64, shape (at required n, n_neighbors): nearest transitions, -1 for none
-    :param cache: ComplianceCache as a plain tuple, in which they are measured
-    :param first: see ``CandidateArrays``
+    :param rows: int64, shape (n,): rows of ``near`` and ``choice``; ``actions``: same shape
+    :param cache: ComplianceCache as a plain tuple, in which all neighbours are measured
     :param draws: a random number for each of ``rows``; or nothing, shape (0,): the best is chosen (see ``choose_one``)
     :param choice: int64: candidates, -1 for none, updated
     :return: how many changed
@@ -204,13 +182,11 @@ def choose(rows, actions, near, cache, first, draws, choice):
 
 @compiled
 def select(query, recorded, limits, cache, first, draws, found):
-    """
-    Choose candidates for exact states and actions (lines 17-20), if all that are needed have been measured.
+    """Choose candidates for exact states and actions (lines 17-20), if all that are needed have been measured.
 
-    :param query: see :func:`find_nearest`; ``recorded`` and ``limits``: the same
+    :param query: as ``recorded`` and ``limits``: see :func:`find_nearest`
     :param draws: a random number for each action; or nothing; the rest as in :func:`choose`
-    :param found: (nearest transitions, scratch for their distances, first candidate, one past the last: none if equal); see
-        :func:`find_nearest` for the first two; the others int64, shape (at least n,)
+    :param found: (nearest transitions, their distances, first candidate, one past the last: none if equal), at least n of each
     :return: whether all nearest transitions have been measured; otherwise nothing is chosen
     """
     cache = ComplianceCache(*cache)

@@ -1,7 +1,5 @@
 """Relevance: which source instances are to be transferred first (Eqs. 4 and 7, and one of this package)."""
 
-from functools import partial
-
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inner
@@ -20,11 +18,9 @@ def renew_relevance(
     values: np.ndarray,
     mu: float | None,
 ) -> None:
-    """
-    Compute the relevance of all source instances, through every candidate, to recorded target transitions.
+    """Compute the relevance of all source instances, through every candidate, to recorded target transitions.
 
     :param n_used: so many of the transitions count, the first ones
-    :param periodic: which state variables of the target are periodic, bool, shape (n_variables,)
     :param values: receives the relevances, shape (n_candidates, most instances of an action)
     :param mu: fraction of the weight of Eq. 4; None: the relevance that does not favour distant instances
     """
@@ -44,20 +40,12 @@ def renew_relevance(
             _relevance.call(target, candidates.instances, source_action, mapping, of_row, mu, weight, values[c])
 
 
-renew_near_relevance = partial(renew_relevance, mu=None)
-
-
 @compiled
 def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
-    """
-    Compute ``equations.source_relevances``, through one state mapping.
+    """Compute ``equations.source_relevances``, through one state mapping.
 
-    :param target: (states, effects, rewards) of the transitions with one target action: unit coordinates, shape (n,
-        n_target_variables); next states minus states, same shape; raw, shape (n,)
-    :param source: Instances of the source; ``action``: the source action
-    :param mapping: (source variable of each target variable, -1 for none; sign, -1 where mirrored; whether the target
-        variable is periodic)
-    :param bandwidths: of Eq. 2; ``mu``: fraction of the weight of Eq. 4
+    :param target: (states, effects, rewards) of the n transitions with one target action
+    :param mapping: (source variable of each target variable, -1 for none; sign; whether the target variable is periodic)
     :param weight: float64 scratch, at least shape (n,)
     :param values: receives the relevances, at least as many as ``source.size[action]``
     """
@@ -74,11 +62,7 @@ def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
 
 @compiled
 def near_relevance(target, source, action, mapping, bandwidths, weight, evidence, values):
-    """
-    Compute the relevance that does not favour distant instances (``equations.near_relevances``), as :func:`relevance`.
-
-    :param evidence: float64 scratch, at least as many as ``source.size[action]``
-    """
+    """Compute ``equations.near_relevances``, as :func:`relevance`; ``evidence``: float64 scratch, shaped as ``values``."""
     n = source.size[action]
     total = 0.0
     complied = 0.0
@@ -124,8 +108,7 @@ def _compliance(j, target, source, action, mapping, bandwidths, weight):
 
 @inner
 def _mean_distance(weight, total, mu, bandwidth):
-    """
-    Return d_j of Eq. 4: mean distance of the heaviest transitions whose sum stays below ``mu`` of the weight, at least one.
+    """Return d_j of Eq. 4: mean distance of the heaviest transitions whose sum stays below ``mu`` of the weight, at least one.
 
     The weights are used up; distances are read back from them. A sum that reaches ``mu`` but for rounding does not stay below.
     """

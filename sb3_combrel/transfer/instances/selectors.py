@@ -24,16 +24,10 @@ class SelectorParts(NamedTuple):
 
 
 class Confidence(NamedTuple):
-    """
-    How sure choices are: mean compliances with the nearest transitions, averaged over states of the sample.
-
-    :param chosen: of the candidates chosen
-    :param next_best: of the best of all others there; NaN if there are none
-    :param no_change: of the no-change baseline
-    """
+    """How sure choices are: mean compliances with the nearest transitions, averaged over states of the sample."""
 
     chosen: float
-    next_best: float
+    next_best: float  # of the best of all others there; NaN if there are none
     no_change: float
 
 
@@ -53,11 +47,7 @@ class Selector(ABC):
 
     @abstractmethod
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        """
-        Select candidates for states and actions, without leaving a trace; parameters as of ``Transfer.transferred``.
-
-        :return: first candidate, and one past the last (equal: none), int64, shape (n,)
-        """
+        """Select candidates, the first and one past the last (equal: none), int64, shape (n,), without leaving a trace."""
 
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         """Select candidates for states of the finite sample, given by their numbers; called for learning only."""
@@ -106,11 +96,7 @@ class Selector(ABC):
 
 
 class FixedSelector(Selector):
-    """
-    Selects one candidate for each action, the same in every state.
-
-    :param fixed: candidate of each target action, int64, shape (n_actions,)
-    """
+    """Selects one candidate for each target action, ``fixed``, the same in every state."""
 
     makes_choices = True
 
@@ -126,11 +112,7 @@ class FixedSelector(Selector):
 
 
 class RandomSelector(Selector):
-    """
-    Selects at random: whenever a state of the sample is asked for; elsewhere one an action until the next transition.
-
-    So a prediction that is asked for twice is the same, and draws no random numbers.
-    """
+    """Selects at random: whenever a state of the sample is asked for; elsewhere one an action until the next transition."""
 
     def __init__(self, parts: SelectorParts):
         super().__init__(parts)

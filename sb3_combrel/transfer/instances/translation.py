@@ -33,75 +33,39 @@ class CandidateMappings(NamedTuple):
 
 
 class TranslationRules(NamedTuple):
-    """
-    When and how instances are translated: see ``equations.TransferRules`` for the first four, and
-
-    :param transfer_terminals: whether an instance that ended a source episode ends the target's
-    :param by_relevance: whether instances come in the order of their relevance, not of their distance
-    :param times_weight: of their relevance times their weight
-    """
+    """When and how instances are translated: see ``equations.TransferRules`` for the first four."""
 
     threshold: float
     breadth: float
     min_weight: float
     min_fraction: float
-    transfer_terminals: bool
-    by_relevance: bool
-    times_weight: bool = False
+    transfer_terminals: bool  # whether an instance that ended a source episode ends the target's
+    by_relevance: bool  # whether instances come in the order of their relevance, not of their distance
+    times_weight: bool = False  # of their relevance times their weight
 
 
 class TranslationScratch(NamedTuple):
-    """
-    Work space: the instances selected at one state, best first, with room for one more than are ever needed.
+    """Work space: the instances selected at one state, best first, with room for one more than are ever needed."""
 
-    :param number: int64, shape (room, 2): instance and candidate
-    :param value: float64, shape (room, 2): what it is ranked by, and its weight
-    :param variable: int64, shape (n_variables,): source variables that a candidate compares with
-    :param at: float64, same shape: where the state lies along each; ``periodic``: bool, whether it wraps there
-    :param gap: float64, shape (n_blocks,): squared distances of the blocks' boxes
-    :param full: bool, shape (1,): an instance that was needed did not fit
-    :param enters: float64, shape (1,): an instance of no higher rank than this is not needed
-    """
-
-    number: np.ndarray
-    value: np.ndarray
-    variable: np.ndarray
-    at: np.ndarray
-    periodic: np.ndarray
-    gap: np.ndarray
-    full: np.ndarray
-    enters: np.ndarray
-
-    @classmethod
-    def empty(cls, max_instances: int, n_variables: int, n_blocks: int) -> TranslationScratch:
-        """Make work space for ``max_instances`` a state."""
-        return cls(
-            number=np.empty((max_instances + 1, 2), dtype=np.int64),
-            value=np.empty((max_instances + 1, 2)),
-            variable=np.empty(n_variables, dtype=np.int64),
-            at=np.empty(n_variables),
-            periodic=np.zeros(n_variables, dtype=np.bool_),
-            gap=np.empty(n_blocks),
-            full=np.zeros(1, dtype=np.bool_),
-            enters=np.zeros(1),
-        )
+    number: np.ndarray  # int64, shape (room, 2): instance and candidate
+    value: np.ndarray  # float64, shape (room, 2): what it is ranked by, and its weight
+    variable: np.ndarray  # int64, shape (n_variables,): source variables that a candidate compares with
+    at: np.ndarray  # float64, same shape: where the state lies along each
+    periodic: np.ndarray  # bool, same shape: whether it wraps there
+    gap: np.ndarray  # float64, shape (n_blocks,): squared distances of the blocks' boxes
+    full: np.ndarray  # bool, shape (1,): an instance that was needed did not fit
+    enters: np.ndarray  # float64, shape (1,): an instance of no higher rank than this is not needed
 
 
 class TranslationArrays(NamedTuple):
-    """
-    All that the translator's loops read, and their work space.
-
-    :param source: the source instances
-    :param relevance: float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
-    :param periodic: bool, shape (n_target_variables,): translated instances lie in the target's space, which wraps along these
-    """
+    """All that the translator's loops read, and their work space."""
 
     source: Instances
     mappings: CandidateMappings
     rules: TranslationRules
-    relevance: np.ndarray
+    relevance: np.ndarray  # float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
     scratch: TranslationScratch
-    periodic: np.ndarray
+    periodic: np.ndarray  # bool, shape (n_target_variables,): the target's variables that wrap
 
     def plain(self) -> tuple[Any, ...]:
         """The same as plain tuples (see ``common.compiled``)."""
@@ -118,14 +82,12 @@ def as_arrays(plain):
 
 @part
 def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
-    """
-    Add an instance to the list of the selected, the highest rank first, and cut what is not needed any more.
+    """Add an instance to the list of the ``kept`` selected, the highest rank first, and cut what is not needed any more.
 
     An instance is needed while those before it and ``own`` do not reach the threshold, and while it has at least
     ``min_fraction`` of their weight. These sums only grow, so what is cut once would be cut for ever.
 
-    :param kept: how many are in the list
-    :return: how many are now, and the least weight with which a further instance could enter (by weight)
+    :return: how many are kept now, and the least weight with which a further instance could enter (by weight)
     """
     number, value = scratch.number, scratch.value
     room = len(value) - 1
@@ -157,13 +119,7 @@ def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
 
 @part
 def add_near_instances(state, own, candidate, arrays, kept):
-    """
-    Add the translated instances of one candidate that weigh at least ``min_weight`` at ``state`` to the selected.
-
-    :param own: weight of the target's own instances at ``state``
-    :param kept: how many are selected
-    :return: how many are now
-    """
+    """Add a candidate's instances that weigh at least ``min_weight`` at ``state`` to the ``kept`` selected; how many now."""
     source, rules, scratch = arrays.source, arrays.rules, arrays.scratch
     row = arrays.mappings.row[candidate]
     action = arrays.mappings.action[candidate]
@@ -261,12 +217,10 @@ def write_row(s, own, kept, arrays, transferred):
 
 @compiled
 def translate(states, own, ranges, arrays, transferred):
-    """
-    Translate instances for states and actions (see ``Transfer.transferred``).
+    """Translate instances for n states and actions (see ``Transfer.transferred``).
 
-    :param states: unit coordinates, shape (n, n_variables)
-    :param own: weight of the target's own instances there, shape (n,)
-    :param ranges: (first candidate whose instances may be used, one past the last: none if equal), shape (n,) each
+    :param own: weight of the target's own instances there
+    :param ranges: (first candidate whose instances may be used, one past the last: none if equal)
     :param arrays: ``TranslationArrays.plain``
     :param transferred: TransferredInstances as a plain tuple, receives the instances, at least n rows
     """
@@ -287,13 +241,9 @@ _translate = EntryPoint(translate)
 
 
 class Translator:
-    """
-    Translates instances of selected candidates.
+    """Translates instances of selected candidates.
 
-    :param candidates: the candidates of every target action
-    :param task: the target task
-    :param breadth: kernel breadth of transferred instances, unit coordinates
-    :param transfer_terminals: see ``TranslationRules``; ``by_relevance`` and ``times_weight``: the same
+    :param breadth: kernel breadth of transferred instances, unit coordinates; the others: see ``TranslationRules``
     """
 
     def __init__(
@@ -333,35 +283,32 @@ class Translator:
     def _set_arrays(self, arrays: TranslationArrays) -> None:
         # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
         self._arrays, self._plain_arrays = arrays, arrays.plain()
+        #: When and how instances are translated; and their relevance, which is written to from outside.
+        self.rules, self.relevance = arrays.rules, arrays.relevance
 
     def _make_scratch(self) -> TranslationScratch:
-        return TranslationScratch.empty(self._max_instances, self._n_variables, self._n_blocks)
+        return TranslationScratch(
+            number=np.empty((self._max_instances + 1, 2), dtype=np.int64),
+            value=np.empty((self._max_instances + 1, 2)),
+            variable=np.empty(self._n_variables, dtype=np.int64),
+            at=np.empty(self._n_variables),
+            periodic=np.zeros(self._n_variables, dtype=np.bool_),
+            gap=np.empty(self._n_blocks),
+            full=np.zeros(1, dtype=np.bool_),
+            enters=np.zeros(1),
+        )
 
     def _make_room(self, n: int) -> None:
         self._room = n
         self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
         self._plain_transferred = tuple(self._transferred)
 
-    @property
-    def rules(self) -> TranslationRules:
-        """When and how instances are translated."""
-        return self._arrays.rules
-
-    @property
-    def relevance(self) -> np.ndarray:
-        """See ``TranslationArrays``; to be written to."""
-        return self._arrays.relevance
-
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""
         self._set_arrays(self._arrays._replace(rules=self.rules._replace(breadth=breadth)))
 
     def __call__(self, states: np.ndarray, own_weight: np.ndarray, ranges: Ranges) -> TransferredInstances:
-        """
-        Translate instances for states and actions, see :func:`translate`.
-
-        :return: instances, in arrays that the next call uses again
-        """
+        """Translate instances for states and actions, see :func:`translate`, in arrays that the next call uses again."""
         if len(own_weight) > self._room:
             self._make_room(2 * len(own_weight))
         _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)

@@ -23,9 +23,8 @@ from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappedVariables, MappingsLike, SourceLike, load_sources
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
-from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer, MeasureRelevance
-from sb3_combrel.transfer.instances.relevance import renew_near_relevance, renew_relevance
-from sb3_combrel.transfer.instances.report_of_instances import report_of_instances
+from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
+from sb3_combrel.transfer.instances.relevance import renew_relevance
 from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
 from sb3_combrel.transfer.instances.translation import Translator
 from sb3_combrel.transfer.prior.prior_sets import is_factored
@@ -160,15 +159,15 @@ class MappingTransfer(Transfer):
             selector,
             self._make_translator(self.candidates, task, float(self.breadth)),
             breadth_decay=self.breadth_decay,
-            measure_relevance=self._relevance_to(parts.transitions, bandwidths),
+            measure_relevance=partial(
+                renew_relevance,
+                self.candidates,
+                parts.transitions,
+                bandwidths=bandwidths,
+                periodic=self._periodic,
+                mu=None if self.relevance == NEAR else float(self.relevance_fraction),
+            ),
         )
-
-    def _relevance_to(self, transitions: RecordedTransitions, bandwidths: CandidateBandwidths) -> MeasureRelevance:
-        """Return what measures the candidates' relevance to recorded transitions."""
-        given: dict[str, Any] = dict(bandwidths=bandwidths, periodic=self._periodic)
-        if self.relevance == NEAR:
-            return partial(renew_near_relevance, self.candidates, transitions, **given)
-        return partial(renew_relevance, self.candidates, transitions, **given, mu=float(self.relevance_fraction))
 
     def _whole_mappings(self) -> bool:
         """Return whether whole mappings are the candidates."""
@@ -320,7 +319,7 @@ class MappingTransfer(Transfer):
             raise ValueError("there is nothing to report before learning: call model.learn(total_timesteps) first")
         if self.use == "prior":
             return report_of_prior(repr(self), self.source_prior, self.statistics())
-        return report_of_instances(repr(self), self._instances, self.statistics())
+        return self._instances.report(repr(self), self.statistics())
 
     def get_state(self) -> dict[str, np.ndarray]:
         return self._source_use.get_state()

@@ -16,7 +16,7 @@ from sb3_combrel.transfer.methods import soft_mapping as soft
 from sb3_combrel.transfer.methods.soft_mapping import Logits
 from sb3_combrel.transfer.prior.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
 from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
-from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
 
 # Each mapping predicts every transition that is fitted to with each source action.
@@ -114,7 +114,7 @@ class SoftHomomorphism(Transfer):
         self._logits: Logits | None = None
         self._mixture = soft.MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
         self._periodic = np.array(task.periodic)
-        self._transitions = RecordedEpisodes(d)
+        self._transitions = RecordedTransitions(d)
         self._claims = Claims(source.rewards, task, self.transfer_terminals)
         # Squared errors of predictions, and squared effects, of transitions as they came.
         self._squares = np.zeros(2)

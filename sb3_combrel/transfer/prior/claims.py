@@ -7,7 +7,7 @@ import numpy as np
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.outcome_evidence import GOES_ON, OutcomeEvidence
-from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # What is predicted through, and what is claimed, is renewed first after so many transitions of the target, and whenever this
 # many times as much has been observed as at the last time.
@@ -31,8 +31,7 @@ TRUST_STEP = 0.1
 
 
 def part_explained(unexplained: np.ndarray, n_covered: np.ndarray) -> np.ndarray:
-    """
-    Return which part of the effects is explained, for each target action, of the variable of which least is.
+    """Return which part of the effects is explained, for each target action, of the variable of which least is.
 
     :param unexplained: how much is not explained of the target's transitions, as a number of them, shape (n_target_actions,
         n_target_variables); ``n_covered``: of how many, same shape
@@ -42,13 +41,9 @@ def part_explained(unexplained: np.ndarray, n_covered: np.ndarray) -> np.ndarray
 
 
 def trust_in(unexplained: np.ndarray, n_covered: np.ndarray) -> np.ndarray:
-    """
-    Return how far a source is trusted: as far as it explains the target's effects, in steps.
+    """Return how far a source is trusted, as far as it explains the target's effects: 0 to 1, shape (n_target_actions,).
 
-    Not at all if it explains less than ``MIN_EXPLAINED`` of what has been seen of a variable, or if so little has been seen
-    that less than ``LEAST_TRUST`` would be left. Parameters: see :func:`part_explained`.
-
-    :return: from 0 to 1, shape (n_target_actions,)
+    0 if it explains less than ``MIN_EXPLAINED`` of what was seen of a variable, or less than ``LEAST_TRUST`` would be left.
     """
     explained = part_explained(unexplained, n_covered)
     believed = (unexplained <= (1.0 - MIN_EXPLAINED) * n_covered).all(axis=1) & (explained >= LEAST_TRUST)
@@ -56,20 +51,14 @@ def trust_in(unexplained: np.ndarray, n_covered: np.ndarray) -> np.ndarray:
 
 
 class Claims:
-    """
-    What a prior claims to know without instances of the target, and which of its effects are used.
+    """What a prior claims to know without instances of the target, and which of its effects are used.
 
     The weight of a prediction is ``CLAIMED_WEIGHT`` times that of the source's data there, times the trust in the source for
-    the target action, see :func:`trust_in`. It is 0 while the source's ends or rewards are doubted (see
-    :class:`~sb3_combrel.transfer.outcome_evidence.OutcomeEvidence`), and of transitions that may end unless predicted ends
-    have been seen to come. A probability of termination below ``GOES_ON`` is none.
+    the target action, see :func:`trust_in`. It is 0 while the source's ends or rewards are doubted (see ``OutcomeEvidence``),
+    and of transitions that may end unless predicted ends have been seen to come.
 
     Effects are the mean that the target's own instances are fitted to where nothing is claimed, too. Only those on variables
     of which the source turns out to explain less than ``MIN_EXPLAINED`` under the action are 0.
-
-    :param rewards: of the sources' instances
-    :param task: the target task
-    :param transfer_terminals: whether the source's ends are used at all
     """
 
     def __init__(self, rewards: np.ndarray, task: TargetTask, transfer_terminals: bool):
@@ -84,19 +73,11 @@ class Claims:
         self._noted = self._believed()
 
     def _believed(self) -> tuple[bool, bool]:
-        return self.evidence.doubted, self._ends_believed
-
-    @property
-    def _ends_believed(self) -> bool:
-        return self.transfer_terminals and self.evidence.ends_believed
+        """Whether ends and rewards are doubted, and whether ends are believed."""
+        return self.evidence.doubted, self.transfer_terminals and self.evidence.ends_believed
 
     def renew(self, unexplained: np.ndarray, n_covered: np.ndarray, predicted: np.ndarray | bool = True) -> bool:
-        """
-        Renew :attr:`trust` and :attr:`explains`; return whether either has changed.
-
-        :param unexplained: as in :func:`part_explained`; ``n_covered``: same
-        :param predicted: which effects the source says anything of, bool, same shape; True: all
-        """
+        """Renew trust and explains, see ``part_explained``; whether either changed. ``predicted``: which effects count."""
         trust = trust_in(unexplained, n_covered)
         explained = unexplained <= (1.0 - MIN_EXPLAINED) * n_covered
         explains = (n_covered < MIN_TRANSITIONS) | explained | ~np.asarray(predicted)
@@ -114,39 +95,25 @@ class Claims:
         return self._noted != before
 
     def weight(self, end: np.ndarray, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """
-        Return the weight that is claimed for predictions.
-
-        :param end: probability of termination that is predicted, shape (n,); ``coverage``: weight of the source's data
-        :param actions: target actions, int64, same shape
-        """
-        if self.evidence.doubted:
+        """Return the weight that is claimed; ``end``: predicted termination, ``coverage``: weight of the source's data."""
+        doubted, ends_believed = self._believed()
+        if doubted:
             return np.zeros(len(actions))
         weight = CLAIMED_WEIGHT * coverage * self.trust[actions]
-        if not self._ends_believed:
+        if not ends_believed:
             weight[end >= GOES_ON] = 0.0
         return weight
 
     def restrict(
         self, effect: np.ndarray, reward: np.ndarray, end: np.ndarray, coverage: np.ndarray, actions: np.ndarray
     ) -> PriorPredictions:
-        """
-        Restrict what the source predicts to what it explains and claims to know.
-
-        :param effect: shape (n, n_target_variables); it may be overwritten
-        :param reward: raw, shape (n,); ``end``, ``coverage`` and ``actions``: see :meth:`weight`
-        """
+        """Restrict predictions, see :meth:`weight`, to what is explained and claimed; ``effect`` may be overwritten."""
         if not self.explains.all():
             effect *= self.explains[actions]
         return PriorPredictions(effect, reward, np.where(end < GOES_ON, 0.0, end), self.weight(end, coverage, actions))
 
-    def replay(self, seen: RecordedEpisodes, reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> None:
-        """
-        Count anew what confirms and contradicts the ends and rewards that are predicted now.
-
-        :param seen: the target's recorded transitions
-        :param reward: predicted of each; ``end`` and ``weight``: probability of termination, and weight of the source's data
-        """
+    def replay(self, seen: RecordedTransitions, reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> None:
+        """Count anew what confirms and contradicts the ends and rewards predicted now of transitions ``seen``."""
         self.evidence.forget()
         for i, ended in enumerate(seen.ended[: seen.n].tolist()):
             self.evidence.note(

@@ -28,14 +28,12 @@ Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Copies:
-    """
-    Copies of sources in the target: each makes some target variables variables of a source.
+    """Copies of sources in the target: each makes some target variables variables of a source.
 
     A copy that leaves out source variables is predicted by a local linear model of the others alone. Where an end depends on
     those left out, its probability is an average over them, and small everywhere; so it is in parts of the largest that the
     model predicts of the instances which have ended an episode.
 
-    :param sources: instances of each source task
     :param source: number of each copy's source, int64, shape (n_copies,)
     :param state: source variable of each target variable, int64, shape (n_copies, n_target_variables), -1: not in the copy
     :param sign: -1 where a target variable is mirrored, same shape
@@ -81,25 +79,16 @@ class Copies:
             n_actions=np.array([sources[s].n_actions for s in source], dtype=np.int64),
         )
         self._plain_table = tuple(self.table)
+        #: Number of actions of the source that has most.
+        self.most_actions = int(self.table.n_actions.max())
         d = state.shape[1]
         self._scratch = tuple(CopyScratch(np.empty(n_variables), np.empty(n_variables), np.empty(d), np.empty(d)))
 
     def __len__(self) -> int:
         return len(self.source)
 
-    @property
-    def most_actions(self) -> int:
-        """Number of actions of the source that has most."""
-        return int(self.table.n_actions.max())
-
     def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums, whole: bool) -> None:
-        """
-        Add a target transition to the sums.
-
-        :param state: unit coordinates, shape (n_target_variables,); ``effect``: next state minus state
-        :param whole: whether compliance is over all target variables, of which those that a copy does not have stay; or over
-            its own
-        """
+        """Add a target transition to the sums; ``whole``: variables that a copy does not have count as well, as staying."""
         rules = whole, self.threshold
         _add_transition.call(self.model.plain, self._plain_table, rules, (state, action, effect), tuple(sums), self._scratch)
 
@@ -109,12 +98,7 @@ class Copies:
         _add_used.call(self._plain_table, tuple(uses), (action, effect, predicted[0][0], covered), tuple(sums))
 
     def uses(self, copies: np.ndarray, actions: np.ndarray) -> Uses:
-        """
-        List what makes up each target action.
-
-        :param copies: int64, shape (n_target_actions, n): copies, -1 for none
-        :param actions: same shape: the source action of each, -1 for none
-        """
+        """List what makes up each target action; ``copies`` and ``actions`` as of ``Choice``."""
         number: dict[tuple[int, int], int] = {}
         of_action = np.full(copies.shape, -1, dtype=np.int64)
         for a, c in np.argwhere((copies >= 0) & (actions >= 0)):
@@ -131,13 +115,8 @@ class Copies:
         return UsePredictions(np.zeros(n, dtype=np.bool_), np.empty((n + 1, self.model.n_variables)), np.empty((n + 1, 3)))
 
     def predict(self, uses: Uses, found: UsePredictions, states: np.ndarray, actions: np.ndarray) -> Predicted:
-        """
-        Predict pairs of the target.
+        """Predict pairs of the target, in work space ``found``.
 
-        :param uses: of each target action
-        :param found: from :meth:`work_space`
-        :param states: unit coordinates of the target, float64, shape (n, n_target_variables)
-        :param actions: target actions, int64, shape (n,)
         :return: effects, shape (n, n_target_variables), 0 for variables in no copy; mean rewards; products of probabilities of
             termination; and the least weights of all copies, 0 for actions that are not complete
         """
@@ -188,12 +167,7 @@ class Copies:
         return mapping.with_names(source.state_names, task.state_names, source.action_names, task.action_names)
 
     def _end_scale(self, number: int, used: tuple[int, ...], first: int) -> float:
-        """
-        One over the largest probability of termination at the instances of a source that have ended an episode, or 1.
-
-        :param used: those of the source's variables that a copy has; 1 for all of them
-        :param first: the model's number of the source's first action
-        """
+        """One over the largest probability of termination where episodes ended, or 1 for a copy of all variables."""
         source = self.sources[number]
         ended = np.flatnonzero(source.terminated)
         if len(used) == source.n_variables or len(ended) == 0:
@@ -204,10 +178,7 @@ class Copies:
         return 1.0 / largest if largest > 0.0 else 1.0
 
     def _typical_effects(self, by_action: bool) -> np.ndarray:
-        """How much each source moves what a copy makes of it, see :func:`_typical_effects_of`.
-
-        :return: shape (n_copies, n_target_variables); 0 for variables that are not in the copy
-        """
+        """How much each source moves its copies, shape (n_copies, n_target_variables); 0 for variables not in one."""
         typical = [_typical_effects_of(source, by_action) for source in self.sources]
         found = np.zeros(self.state.shape)
         for copy, (number, row) in enumerate(zip(self.source.tolist(), self.state, strict=True)):

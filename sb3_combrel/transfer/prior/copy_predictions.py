@@ -11,51 +11,35 @@ from sb3_combrel.transfer.source_model import predict_source, source_arrays
 
 
 class CopyTable(NamedTuple):
-    """Copies of sources for compiled code, one a row.
+    """Copies of sources for compiled code, one a row."""
 
-    :param variable: int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
-    :param sign: float64, same shape: -1 where it is mirrored
-    :param share: float64, shape (n_copies, n_source_variables): 1 / number of target variables that a variable of the copy has
-    :param least: float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least, as of
-        all actions; ``most``: that may grow to this, as of the action that moves the variable most, where the target does
-    :param end_scale: float64, shape (n_copies,): factor on probabilities of termination, which are 1 at most
-    :param first: int64, shape (n_copies,): the model's number of the source's first action; ``n_actions``: same shape
-    """
-
-    variable: np.ndarray
-    sign: np.ndarray
-    share: np.ndarray
+    variable: np.ndarray  # int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
+    sign: np.ndarray  # float64, same shape: -1 where it is mirrored
+    share: np.ndarray  # float64, shape (n_copies, n_source_variables): 1 / number of target variables that it has
+    # Float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least, as of all actions;
+    # and what it may grow to where the target moves more, as of the action that moves the variable most.
     least: np.ndarray
     most: np.ndarray
-    end_scale: np.ndarray
-    first: np.ndarray
-    n_actions: np.ndarray
+    end_scale: np.ndarray  # float64, shape (n_copies,): factor on probabilities of termination, which are 1 at most
+    first: np.ndarray  # int64, shape (n_copies,): the model's number of the source's first action
+    n_actions: np.ndarray  # int64, same shape
 
 
 class Uses(NamedTuple):
-    """The copies and source actions that make up each target action, each pair of them once.
+    """The copies and source actions that make up each target action, each pair of them once."""
 
-    :param copy: int64, shape (n_uses,): copy; ``action``: the model's number of the source action
-    :param of_action: int64, shape (n_target_actions, most copies): uses of each target action, -1 for none
-    :param complete: bool, shape (n_target_actions,): whether every copy of the action has a source action
-    """
-
-    copy: np.ndarray
-    action: np.ndarray
-    of_action: np.ndarray
-    complete: np.ndarray
+    copy: np.ndarray  # int64, shape (n_uses,)
+    action: np.ndarray  # int64, same shape: the model's number of the source action
+    of_action: np.ndarray  # int64, shape (n_target_actions, most copies): uses of each target action, -1 for none
+    complete: np.ndarray  # bool, shape (n_target_actions,): whether every copy of the action has a source action
 
 
 class UsePredictions(NamedTuple):
-    """What each use predicts at one state: work space of :func:`predict_pairs`.
+    """What each use predicts at one state: work space of :func:`predict_pairs`."""
 
-    :param done: bool, shape (n_uses,); ``effect``: float64, shape (n_uses, n_source_variables)
-    :param outcome: float64, shape (n_uses, 3): reward, probability of termination, weight
-    """
-
-    done: np.ndarray
-    effect: np.ndarray
-    outcome: np.ndarray
+    done: np.ndarray  # bool, shape (n_uses,)
+    effect: np.ndarray  # float64, shape (n_uses + 1, n_source_variables): the last row is for a state as a copy has it
+    outcome: np.ndarray  # float64, shape (n_uses + 1, 3): reward, probability of termination, weight
 
 
 @inlined
@@ -70,11 +54,7 @@ def see_state(table, copy, state, at):
 
 @compiled
 def predict_pairs(source, table, uses, pairs, predicted, found):
-    """Predict target states and actions, see :func:`join_copies`.
-
-    :param source: ``SourceModel.plain``; ``table``: CopyTable; ``uses``: Uses; ``found``: UsePredictions; plain tuples
-    :param pairs: (states, actions)
-    """
+    """Predict target states and actions, ``pairs``, see :func:`join_copies`; the structures are plain tuples."""
     instances, effect_range, kernel, near = source_arrays(source)
     table, uses, found = CopyTable(*table), Uses(*uses), UsePredictions(*found)
     states, actions = pairs
@@ -101,11 +81,7 @@ def predict_pairs(source, table, uses, pairs, predicted, found):
 
 @inlined
 def join_copies(table, uses, action, i, effects, outcomes, predicted):
-    """Write what all copies predict of pair ``i``.
-
-    :param effects: float64, shape (n_uses, n_source_variables): of each use; ``outcomes``: float64, shape (n_uses, 3)
-    :param predicted: receives effects, mean rewards, the product of probabilities of termination, and the least weight
-    """
+    """Write to ``predicted``, see ``Copies.predict``, what all copies predict of pair ``i``; the others: of each use."""
     effect, reward, end, weight = predicted
     effect[i, :] = 0.0
     n = 0
@@ -133,8 +109,8 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
 def join_many(table, uses, actions, found, predicted):
     """:func:`join_copies` for many pairs.
 
-    :param found: for each use and pair, the number of its prediction, int64, shape (n_uses, n); and these predictions,
-        float64, shape (n_predictions, n_source_variables) and (n_predictions, 3)
+    :param found: of each use and pair the number of its prediction, int64, shape (n_uses, n); effects and outcomes of these,
+        shape (n_predictions, ...); and room for those of one pair
     """
     table, uses = CopyTable(*table), Uses(*uses)
     rows, effects, outcomes, effect_here, outcome_here = found

@@ -19,25 +19,19 @@ LARGEST_MISS = 2.0
 
 
 class CopySums(NamedTuple):
-    """Sums over the target's transitions, by target action.
+    """Sums over the target's transitions, by target action, float64.
 
-    :param n: float64, shape (n_target_actions,): transitions
-    :param size: float64, shape (n_target_actions, n_target_variables): sizes of effects
-    :param effect: float64, same shape: squared effects
-    :param stay: float64, same shape: compliances of each variable with "it stays as it is"
-    :param compliance: float64, shape (n_copies, n_target_actions, most source actions): compliances of each copy
-    :param error: float64, shape (n_copies, n_target_actions, most source actions, n_target_variables): squared errors
-    :param unexplained: float64, same shape: squared errors in parts of the squared effects, each at most
-        ``LARGEST_MISS``, times how much of the threshold the weight of the source's data reaches, at most 1
-    :param n_covered: float64, shape (n_copies, n_target_actions, most source actions): sums of these factors
+    "Of copies" is shape (n_copies, n_target_actions, most source actions).
     """
 
-    n: np.ndarray
-    size: np.ndarray
-    effect: np.ndarray
-    stay: np.ndarray
-    compliance: np.ndarray
-    error: np.ndarray
+    n: np.ndarray  # shape (n_target_actions,): transitions
+    size: np.ndarray  # shape (n_target_actions, n_target_variables): sizes of effects
+    effect: np.ndarray  # same shape: squared effects
+    stay: np.ndarray  # same shape: compliances of each variable with "it stays as it is"
+    compliance: np.ndarray  # of copies: compliances of each copy
+    error: np.ndarray  # of copies, and (n_target_variables,) last: squared errors
+    # Same shape: squared errors in parts of the squared effects, each at most LARGEST_MISS, times how much of the threshold
+    # the weight of the source's data reaches, at most 1; and, of copies, the sums of these factors.
     unexplained: np.ndarray
     n_covered: np.ndarray
 
@@ -58,17 +52,12 @@ class CopySums(NamedTuple):
 
 
 class CopyScratch(NamedTuple):
-    """Work space.
+    """Work space, float64."""
 
-    :param at: float64, shape (n_source_variables,): a state as the copy has it; ``effect``: what the source predicts there
-    :param scale: float64, shape (n_target_variables,): what squared errors are compared with in compliance
-    :param motion: float64, same shape: see :func:`squared_motion`
-    """
-
-    at: np.ndarray
-    effect: np.ndarray
-    scale: np.ndarray
-    motion: np.ndarray
+    at: np.ndarray  # shape (n_source_variables,): a state as the copy has it
+    effect: np.ndarray  # same shape: what the source predicts there
+    scale: np.ndarray  # shape (n_target_variables,): what squared errors are compared with in compliance
+    motion: np.ndarray  # same shape: see squared_motion
 
 
 @inlined
@@ -91,10 +80,7 @@ def add_effect(sums, action, effect):
 
 @inlined
 def add_error(table, sums, at, effect, predicted, covered, motion):
-    """Add the error of one variable to the sums; its square.
-
-    :param at: (copy, target action, source action, target variable); ``motion``: see :func:`squared_motion`
-    """
+    """Add the error of one variable, ``at`` (copy, target action, source action, target variable), to the sums; its square."""
     copy, action, u, v = at
     error = (effect - predicted) ** 2
     sums.error[copy, action, u, v] += error
@@ -105,13 +91,11 @@ def add_error(table, sums, at, effect, predicted, covered, motion):
 
 @compiled
 def add_transition(source, table, rules, transition, sums, scratch):
-    """Add one target transition to the sums: errors and compliances of all copies and source actions.
+    """Add one target transition (state, action, effect) to the sums: errors and compliances of all copies and source actions.
 
-    The scale of compliance is that of ``equations.running_scales``.
+    The scale of compliance is that of ``equations.running_scales``. The structures are plain tuples.
 
-    :param source: ``SourceModel.plain``; ``table``: CopyTable; ``sums``: CopySums; ``scratch``: CopyScratch; plain tuples
     :param rules: (whole, see ``Copies.measure``; weight from which on the source has data)
-    :param transition: (state, action, effect), unit coordinates
     """
     instances, effect_range, kernel, near = source_arrays(source)
     table, sums, scratch = CopyTable(*table), CopySums(*sums), CopyScratch(*scratch)

@@ -19,12 +19,7 @@ Moves = Sequence[tuple[int, int]]
 
 
 class PriorCandidates:
-    """
-    The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up.
-
-    :param copies: the copies that can be chosen
-    :param task: the target task
-    """
+    """The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up."""
 
     def __init__(self, copies: Copies, task: TargetTask):
         self.copies = copies
@@ -66,11 +61,7 @@ class PriorCandidates:
         action, moves = self._made_of(candidate)
         found = MappedVariables.none(action, self.task.n_variables)
         for copy, used in moves:
-            has = self.copies.state[copy] >= 0
-            found.source[has] = self.copies.source[copy]
-            found.variable[has] = self.copies.state[copy, has]
-            found.sign[has] = np.where(self.copies.sign[copy, has] < 0, -1, 1)
-            found.action[has] = used
+            found.map(self.copies.source[copy], self.copies.state[copy], self.copies.sign[copy], used)
         return found
 
     def describe(self, candidate: int) -> str:

@@ -19,14 +19,10 @@ MAX_FACTORED_VARIABLES = 12
 
 
 class Choice(NamedTuple):
-    """What each target action is made of.
+    """What each target action is made of; int64, shape (n_target_actions, n)."""
 
-    :param copies: int64, shape (n_target_actions, n): copies that it moves, -1 for none
-    :param actions: int64, same shape: the source action that moves each, -1 where none has been chosen so far
-    """
-
-    copies: np.ndarray
-    actions: np.ndarray
+    copies: np.ndarray  # copies that it moves, -1 for none
+    actions: np.ndarray  # the source action that moves each, -1 where none has been chosen so far
 
     def same(self, other: Choice | None) -> bool:
         """Whether another choice is the same."""
@@ -42,12 +38,10 @@ Chooser = Callable[[CopySums], Choice]
 
 
 def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Find the source action of highest mean compliance for each copy and target action, each on its own.
+    """Find the source action of highest mean compliance for each copy and target action, each on its own.
 
     :param allowed: bool, shape (n_copies, n_target_actions, most source actions): what may be chosen; None: everything
-    :return: the actions, int64, shape (n_copies, n_target_actions), -1 where none is allowed or no transition has the target
-        action; and their mean compliances
+    :return: the actions, int64, shape (n_copies, n_target_actions), -1 for none; and their mean compliances
     """
     exists = np.arange(copies.most_actions) < copies.table.n_actions[:, None, None]
     exists = np.broadcast_to(exists, sums.compliance.shape)
@@ -59,13 +53,7 @@ def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = No
 
 
 def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choice:
-    """
-    Choose for each target action one state mapping and source action: the pair of highest mean compliance.
-
-    :param copies: one for each state mapping
-    :param sums: over all target variables (``whole`` of :meth:`Copies.measure`)
-    :param allowed: see :func:`best_actions`
-    """
+    """Choose for each target action the state mapping (a copy) and source action of highest mean compliance."""
     action, mean = best_actions(copies, sums, allowed)
     mean = np.where(action < 0, -1.0, mean)
     best = mean.argmax(axis=0)
@@ -74,11 +62,7 @@ def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choic
 
 
 def choose_factored(copies: Copies, sums: CopySums) -> Choice:
-    """
-    Choose the division of the target's variables into copies and variables that stay, and each copy's source actions.
-
-    The division is that of the highest ``equations.division_score``.
-    """
+    """Choose the division into copies and variables that stay of the highest ``equations.division_score``."""
     action, mean = best_actions(copies, sums)
     scores = np.log(np.maximum(mean, SMALLEST_COMPLIANCE)) @ sums.n
     scores -= np.log(MIN_GAIN) * sums.n.sum() * (copies.state >= 0).sum(axis=1)
@@ -90,14 +74,10 @@ def choose_factored(copies: Copies, sums: CopySums) -> Choice:
 
 
 def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) -> list[int]:
-    """
-    Find the disjoint copies whose scores, with those of the variables in none, add up to most.
+    """Find the disjoint copies whose scores, with those of the variables in none, add up to most; by their first variable.
 
-    By dynamic programming over the subsets of the variables that are divided already.
-
-    :param members: bool, shape (n_copies, n_variables): the variables of each copy
-    :param scores: shape (n_copies,); ``stays``: shape (n_variables,): of each variable in no copy
-    :return: the copies, by their first variable
+    By dynamic programming over the subsets of the variables that are divided already. ``members``: the variables of each copy,
+    bool, shape (n_copies, n_variables); ``scores``: of each copy; ``stays``: of each variable in no copy.
     """
     n_variables = members.shape[1]
     masks = members @ (1 << np.arange(n_variables))
@@ -130,17 +110,16 @@ def draw_mapping(copies: Copies, allowed: np.ndarray, rng: np.random.Generator) 
 
 
 def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> Choice:
-    """
-    Draw a factored mapping for the whole run, as a control.
+    """Draw a factored mapping for the whole run, as a control.
 
     All divisions of as many target variables as possible into as few copies as possible are equally likely, and so are all
     source actions, each copy's and each target action's on its own.
     """
     members = copies.state >= 0
-    ways = _count_divisions(members)
     n_variables = members.shape[1]
-    taken, chosen = 0, []
     masks = (members @ (1 << np.arange(n_variables))).tolist()
+    ways = _count_divisions(masks, n_variables)
+    taken, chosen = 0, []
     while taken < (1 << n_variables) - 1:
         options = _options(taken, masks, ways)
         counts = np.array([n for *_, n in options], dtype=np.float64)
@@ -157,10 +136,8 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
 Ways = dict[int, tuple[int, int, int]]
 
 
-def _count_divisions(members: np.ndarray) -> Ways:
+def _count_divisions(masks: list[int], n_variables: int) -> Ways:
     """Count how many ways there are to divide the remaining variables, with as few left out and in as few copies as can be."""
-    n_variables = members.shape[1]
-    masks = (members @ (1 << np.arange(n_variables))).tolist()
     full = (1 << n_variables) - 1
     ways: Ways = {full: (0, 0, 1)}
     for taken in range(full - 1, -1, -1):

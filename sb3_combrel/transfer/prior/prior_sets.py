@@ -48,8 +48,7 @@ def make_prior(
     max_transitions: int,
     transfer_terminals: bool,
 ) -> SourcePrior:
-    """
-    Make the prior of a target task.
+    """Make the prior of a target task.
 
     :param breadth: kernel breadth of the source's model, in unit coordinates of the source
     :param given: ``mappings`` is one mapping, or one for each target action, and is used as it is
@@ -89,23 +88,16 @@ def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTas
             f'mappings="{name}" is for targets of at most {MAX_FACTORED_VARIABLES} state variables, got {task.n_variables}; '
             "give a FactoredMapping"
         )
-    numbers, states, signs = [], [], []
-    for number, source in enumerate(sources):
-        state = copies_of_source(source.n_variables, task.n_variables)
-        sign = np.ones_like(state)
-        if name.startswith("signed_"):
-            state, sign = with_mirrored(state)
-        numbers.append(np.full(len(state), number, dtype=np.int64))
-        states.append(state)
-        signs.append(sign)
-    n = sum(map(len, numbers))
-    if n > MAX_COPIES:
+    states = [copies_of_source(source.n_variables, task.n_variables) for source in sources]
+    signed = [with_mirrored(state) if name.startswith("signed_") else (state, np.ones_like(state)) for state in states]
+    number = np.repeat(np.arange(len(signed)), [len(state) for state, _ in signed])
+    if len(number) > MAX_COPIES:
         raise ValueError(
-            f'mappings="{name}" has {n} copies from these source tasks to {task.n_variables} state variables, more than the '
-            f"{MAX_COPIES} that are practical; give a FactoredMapping"
+            f'mappings="{name}" has {len(number)} copies from these source tasks to {task.n_variables} state variables, '
+            f"more than the {MAX_COPIES} that are practical; give a FactoredMapping"
         )
-    arrays = np.concatenate(numbers), np.concatenate(states), np.concatenate(signs)
-    return Copies(sources, *arrays, breadth, task.exploration_threshold)
+    state, sign = map(np.concatenate, zip(*signed, strict=True))
+    return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
 
 
 def _given_factored(

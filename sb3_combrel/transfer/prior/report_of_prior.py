@@ -27,11 +27,7 @@ class _Sample:
         self.scale = np.maximum(size**2, SMALLEST_SCALE)
 
     def judge(self, choice: Choice | None, action: int | None = None) -> tuple[float, float]:
-        """
-        Return the mean compliance of a choice, or of "no change", and its error over that of "no change"; NaN for none.
-
-        :param action: by the transitions with this target action; None: by all
-        """
+        """Mean compliance of a choice, or of "no change", and its error over that of "no change"; NaN for none."""
         rows = np.ones(len(self.actions), dtype=np.bool_) if action is None else self.actions == action
         if not rows.any():
             return np.nan, np.nan
@@ -46,13 +42,7 @@ class _Sample:
 
 
 def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, float]) -> TransferReport:
-    """
-    Report what a source was taken for, as the prior of the target's model.
-
-    :param method: the method with its arguments, as text
-    :param prior: after one step at least
-    :param statistics: the method's figures of the log, by name
-    """
+    """Report what a source was taken for; ``method``: with its arguments, as text; ``statistics``: its figures of the log."""
     names = prior.task.action_names
     pairs = np.argwhere(~prior.claims.explains)
     choice, sample = prior.choice, _Sample(prior)
@@ -111,11 +101,7 @@ def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, o
 
 
 def _alternatives(prior: SourcePrior, choice: Choice) -> list[Choice]:
-    """
-    Return choices that have another mapping for every target action, the best of the others: all at once, or copy by copy.
-
-    None for a mapping that is given: nothing was compared then.
-    """
+    """The best choices with another mapping for every target action: all at once, or copy by copy; none if given."""
     if prior.choose is None:
         return []
     used = np.nonzero((choice.copies >= 0) & (choice.actions >= 0))

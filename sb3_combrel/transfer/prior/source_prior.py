@@ -9,15 +9,14 @@ import numpy as np
 
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, warn_of_error
+from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, RegionErrors, warn_of_error
 from sb3_combrel.transfer.prior.claims import CLAIMED_WEIGHT, FIRST_RENEWAL, RENEWAL_GROWTH, Claims, part_explained
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.value_bound import ValueBound
-from sb3_combrel.transfer.recorded_transitions import RecordedEpisodes
-from sb3_combrel.transfer.region_errors import RegionErrors
+from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # A variable that is predicted to stay moves, if it does, by more than this; in unit coordinates.
 SMALLEST_MOVE = 0.005
@@ -26,20 +25,14 @@ ALL_MEASURED, MEASURED_LATER = 500, 5
 
 
 class SourcePrior:
-    """
-    What a source predicts of the target, through a mapping that is given or chosen by compliance.
+    """What a source predicts of the target, through a mapping that is given or chosen by compliance.
 
-    Methods of the same name mean what they do of :class:`~sb3_combrel.transfer.base.Transfer` and of
-    :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`. No instances are transferred.
+    Methods of the same name mean what they do of ``Transfer`` and of ``MappingTransfer``. No instances are transferred. For
+    what it claims to know, and which effects are used, see :class:`~sb3_combrel.transfer.prior.claims.Claims`.
 
-    What it claims to know, and which effects are used, is said in :class:`~sb3_combrel.transfer.prior.claims.Claims`.
-
-    :param copies: the copies that can be chosen
-    :param task: the target task
     :param choose: chooses from the sums over the target's transitions; or the choice that is given
     :param whole: see :meth:`Copies.measure`
     :param max_transitions: target transitions by which is chosen, at most; what is chosen then is checked on
-    :param transfer_terminals: whether the source's ends are used at all
     :param first_renewal: target transitions after which is chosen first; equal to ``max_transitions``, it is chosen once
     """
 
@@ -78,7 +71,7 @@ class SourcePrior:
         self.errors = RegionErrors(task)
         #: Transitions whose outcome the source claimed to know.
         self.n_claimed = 0
-        self.transitions = RecordedEpisodes(task.n_variables)
+        self.transitions = RecordedTransitions(task.n_variables)
         self._renewal_due = float(first_renewal)
         self._all_measured = max(ALL_MEASURED, first_renewal)
         self._warned = False
@@ -160,12 +153,7 @@ class SourcePrior:
             self.errors.note(state, action, effect, predicted)
 
     def value_bound(self) -> np.ndarray | None:
-        """
-        Return an upper bound on the return from each state of the sample, shape (n_points,), or None.
-
-        The source's values, see :class:`~sb3_combrel.transfer.prior.value_bound.ValueBound`, while all of the target's actions
-        are explained, and neither ends nor rewards of the source are doubted.
-        """
+        """The source's values, while all target actions are explained and neither ends nor rewards are doubted, or None."""
         if self.choice is None or not self.claims.allow_bound():
             return None
         return self._value_bound.through(self.choice)
@@ -205,19 +193,16 @@ class SourcePrior:
         self.claims.replay(seen, reward, end, weight)
 
     def explained(self) -> np.ndarray:
-        """
-        Return which part of the effects is explained, for each target action, of the variable of which least is.
-
-        Of a transition and variable, 1 less squared error over squared effect, within bounds: so a few large effects count no
-        more than others. Of a variable in a copy, over the transitions where the source has data; of one that stays, over all:
-        how much it moves, in parts of what the action that moves it most does.
-
-        :return: shape (n_target_actions,), see :func:`~sb3_combrel.transfer.prior.claims.part_explained`
-        """
+        """Return which part of each target action's effects is explained, see ``part_explained``."""
         return part_explained(*self._unexplained())
 
     def _unexplained(self) -> tuple[np.ndarray, np.ndarray]:
-        """What is not explained of the effects of each target action and variable, and over how many transitions."""
+        """What is not explained of the effects of each target action and variable, and over how many transitions.
+
+        Of a transition and variable, squared error over squared effect, within bounds: so a few large effects count no more
+        than others. Of a variable in a copy, over the transitions where the source has data; of one that stays, over all: how
+        much it moves, in parts of what the action that moves it most does.
+        """
         n_covered = np.repeat(self.sums.n[:, None], self.task.n_variables, axis=1)
         mean = self.sums.effect / np.maximum(n_covered, 1.0)
         unexplained = n_covered * np.sqrt(mean / np.maximum(mean.max(axis=0), SMALLEST_MOVE**2))

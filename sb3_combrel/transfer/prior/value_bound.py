@@ -9,27 +9,22 @@ from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.prior.copies import Copies, distinct_rows
 from sb3_combrel.transfer.prior.prior_choice import Choice
-from sb3_combrel.transfer.source_mdp import MAX_STEPS, planning_tolerance, source_mdp
 from sb3_combrel.transfer.source_model import SourceModel
+from sb3_combrel.transfer.source_policy import MAX_STEPS, planning_tolerance, source_mdp
 
 MAX_SWEEPS = 300
 
 
 class ValueBound:
-    """
-    Bounds the values of the target's states by those of the source's states that they are taken for.
+    """Bounds the values of the target's states by those of the source's states that they are taken for.
 
     R-Max with an admissible potential (Asmuth, Littman & Zinkov, "Potential-based shaping in model-based reinforcement
     learning", AAAI 2008), which comes from another task through a mapping, as in Mann & Choe, "Directed exploration in
     reinforcement learning with transferred knowledge", EWRL 2012.
 
-    The source's values are those of Fitted R-Max's planning with its local linear model: where it has too few data, a pair is
-    worth ``max_value``. A target of several copies ends when all of them have ended: if every step costs the same, the least
-    of their values bounds it. Otherwise nothing is said of several.
-
-    :param copies: the copies that can be chosen
-    :param task: the target task
-    :param min_weight: weight of the source's data from which on a pair of the source has a model
+    The source's values are those of Fitted R-Max's planning with its local linear model: where it has too few data (a weight
+    below ``min_weight``), a pair is worth ``max_value``. A target of several copies ends when all of them have ended: if every
+    step costs the same, the least of their values bounds it. Otherwise nothing is said of several.
     """
 
     def __init__(self, copies: Copies, task: TargetTask, min_weight: float):
@@ -41,12 +36,10 @@ class ValueBound:
         self._of_copy: dict[int, np.ndarray] = {}
 
     def through(self, choice: Choice) -> np.ndarray | None:
-        """
-        Bound the values of all states of the target's sample.
+        """Bound the values of all states of the target's sample, shape (n_points,).
 
-        :param choice: what each target action is made of
-        :return: shape (n_points,); None if nothing bounds them: if actions are taken for those of different copies, no copy
-            has all variables of its source, or several copies do not cost the same at every step
+        None if nothing bounds them: if actions are taken for those of different copies, no copy has all variables of its
+        source, or several copies do not cost the same at every step.
         """
         used = choice.copies[0][choice.copies[0] >= 0].tolist()
         if not (choice.copies == choice.copies[0]).all() or (len(used) > 1 and not self._costs_are_alike(used)):
