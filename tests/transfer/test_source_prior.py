@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers import factored as f
-from helpers.factored import bound, inside, naive_prediction, oscillate, oscillator_source, show
+from helpers.factored import bound, inside, naive_prediction, oscillator_source, show
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -262,14 +262,6 @@ def test_predictions_are_those_of_a_weighted_regression(seed, d, n, breadth, n_n
         expected = naive_prediction(*of_action, state, breadth, n_neighbors, outcome_breadth)
         for ours, theirs in zip((found.effect[i], found.reward[i], found.end[i], found.weight[i]), expected, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
-
-
-def test_linear_dynamics_are_predicted_almost_exactly():
-    model = SourceModel(stacked_instances([oscillator_source()]))
-    rng = np.random.default_rng(1)
-    states, actions = 0.1 + 0.8 * rng.random((300, 2)), rng.integers(3, size=300)
-    # The ridge takes a little of the slopes.
-    np.testing.assert_allclose(model.predict(states, actions).effect, oscillate(states, actions), atol=1e-3)
 
 
 def test_far_from_all_instances_the_nearest_predict_with_next_to_no_weight():

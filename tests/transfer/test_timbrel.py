@@ -91,15 +91,6 @@ def test_at_first_everything_has_changed_and_then_nothing(source, task):
     assert changed_pairs(method, known).tolist() == []
 
 
-def test_pairs_that_are_known_are_given_nothing(source, task):
-    method = bound(TIMBREL(source, ONE, breadth=0.3), task)
-    assert given_to_all(method, task, own=0.5).length.any()
-    assert not given_to_all(method, task, own=1.0).length.any()
-    assert transferred_at(method, POINTS[12], np.array([0.0, 1.0])).length.tolist()[1] == 0
-    assert transferred_at(method, POINTS[12], np.array([1.0, 0.0])).length.tolist()[0] == 0
-    assert not transferred_at(method, POINTS[12], np.array([1.0, 3.0])).length.any()
-
-
 def mountain_car(transfer, seed=0, **kwargs):
     env = make_vec_env("combrel/MountainCar2D-v0", seed=seed, env_kwargs=dict(max_episode_steps=200))
     return FittedRMax(env, transfer=transfer, model_breadth=1 / 16, resolution=4, seed=seed, **kwargs)
