@@ -7,7 +7,6 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -52,11 +51,6 @@ def test_versions_agree():
     assert re.fullmatch(r"\d+\.\d+\.\d+\w*", version)
     assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"\n## [{version}] - 20" in (ROOT / "CHANGELOG.md").read_text()
-
-
-def test_the_command_is_installed():
-    (command,) = metadata.entry_points(group="console_scripts", name="sb3-combrel")
-    assert command.value == "sb3_combrel.cli:main"
 
 
 def test_all_contains_every_extra_but_those_of_developers():

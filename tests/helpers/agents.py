@@ -9,10 +9,7 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 
 
 def make_agent(n_variables, n_actions, transfer=None, rng=0, **settings):
-    """An agent for states in the unit box.
-
-    :param rng: a seed or a generator
-    """
+    """An agent for states in the unit box; ``rng``: a seed or a generator."""
     task = Task(StateScaling(np.zeros(n_variables), np.ones(n_variables)), n_actions)
     return FittedRMaxAgent(FittedRMaxSettings(**settings), task, transfer, np.random.default_rng(rng))
 

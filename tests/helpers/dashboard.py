@@ -1,37 +1,20 @@
 """A small task for tests of the dashboard, and what reads its event files back."""
 
 import gymnasium as gym
-import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_combrel import FittedRMax
+from helpers.walk import Walk, small
 
 METHODS = ["none", "TIMBREL", "random", "pool", "COMBREL"]
 
 
-class NamedWalk(gym.Env):
-    """A walk on a line to its right end; a second variable never changes."""
+class NamedWalk(Walk):
+    """The walk with names."""
 
     state_names = ("place", "height")
     action_names = ("back", "forth")
-
-    def __init__(self, limit=30):
-        self.observation_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 2.0]))
-        self.action_space = spaces.Discrete(2)
-        self.limit = limit
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.at, self.steps = self.np_random.uniform(-0.6, 0.0), 0
-        return np.array([self.at, 1.0], dtype=np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        self.at = float(np.clip(self.at + (0.15 if action == 1 else -0.15), -1.0, 1.0))
-        done = self.at > 0.9
-        return np.array([self.at, 1.0], dtype=np.float32), -1.0, done, self.steps >= self.limit and not done, {}
 
 
 class Still(gym.Env):
@@ -50,10 +33,7 @@ class Still(gym.Env):
 
 def walker(log=None, transfer=None, env=None, **kwargs):
     """A model of the walk, with a TensorBoard log in the folder ``log``."""
-    env = NamedWalk() if env is None else env
-    return FittedRMax(
-        env, transfer=transfer, model_breadth=0.15, resolution=3, seed=0, tensorboard_log=log and str(log), **kwargs
-    )
+    return small(NamedWalk() if env is None else env, transfer=transfer, tensorboard_log=log and str(log), **kwargs)
 
 
 def run_folder(log):
@@ -64,8 +44,7 @@ def run_folder(log):
 
 def events(folder):
     """All that the event files of a folder have."""
-    found = EventAccumulator(str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0})
-    return found.Reload()
+    return EventAccumulator(str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0}).Reload()
 
 
 def scalars(found, tag, at=None):
@@ -78,8 +57,7 @@ class Witness(BaseCallback):
 
     def __init__(self, of):
         super().__init__()
-        self.of = of
-        self.seen = {}
+        self.of, self.seen = of, {}
 
     def _on_step(self):
         return True

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from helpers import asking
+from helpers import naive_transfer as naive
 from helpers.naive_local_linear import RIDGE
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
-from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.mappings.state_mappings import copies_of_source
-from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 
@@ -28,10 +28,7 @@ def ends(states):
 
 
 def oscillator_source(n=600, seed=0, noise=0.0, effects=oscillate, rewards=None):
-    """Instances of the source from everywhere.
-
-    :param noise: standard deviation of what is added to effects, unit coordinates
-    """
+    """Instances of the source from everywhere; ``noise``: standard deviation of what is added to effects."""
     rng = np.random.default_rng(seed)
     states, actions = rng.random((n, 2)), rng.integers(3, size=n)
     after = states + effects(states, actions) + noise * rng.normal(size=states.shape)
@@ -55,13 +52,11 @@ def copies_mapping(n_copies, order=None):
 
     :param order: the target variable of each variable of the first copy, of the second, ...
     """
-    order = list(range(2 * n_copies)) if order is None else list(order)
-    copies = []
+    order, copies = list(range(2 * n_copies)) if order is None else list(order), []
     for c in range(n_copies):
         state, action = [None] * (2 * n_copies), [0] * (2 * n_copies + 1)
-        for k in range(2):
-            state[order[2 * c + k]] = k
-        action[2 * c + 1], action[2 * c + 2] = 1, 2
+        state[order[2 * c]], state[order[2 * c + 1]] = 0, 1
+        action[2 * c + 1 : 2 * c + 3] = 1, 2
         copies.append(InterTaskMapping(state, action))
     return FactoredMapping(copies)
 
@@ -75,24 +70,12 @@ def target_effects(mapping, states, actions):
     return effects
 
 
-def target_task(n_variables, n_actions, threshold=1.0):
-    return TargetTask(
-        scaling=StateScaling(np.zeros(n_variables), np.ones(n_variables)),
-        n_actions=n_actions,
-        sample_states=np.zeros((3, n_variables)),
-        exploration_threshold=threshold,
-        min_weight=0.01,
-        min_fraction=0.1,
-        state_names=tuple(f"s{k}" for k in range(n_variables)),
-        action_names=tuple(f"a{k}" for k in range(n_actions)),
-    )
+def target_task(n_variables, n_actions):
+    return naive.target_task(np.zeros((3, n_variables)), n_actions)
 
 
 def walk(mapping, n, seed=0, length=40, spread=0.5):
-    """Transitions of such a target, in episodes that start at random and end after ``length`` steps.
-
-    :return: states, actions and effects
-    """
+    """States, actions and effects of such a target, in episodes that start at random and end after ``length`` steps."""
     rng = np.random.default_rng(seed)
     d, n_actions = mapping.n_target_variables, mapping.n_target_actions
     rows = []
@@ -164,8 +147,7 @@ def predicted_by(copies, copy, source_action, states):
 
 
 def bound(transfer, d=4, n_actions=5, seed=0):
-    transfer.bind(target_task(d, n_actions), np.random.default_rng(seed))
-    return transfer
+    return asking.bound(transfer, target_task(d, n_actions), seed)
 
 
 def show(transfer, transitions, rewards=None, ends=None):

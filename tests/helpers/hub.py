@@ -9,21 +9,13 @@ from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundE
 
 
 class FolderHub:
-    """
-    Repositories as folders.
-
-    :param folder: where they are
-    :param monkeypatch: pytest's; it ends with the test
-    """
+    """Repositories as folders below ``folder``, until the test ends."""
 
     def __init__(self, folder, monkeypatch):
         self.folder = Path(folder)
-        api = huggingface_hub.HfApi
         monkeypatch.setenv("TRUST_REMOTE_CODE", "true")
-        monkeypatch.setattr(api, "create_repo", self.create_repo)
-        monkeypatch.setattr(api, "upload_file", self.upload_file)
-        monkeypatch.setattr(api, "upload_folder", self.upload_folder)
-        monkeypatch.setattr(api, "snapshot_download", self.snapshot_download)
+        for name in ("create_repo", "upload_file", "upload_folder", "snapshot_download"):
+            monkeypatch.setattr(huggingface_hub.HfApi, name, getattr(self, name))
         monkeypatch.setattr(huggingface_hub, "hf_hub_download", self.hf_hub_download)
 
     def create_repo(self, repo_id, *, exist_ok=False, private=None, token=None):

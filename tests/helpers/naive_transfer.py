@@ -41,6 +41,15 @@ def random_source(rng, n, n_variables=2, n_actions=3, spread=1.0):
     )
 
 
+def source_of(seed=0, n_variables=2, n_actions=2, n=60):
+    return random_source(np.random.default_rng(seed), n, n_variables, n_actions)
+
+
+def transitions_of(n, n_variables=3, n_actions=2, seed=1):
+    rng = np.random.default_rng(seed)
+    return [random_transition(rng, n_variables, n_actions) for _ in range(n)]
+
+
 def places_of(source, instances):
     """Where the package, which has instances in an order of its own, keeps each of the source's."""
     units = source.scaling.to_unit(source.states)
@@ -107,30 +116,11 @@ def as_sample(transitions, n_variables):
     )
 
 
-def distance(a, b):
-    """Euclidean."""
-    return float(np.linalg.norm(np.asarray(a) - np.asarray(b)))
-
-
 def compliance(transition, source, mapping, bandwidths):
     """Compliance of one transition, with the package's guard."""
     sample = as_sample([transition], len(mapping.state))
     [found] = equations.sample_compliance(sample, as_transitions(source), mapping, Bandwidths(*bandwidths), LEAST_EVIDENCE)
     return float(found)
-
-
-def relevance(source, j, mapping, action, transitions, bandwidths, mu):
-    """Eq. 7 for source instance j, translated for target action ``action``."""
-    sample = as_sample(transitions, len(mapping.state))
-    found = equations.source_relevances(as_transitions(source), mapping, action, sample, Bandwidths(*bandwidths), mu)
-    return found[np.flatnonzero(source.actions == mapping.action[action]).tolist().index(j)]
-
-
-def near_relevances(source, mapping, action, transitions, bandwidths):
-    """The relevance that does not favour distant instances, of all instances translated for a target action, by number."""
-    sample = as_sample(transitions, len(mapping.state))
-    found = equations.source_near_relevances(as_transitions(source), mapping, action, sample, Bandwidths(*bandwidths))
-    return dict(zip(np.flatnonzero(source.actions == mapping.action[action]).tolist(), found.tolist(), strict=True))
 
 
 def transferred(state, own, drawn_from, task, breadth, relevance=None, times_weight=False):

@@ -1,8 +1,4 @@
-"""
-Try an installed sb3_combrel: `python smoke.py [folder it is installed in]`, in an empty folder away from the clone.
-
-Uses each of the extras that contain code of their own: envs, zoo, experiments.
-"""
+"""Try an installed sb3_combrel and its extras: `python smoke.py [folder it is in]`, in an empty folder away from the clone."""
 
 import sys
 import sysconfig

@@ -18,12 +18,7 @@ def step(state, action):
 
 
 def learn(agent, n_episodes, episode=0, before_each=lambda state: None):
-    """Learn for some episodes.
-
-    :param episode: number of the first
-    :param before_each: called with the state before each action and before each update
-    :return: the actions of each episode
-    """
+    """The actions of so many episodes of learning, from number ``episode`` on; ``before_each`` is called with each state."""
     agent.prepare()
     actions = []
     for number in range(episode, episode + n_episodes):

@@ -13,12 +13,7 @@ GOAL = 0.9
 
 
 class Walk(gym.Env):
-    """A walk on a line; the right end is the goal.
-
-    :param first: number of the first action
-    :param limit: steps until an episode is cut off
-    :param start: where each episode starts; None for anywhere in the left half
-    """
+    """A walk on a line to its right end; ``first``: number of the first action; ``start``: None for anywhere at the left."""
 
     def __init__(self, first=0, limit=30, start=None):
         self.observation_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 2.0]))
@@ -45,16 +40,8 @@ def walk_source(n=60):
     """Instances of the walk itself, evenly spread."""
     at, action = np.linspace(-1.0, 0.89, n), np.arange(n) % 2
     after = np.clip(at + STRIDE * (2 * action - 1), -1.0, 1.0)
-    return SourceInstances(
-        states=np.column_stack([at, np.ones(n)]),
-        actions=action,
-        rewards=np.full(n, -1.0),
-        next_states=np.column_stack([after, np.ones(n)]),
-        terminated=after > GOAL,
-        low=[-1.0, 0.0],
-        high=[1.0, 2.0],
-        n_actions=2,
-    )
+    states, next_states = np.column_stack([at, np.ones(n)]), np.column_stack([after, np.ones(n)])
+    return SourceInstances(states, action, np.full(n, -1.0), next_states, after > GOAL, [-1.0, 0.0], [1.0, 2.0], 2)
 
 
 METHODS = {

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from helpers.dashboard import NamedWalk
+from helpers.dashboard import NamedWalk, walker
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
 
@@ -20,6 +20,12 @@ def transfers():
         "pool": TIMBREL(source, "pool"),
         "COMBREL": COMBREL(source, use="instances"),
     }
+
+
+@pytest.fixture(scope="session")
+def learnt(transfers):
+    """A model that has learned with COMBREL, to look at."""
+    return walker(transfer=transfers["COMBREL"]).learn(120)
 
 
 @pytest.fixture

@@ -5,39 +5,11 @@ import functools
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
-from helpers.dashboard import METHODS, NamedWalk, Witness, events, run_folder, scalars, slow_q, walker
+from helpers.dashboard import NamedWalk, Witness, events, run_folder, scalars, slow_q, walker
 
 from sb3_combrel.callbacks import DashboardCallback
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
 from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_every_group_of_scalars_is_there(method, transfers, tmp_path):
-    walker(tmp_path, transfers[method]).learn(200)
-    tags = set(events(run_folder(tmp_path)).Tags()["scalars"])
-    always = {"rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps", "model/instances", "model/known", "model/optimistic"}
-    always |= {"model/transferred", "planner/backups", "planner/residual", "planner/time_share"}
-    assert always <= tags
-    of_transfer = {"transfer/instances_used", "transfer/pairs_modelled"}
-    of_choice = {"transfer/compliance", "transfer/choice_entropy", "transfer/switches", "transfer/distinct_mappings"}
-    assert of_transfer <= tags if method != "none" else not any(tag.startswith("transfer/") for tag in tags)
-    assert of_choice <= tags if method == "COMBREL" else not of_choice & tags
-
-
-def test_shares_of_the_grid_are_those_of_its_pairs(transfers, tmp_path):
-    def shares(model):
-        known, modelled = model.agent.model.known, model.agent.mdp.arrays.modelled
-        n = len(known)
-        transferred = sum(1 for k, m in zip(known, modelled, strict=True) if m and not k)
-        return sum(known) / n, transferred / n, sum(~modelled) / n, transferred
-
-    witness = Witness(shares)
-    walker(tmp_path, transfers["COMBREL"]).learn(300, [witness, DashboardCallback(scalar_share=1.0)])
-    found = events(run_folder(tmp_path))
-    assert len(witness.seen) > 2
-    for number, tag in enumerate(["model/known", "model/transferred", "model/optimistic", "transfer/pairs_modelled"]):
-        assert scalars(found, tag, witness.seen) == pytest.approx({step: seen[number] for step, seen in witness.seen.items()})
 
 
 def slow_residual(model):
@@ -86,26 +58,29 @@ def slow_compliance(model):
     return np.mean(means)
 
 
-def test_compliance_is_that_of_the_chosen_mapping_with_the_nearest_transitions(transfers, tmp_path):
-    witness = Witness(slow_compliance)
-    walker(tmp_path, transfers["COMBREL"]).learn(150, [witness, DashboardCallback(scalar_share=1.0)])
-    found = scalars(events(run_folder(tmp_path)), "transfer/compliance", witness.seen)
-    assert len(found) > 1 and found == pytest.approx(witness.seen, rel=1e-5)
-
-
-def test_entropy_and_number_of_mappings_are_those_of_the_choices(transfers, tmp_path):
-    def entropy(model):
+def test_scalars_of_transfer_are_those_of_pairs_and_choices(transfers, tmp_path):
+    def plainly(model):
+        known, modelled = model.agent.model.known, model.agent.mdp.arrays.modelled
+        n, transferred = len(known), sum(1 for k, m in zip(known, modelled, strict=True) if m and not k)
         chosen = [c for c in model.policy.transfer.choices() if c >= 0]
         shares = np.array([chosen.count(c) for c in set(chosen)]) / len(chosen)
-        return -sum(shares * np.log(shares)), len(shares)
+        return {
+            "model/known": sum(known) / n,
+            "model/transferred": transferred / n,
+            "model/optimistic": sum(~modelled) / n,
+            "transfer/pairs_modelled": transferred,
+            "transfer/compliance": slow_compliance(model),
+            "transfer/choice_entropy": -sum(shares * np.log(shares)),
+            "transfer/distinct_mappings": len(shares),
+        }
 
-    witness = Witness(entropy)
-    walker(tmp_path, transfers["COMBREL"]).learn(200, [witness, DashboardCallback(scalar_share=1.0)])
+    witness = Witness(plainly)
+    walker(tmp_path, transfers["COMBREL"]).learn(150, [witness, DashboardCallback(scalar_share=1.0)])
     found = events(run_folder(tmp_path))
-    assert scalars(found, "transfer/choice_entropy", witness.seen) == pytest.approx(
-        {s: e for s, (e, _) in witness.seen.items()}, abs=1e-6
-    )
-    assert scalars(found, "transfer/distinct_mappings", witness.seen) == {s: n for s, (_, n) in witness.seen.items()}
+    assert len(witness.seen) > 2
+    for tag in next(iter(witness.seen.values())):
+        expected = {step: seen[tag] for step, seen in witness.seen.items()}
+        assert scalars(found, tag, witness.seen) == pytest.approx(expected, rel=1e-5, abs=1e-6), tag
 
 
 def test_scalars_stay_within_their_share_of_the_time(tmp_path, monkeypatch, clock):
@@ -114,40 +89,32 @@ def test_scalars_stay_within_their_share_of_the_time(tmp_path, monkeypatch, cloc
         return 0.0
 
     monkeypatch.setattr("sb3_combrel.tensorboard.readings.bellman_residual", slowly)
-    walker(tmp_path).learn(1500, DashboardCallback(picture_freq=None, scalar_share=0.1), log_interval=1)
+    walker(tmp_path).learn(800, DashboardCallback(picture_freq=None, scalar_share=0.1), log_interval=1)
     found = events(run_folder(tmp_path))
     # Between logs and with them the first is written before anybody knows how long it takes; the last comes at the end.
     assert 4 <= len(found.Scalars("planner/residual")) <= 3 + 0.1 * clock[0] / 0.02
     assert len(found.Scalars("planner/residual")) == len(found.Scalars("model/known"))
-    assert len(found.Scalars("rollout/ep_rew_mean")) > 20
+    assert len(found.Scalars("rollout/ep_rew_mean")) > 10
 
 
 @pytest.mark.parametrize("method", ["none", "COMBREL"])
 def test_between_logs_there_are_points_of_all_that_a_log_has(method, transfers, tmp_path):
     """With few and long episodes, too."""
-    env = NamedWalk(limit=10**6)
-    env.reset = functools.partial(_at_the_far_end, env)
-    walker(tmp_path, transfers[method], env, max_value=0.0).learn(
-        1000, DashboardCallback(scalar_share=1.0), log_interval=10**6
+    walker(tmp_path, transfers[method], NamedWalk(limit=10**6, start=-1.0), max_value=0.0).learn(
+        300, DashboardCallback(scalar_share=1.0), log_interval=10**6
     )
     found = events(run_folder(tmp_path))
     steps = {tag: [event.step for event in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
     assert not any(tag.startswith("rollout/") for tag in steps)
-    assert len(steps["model/known"]) >= 400 and steps["model/known"][-1] == 1000
+    assert len(steps["model/known"]) >= 100 and steps["model/known"][-1] == 300
     assert steps["planner/residual"] == steps["planner/backups"] == steps["model/known"]
     assert ("transfer/pairs_modelled" in steps) == (method != "none")
 
 
-def _at_the_far_end(env, seed=None, options=None):
-    observation, info = NamedWalk.reset(env, seed=seed)
-    env.at = -1.0
-    return np.array([-1.0, observation[1]], dtype=np.float32), info
-
-
 def test_no_step_has_two_points(tmp_path):
-    walker(tmp_path).learn(300, DashboardCallback(scalar_share=1.0), log_interval=1)
+    walker(tmp_path).learn(200, DashboardCallback(scalar_share=1.0), log_interval=1)
     steps = [event.step for event in events(run_folder(tmp_path)).Scalars("planner/residual")]
-    assert len(steps) > 150 and len(set(steps)) == len(steps) and steps == sorted(steps)
+    assert len(steps) > 100 and len(set(steps)) == len(steps) and steps == sorted(steps)
 
 
 def test_planning_takes_a_share_of_the_time(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from helpers import factored as f
 from helpers.factored import bound, inside, show
 
-from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping
+from sb3_combrel import TIMBREL, InterTaskMapping
 from sb3_combrel.transfer.outcome_evidence import GOES_ON
 from sb3_combrel.transfer.prior.claims import PRESUMED, part_explained, trust_in
 
@@ -65,16 +65,6 @@ def test_small_chances_of_an_end_are_none_also_before_an_end_was_confirmed():
     assert large.any() and not found.weight[large].any()
 
 
-@pytest.mark.parametrize("given", [True, False])
-def test_what_is_explained_is_less_than_all_of_few_transitions(given):
-    transfer = bound(COMBREL(f.oscillator_source(), TWO if given else "factored", use="prior"))
-    states, actions, effects = f.walk(TWO, 60)
-    show(transfer, (states, actions, effects))
-    explained = transfer.source_prior.explained()
-    for action, n in enumerate(np.bincount(actions, minlength=5)):
-        assert explained[action] == pytest.approx(n / (n + PRESUMED), abs=0.01)
-
-
 def with_noise_at_rest(size, seed=3):
     """Transitions of one copy, and a variable in no copy, which the first action moves by 0.05, the others by noise."""
     rng = np.random.default_rng(seed)
@@ -95,20 +85,6 @@ def test_noise_in_a_variable_that_an_action_leaves_alone_is_no_motion(size, trus
     np.testing.assert_allclose(explained, (1.0 - np.sqrt(squares / squares.max())) * n / (n + PRESUMED), atol=0.03)
     trust = transfer.source_prior.claims.trust
     assert trust[0] == 0.0 and ((trust[1:] > 0.75).all() if trusted else not trust[1:].any())
-
-
-@pytest.mark.parametrize(("moved", "compared"), [(0.0001, 0.001), (0.01, 0.01), (0.5, 0.08)])
-def test_errors_are_compared_with_what_the_target_moves_between_what_the_source_does(moved, compared):
-    def effects(states, actions):
-        return np.column_stack([np.where(actions == 2, 0.08, 0.001), np.full(len(states), 0.02)])
-
-    prior = bound(COMBREL(f.oscillator_source(effects=effects), "factored", use="prior"), 2, 3).source_prior
-    # The second action moves the first variable; in the transition of the first it does not move at all.
-    for action, effect in ((1, moved), (0, 0.0)):
-        prior.observe(np.array([0.5, 0.5]), action, -1.0, np.array([effect, 0.02]), False)
-    both = int(np.flatnonzero((prior.copies.state == [0, 1]).all(axis=1))[0])
-    expected = min(2.0, (0.001 / (0.25 * compared)) ** 2)
-    assert prior.sums.unexplained[both, 0, 0, 0] / prior.sums.n_covered[both, 0, 0] == pytest.approx(expected, rel=0.05)
 
 
 def drive_to_the_end(n=200):

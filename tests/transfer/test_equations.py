@@ -1,4 +1,4 @@
-"""Eqs. 1-7 in NumPy: their properties, cases with a known answer, and the compiled code against them."""
+"""Eqs. 1-7 in NumPy: properties, known answers, the compiled code against them; their bandwidths and evidence."""
 
 import math
 from itertools import pairwise
@@ -6,14 +6,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
+from helpers.asking import bound, choices_of, show
 from helpers.naive_transfer import as_sample, as_transitions, problem
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer import equations
-from sb3_combrel.transfer.candidates import stacked_instances, stacked_table
+from sb3_combrel.transfer.candidates import Candidates, stacked_instances, stacked_table
 from sb3_combrel.transfer.equations import Bandwidths, Transitions
+from sb3_combrel.transfer.instances.bandwidths import default_bandwidths, start_bandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceScratch, transition_compliance
 from sb3_combrel.transfer.instances.relevance import near_relevance, relevance
 
@@ -77,21 +81,6 @@ def test_compiled_compliance_has_a_start_bandwidth_for_each_state_mapping(seed, 
         found = tables[np.arange(len(transitions)), row, np.array(mapping.action)[sample.action]]
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
         assert equations.task_compliance(expected, prior=0.25) == pytest.approx(expected.mean() / 4)
-
-
-def test_sources_side_by_side_have_the_compliance_that_each_has_alone():
-    rng = np.random.default_rng(0)
-    sources = [naive.random_source(rng, 50, 1, 2), naive.random_source(rng, 80, 3, 4)]
-    sets = [MappingSet.injective(s.n_variables, 3, s.n_actions, 2) for s in sources]
-    sample, bandwidths = as_sample([naive.random_transition(rng, 3, 2) for _ in range(10)], 3), Bandwidths(0.1, 0.05, 1.0)
-    together = compiled_tables(sample, sources, sets, bandwidths)
-    rows = np.cumsum([0] + [s.n_state_mappings for s in sets])
-    actions = np.cumsum([0] + [s.n_actions for s in sources])
-    for k, (source, mappings) in enumerate(zip(sources, sets, strict=True)):
-        alone = compiled_tables(sample, [source], [mappings], bandwidths)
-        assert (alone > 0.0).any()
-        of_source = together[:, rows[k] : rows[k + 1], actions[k] : actions[k + 1]]
-        np.testing.assert_allclose(of_source, alone, rtol=1e-12, atol=1e-15)
 
 
 @settings(max_examples=25, deadline=None)
@@ -163,9 +152,9 @@ def test_average_distance_takes_the_nearest_whose_weights_stay_below_mu(distance
 
 def test_average_distance_leaves_out_the_transition_that_crosses_mu_but_never_the_nearest():
     distances, weights = np.array([3.0, 1.0, 2.0, 4.0]), np.array([0.2, 0.4, 0.3, 0.1])
-    for mu, expected in ((0.1, 1.0), (0.4, 1.0), (0.5, 1.0), (0.7, 1.0), (0.71, 1.5), (0.9, 1.5), (0.95, 2.0), (1.0, 2.0)):
-        assert equations.average_distance(distances, weights, mu) == pytest.approx(expected), mu
-    for mu in (0.0, -0.5, 1.01, float("nan")):
+    found = [equations.average_distance(distances, weights, mu) for mu in (0.1, 0.4, 0.7, 0.71, 0.95, 1.0)]
+    assert found == pytest.approx([1.0, 1.0, 1.0, 1.5, 2.0, 2.0])
+    for mu in (0.0, 1.01, float("nan")):
         with pytest.raises(ValueError, match="mu must be above 0 and at most 1, got"):
             equations.average_distance(distances, weights, mu)
 
@@ -182,15 +171,6 @@ def test_relevances_are_those_of_compiled_code(seed, sizes, bandwidths, n_transi
         np.testing.assert_allclose(found, compiled, rtol=1e-7, atol=1e-9)
         found = equations.source_near_relevances(instances, mapping, action, sample, bandwidths)
         np.testing.assert_allclose(found, compiled_near, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("apart", [0.02, 0.1, 0.3, 1.0, 10.0])
-def test_far_away_a_contradicted_instance_is_never_before_one_that_is_nearly_borne_out(apart):
-    """By Eq. 7 it is, from some distance on: the case for another relevance."""
-    of_far = 5.0 * math.exp(-(apart**2) / 0.01)
-    near, _, far = equations.near_relevances(np.array([0.9, 0.2, 0.1]), np.array([5.0, 5.0, of_far]))
-    assert near > far
-    assert (equations.relevance(0.9, 0.02) > equations.relevance(0.1, apart)) == (apart < 0.15)
 
 
 @settings(max_examples=25, deadline=None)
@@ -236,16 +216,86 @@ def test_relevance_is_1_for_perfect_compliance_and_for_instances_without_evidenc
     assert equations.source_relevances(instances, identity, 0, repeated, Bandwidths(0.3, 0.1, 0.7), 0.5)[0] == 1.0
 
 
+def test_relevance_of_eq_7():
+    given = [(1.0, 0.0), (1.0, 0.3), (0.5, 0.0), (0.5, 1e-300), (0.0, 1.0), (0.8, 0.1)]
+    expected = [1.0, 1.0, 0.0, 0.0, math.exp(-1), math.exp(-4)]
+    assert [equations.relevance(*each) for each in given] == pytest.approx(expected, rel=1e-12)
+
+
+def line(states, effects, rewards=None, actions=None):
+    """Source instances of a task with the variables of ``states``, in the unit box."""
+    states, effects = np.array(states, dtype=float), np.array(effects, dtype=float)
+    n, d = states.shape
+    return SourceInstances(
+        states,
+        np.zeros(n, dtype=int) if actions is None else np.array(actions),
+        -np.ones(n) if rewards is None else np.array(rewards, dtype=float),
+        states + effects,
+        np.zeros(n, dtype=bool),
+        np.zeros(d),
+        np.ones(d),
+        1 if actions is None else max(actions) + 1,
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 80), st.integers(1, 3))
+def test_default_bandwidths_are_what_they_are_said_to_be(seed, n, n_actions):
+    source = naive.random_source(np.random.default_rng(seed), n, 2, n_actions)
+    units, _, effects, rewards, _ = naive.as_transitions(source)
+    to_the_20th = []
+    for a in range(n_actions):
+        of_action = units[source.actions == a]
+        for state in of_action:
+            apart = sorted(np.linalg.norm(of_action - state, axis=1))
+            if len(apart) > 1:
+                to_the_20th.append(apart[min(20, len(apart) - 1)])
+    found = default_bandwidths(stacked_instances([source]))
+    if to_the_20th:
+        assert found.start == pytest.approx(np.median(to_the_20th) ** 2, rel=1e-9)
+    assert found.outcome == pytest.approx((effects**2).sum(axis=1).mean(), rel=1e-9)
+    if rewards.var() > 0:
+        assert found.reward == pytest.approx(rewards.var(), rel=1e-9)
+
+
 @pytest.mark.parametrize(
-    ("with_target", "distance", "expected"),
+    "source",
     [
-        (1.0, 0.0, 1.0),
-        (1.0, 0.3, 1.0),
-        (0.5, 0.0, 0.0),
-        (0.5, 1e-300, 0.0),
-        (0.0, 1.0, math.exp(-1)),
-        (0.8, 0.1, math.exp(-4)),
+        line([[0.5]], [[0.0]]),
+        line([[0.5]] * 30, [[0.0]] * 30),
+        line([[0.1], [0.9]], [[0.0], [0.0]], actions=[0, 2]),
+        line([[0.1], [0.9], [0.2]], [[1e-12], [0.0], [1e-12]], rewards=[-1e9, 1e9, 0.0]),
     ],
+    ids=["one", "all alike", "one an action", "extremes"],
 )
-def test_relevance_of_eq_7(with_target, distance, expected):
-    assert equations.relevance(with_target, distance) == pytest.approx(expected, rel=1e-12)
+def test_default_bandwidths_are_usable_whatever_the_source(source):
+    bandwidths = default_bandwidths(stacked_instances([source]))
+    assert all(np.isfinite(b) and b > 0.0 for b in bandwidths)
+    transition = naive.Transition(source.states[0], 0, float(source.rewards[0]), source.next_states[0])
+    assert 0.0 < naive.compliance(transition, source, InterTaskMapping([0], [0]), bandwidths) <= 1.0
+
+
+@pytest.mark.parametrize("state", [(0, 0, None), (0, 1, 0), (0, 0, 1), (1, None, None), (0, 1, None)], ids=str)
+@pytest.mark.parametrize("given", [0.02, None])
+def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_number(state, given):
+    rng = np.random.default_rng(0)
+    source, n_mapped = naive.random_source(rng, 100, 2, 2), len(state) - state.count(None)
+    candidates = Candidates(source, [InterTaskMapping(state, [0])], naive.target_task(np.zeros((1, 3)), 1))
+    usual = default_bandwidths(candidates.instances).start if given is None else given
+    [found] = start_bandwidths(candidates, usual)
+    for along in (0.01, 0.1):
+        two, all_mapped = (along * np.sqrt(n) for n in (2, n_mapped))
+        assert equations.phi(all_mapped, found) == pytest.approx(equations.phi(two, usual), rel=1e-12)
+    assert n_mapped != 2 or found == usual, "to the last bit"
+
+
+def test_min_evidence_is_the_sum_of_kernels_below_which_nothing_counts():
+    source, transition = line([[0.3], [0.3]], [[0.1], [0.1]]), naive.Transition(np.array([0.4]), 0, -1.0, np.array([0.5]))
+    evidence = 2 * np.exp(-0.01 / 0.005)
+    task = naive.target_task(np.array([[0.4]]), 1)
+    for least, expected in ((0.0, 1.0), (0.99 * evidence, 1.0), (1.01 * evidence, np.nan)):
+        arguments = dict(bandwidths=(0.005, 0.01, 1.0), min_evidence=least, min_compliance=0.0)
+        method = bound(COMBREL(source, InterTaskMapping([0], [0]), **arguments), task)
+        show(method, transition)
+        choices_of(method)
+        np.testing.assert_allclose(method.chosen_compliance(np.zeros(1, dtype=int)), [expected], rtol=1e-9)

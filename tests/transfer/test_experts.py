@@ -8,7 +8,6 @@ import pytest
 from helpers import naive_transfer as naive
 from helpers.asking import bound
 from helpers.walk import GOAL, STRIDE, Walk, small, walk_source
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_combrel import InterTaskMapping, MappingExperts, MappingSet, SourceInstances
@@ -50,26 +49,21 @@ def line_source(stride, reward_at_goal, n=400):
     )
 
 
-def test_values_where_a_step_is_shorter_than_a_cell_of_the_grid():
-    """The finite MDP leads several steps ahead, each of them discounted."""
-    gamma, stride = 0.98, 0.012
-    policy = SourcePolicy(line_source(stride, 0.0), gamma, 0.2)
-    for n in (20, 40, 80):
-        place = GOAL - stride * (n - 0.5)
-        expected = -(1.0 - gamma**n) / (1.0 - gamma)
-        # The end is averaged over a neighbourhood of several steps.
-        assert policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))[1] == pytest.approx(expected, rel=0.1)
-
-
-def test_values_are_of_ways_that_exist_even_if_rewards_are_bounded_by_much_more():
-    """Going to and fro for ever loses little: from above, the values would still be several times too high."""
-    gamma = 0.995
-    policy = SourcePolicy(line_source(STRIDE, 10.0), gamma, 0.2)
-    for n in range(1, 12):
-        place = GOAL - STRIDE * (n - 0.5)
-        q = policy.q_values(np.array([(place + 1.0) / 2.0, 0.5]))
-        assert q[1] == pytest.approx(10.0 * gamma ** (n - 1), rel=0.05)
-        assert q[0] < q[1]
+@pytest.mark.parametrize(
+    ("stride", "reward_at_goal", "gamma", "numbers", "rel"),
+    [
+        # A step is shorter than a cell of the grid: the finite MDP leads several steps ahead, each of them discounted.
+        (0.012, 0.0, 0.98, (20, 40, 80), 0.1),
+        # Rewards are bounded by much more than ways that exist give: from above, values would be several times too high.
+        (STRIDE, 10.0, 0.995, range(1, 12), 0.05),
+    ],
+)
+def test_values_are_those_of_the_steps_to_the_goal(stride, reward_at_goal, gamma, numbers, rel):
+    policy = SourcePolicy(line_source(stride, reward_at_goal), gamma, 0.2)
+    for n in numbers:
+        q = policy.q_values(np.array([(GOAL - stride * (n - 0.5) + 1.0) / 2.0, 0.5]))
+        expected = reward_at_goal * gamma ** (n - 1) if reward_at_goal else -(1.0 - gamma**n) / (1.0 - gamma)
+        assert q[1] == pytest.approx(expected, rel=rel) and q[0] < q[1]
 
 
 def test_without_data_an_action_has_no_value():
@@ -93,8 +87,9 @@ def test_an_expert_does_what_is_best_in_the_source_seen_through_its_mapping():
         assert method.expert_action(1, np.array([at, 0.5])) == 1
         assert method.expert_action(2, np.array([at, 0.5])) == 0
         assert method.expert_action(3, np.array([0.5, at])) == 0
-    # Far from all data of the source.
+    # Far from all data of the source; where no target variable is mapped to a source variable, it is typical.
     assert method.expert_action(1, np.array([0.5, 0.0])) is None
+    assert experts_of(InterTaskMapping([0, None], [0, 1])).expert_action(1, np.array([0.4, 0.0])) == 1
 
 
 def test_of_several_target_actions_one_is_drawn_and_of_none_the_next_best_source_action_is_taken():
@@ -113,11 +108,6 @@ def test_of_several_target_actions_one_is_drawn_and_of_none_the_next_best_source
             assert taken == (set(possible) if np.isfinite(q[best]) else {None})
             seen.add((best == int(q.argmax()), len(possible)))
     assert {(True, 2), (False, 2), (True, 1)} <= seen
-
-
-def test_source_variables_that_no_target_variable_maps_to_are_typical():
-    method = experts_of(InterTaskMapping([0, None], [0, 1]))
-    assert method.expert_action(1, np.array([0.4, 0.0])) == 1
 
 
 def test_each_expert_uses_its_own_source():
@@ -222,62 +212,17 @@ def test_an_episode_that_was_broken_off_counts_for_nothing():
     assert method._episodes[1:] == [(1, -5.0, 1, 1)]
 
 
-def test_episodes_of_several_environments_are_told_apart():
-    method, states = bound(MappingExperts(walk_source(), [SAME, OPPOSITE], patience=None), TASK), np.full((2, 2), 0.5)
-
-    def step(rewards, after):
-        decided = []
-        for e in (0, 1):
-            method.environment = e
-            decided.append(method.action(states[e]))
-        for e in (0, 1):
-            method.environment = e
-            reached = np.array([after, 0.5])
-            method.observe(states[e], 0, rewards[e], reached, False)
-            states[e] = reached
-        return decided
-
-    def end(e):
-        method.environment = e
-        method.end_episode(True)
-        states[e] = 0.5
-
-    # Before the agent has ended an episode nobody else acts.
-    assert step([-1.0, -2.0], 0.51) == [None, None]
-    end(1)
-    # Now the first expert acts in the second environment, to the right, while the agent goes on in the first.
-    assert step([-1.0, -4.0], 0.52) == [None, 1]
-    end(0)
-    assert step([-8.0, -4.0], 0.53) == [0, 1]
-    end(1)
-    end(0)
-    assert [(arm, total) for arm, total, *_ in method._episodes] == [(0, -2.0), (0, -2.0), (1, -8.0), (2, -8.0)]
-
-
-def returns_of(model):
-    return [info["r"] for info in model.ep_info_buffer]
-
-
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_the_returns_are_those_of_the_episodes_and_the_agent_learns_from_every_step(n_envs):
-    model = small(make_vec_env(Walk, n_envs=n_envs, seed=0), transfer=MappingExperts(walk_source())).learn(300)
+def test_returns_are_those_of_the_episodes_of_each_environment_and_the_agent_learns_from_every_step():
+    model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=MappingExperts(walk_source())).learn(300)
     method = model.policy.transfer
     # In the buffer the last digits are rounded.
-    np.testing.assert_allclose([total for _, total, *_ in method._episodes], returns_of(model), atol=1e-5)
+    np.testing.assert_allclose(
+        [total for _, total, *_ in method._episodes], [info["r"] for info in model.ep_info_buffer], atol=1e-5
+    )
     assert sum(steps for *_, steps, _ in method._episodes) == sum(info["l"] for info in model.ep_info_buffer)
     assert model.agent.model.n_instances == 300
     assert len(method.experts) == 8 and {arm for arm, *_ in method._episodes} == set(range(9))
     assert model.agent.model.transfer is None
-
-
-def test_with_the_right_mapping_the_first_episode_of_the_expert_is_as_short_as_can_be():
-    model = small(Walk(start=-0.5), transfer=MappingExperts(walk_source(), SAME, patience=None))
-    model.learn(10_000, StopTrainingOnMaxEpisodes(2))
-    first, second = returns_of(model)
-    assert second == -math.ceil((GOAL + 0.5) / STRIDE)
-    assert first < second
-    model.learn(10_000, StopTrainingOnMaxEpisodes(12))
-    assert model.policy.transfer.describe()[1][1] == second
 
 
 def test_a_set_that_is_too_large_to_draw_from_is_refused():

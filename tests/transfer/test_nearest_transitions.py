@@ -2,7 +2,7 @@
 
 import numpy as np
 from helpers import naive_transfer as naive
-from helpers.asking import changed_pairs
+from helpers.asking import bound, changed_pairs, show
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -142,32 +142,17 @@ def test_the_best_candidate_is_the_best_mapping_of_algorithm_1(seed, n_candidate
         assert chosen == (-1 if best is None else first[action] + best)
 
 
-class TestMethod:
-    def bound(self, seed=0, choice="drawn", **kwargs):
-        rng = np.random.default_rng(1)
-        task = naive.target_task(POINTS, 2)
-        method = COMBREL(naive.random_source(rng, 100, 2, 2), choice=choice, min_compliance=0.0, **kwargs)
-        method.bind(task, np.random.default_rng(seed))
-        for _ in range(15):
-            t = naive.random_transition(rng, 2, 2)
-            method.observe(t.state, t.action, t.reward, t.next_state, False)
-        changed_pairs(method)
-        return method
-
-    def test_the_seed_decides(self):
-        one, same, other = self.bound(0), self.bound(0), self.bound(1)
-        np.testing.assert_array_equal(one.choices(), same.choices())
-        assert (one.choices() != other.choices()).mean() > 0.2
-
-    def selected(self, method, state):
-        """The first candidates of the range selected for each action."""
-        return method._instances.selector.select(np.tile(state, (2, 1)), np.arange(2), np.zeros(2))[0].tolist()
-
-    def test_to_ask_leaves_no_trace(self):
-        method = self.bound()
-        before = method.rng.bit_generator.state, {name: array.copy() for name, array in method.get_state().items()}
-        for state in np.random.default_rng(3).random((10, 2)):
-            assert self.selected(method, state) == self.selected(method, state)
-        assert method.rng.bit_generator.state == before[0]
-        for name, array in method.get_state().items():
-            np.testing.assert_array_equal(array, before[1][name])
+def test_to_ask_leaves_no_trace():
+    rng = np.random.default_rng(1)
+    method = COMBREL(naive.random_source(rng, 100, 2, 2), choice="drawn", min_compliance=0.0)
+    bound(method, naive.target_task(POINTS, 2))
+    for _ in range(15):
+        show(method, naive.random_transition(rng, 2, 2))
+    changed_pairs(method)
+    before = method.rng.bit_generator.state, {name: array.copy() for name, array in method.get_state().items()}
+    for state in np.random.default_rng(3).random((10, 2)):
+        asked = np.tile(state, (2, 1)), np.arange(2)
+        assert method.selected(*asked).tolist() == method.selected(*asked).tolist()
+    assert method.rng.bit_generator.state == before[0]
+    for name, array in method.get_state().items():
+        np.testing.assert_array_equal(array, before[1][name])

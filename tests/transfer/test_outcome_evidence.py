@@ -122,7 +122,3 @@ def test_counts_are_saved():
         note(each, [SURE, NONE])
         each.end_episode(True)
     assert vars(made) == vars(other)
-    fresh = evidence()
-    fresh.set_state(evidence().get_state())
-    note(fresh, [NONE])
-    assert fresh.reward_range == (-1.0, -1.0)

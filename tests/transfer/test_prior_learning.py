@@ -1,4 +1,4 @@
-"""Learning with a prior: Mountain Car's division is found, and a source that is exact shortens learning."""
+"""Learning with a prior and bounded values: less is explored, and a model is saved with what it knows."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,8 @@ from helpers.oscillators import Oscillators, episodes
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.transfer.base import TargetTask
+from sb3_combrel.common.transferred import PriorPredictions
+from sb3_combrel.transfer.base import TargetTask, Transfer
 
 LOW, HIGH = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
 ACTIONS_4D = ("Neutral", "West", "East", "South", "North")
@@ -34,7 +35,7 @@ def car_task():
     return TargetTask(StateScaling(low, high), 5, np.zeros((1, 4)), 1.0, 0.01, 0.1, ("x", "y", "vx", "vy"), ACTIONS_4D)
 
 
-@pytest.mark.parametrize(("mappings", "seed"), [("factored", 0), ("factored", 1), ("signed_factored", 2)])
+@pytest.mark.parametrize(("mappings", "seed"), [("factored", 0), ("signed_factored", 2)])
 def test_two_cars_are_found_in_mountain_car_4d_within_one_episode(mappings, seed):
     transfer = COMBREL(car_source(seed), mappings, use="prior")
     task = car_task()
@@ -82,4 +83,78 @@ def test_a_model_with_a_prior_is_saved_and_learns_on(method, tmp_path):
     for one, other in zip(ours.prior(states, actions), theirs.prior(states, actions), strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(model.agent.model.fits.prior, loaded.agent.model.fits.prior)
+    assert ours.value_bound() is not None
+    np.testing.assert_array_equal(loaded.agent.planner.upper, model.agent.planner.upper)
     assert loaded.learn(60, reset_num_timesteps=False).agent.model.n_instances > model.agent.model.n_instances - 1
+
+
+class Bounded(Transfer):
+    """Predicts nothing; after ``n_steps`` transitions states are worth at most ``highest`` at the left."""
+
+    use = "prior"
+
+    def __init__(self, n_steps=50, highest=-20.0, shape=None):
+        self.n_steps, self.highest, self.shape, self.n_seen = n_steps, highest, shape, 0
+
+    def observe(self, state, action, reward, next_state, terminated):
+        self.n_seen += 1
+
+    def transferred(self, states, actions, own_weight):
+        raise AssertionError("a prior is not asked for instances")
+
+    def prior(self, states, actions):
+        return PriorPredictions.nothing(len(actions), self.task.n_variables)
+
+    def prior_version(self):
+        return int(self.n_seen >= self.n_steps)
+
+    def value_bound(self):
+        if not self.prior_version():
+            return None
+        return self.highest * (1.0 - self.task.sample_states[:, 0]) if self.shape is None else np.zeros(self.shape)
+
+    def get_state(self):
+        return {"n_seen": np.array([float(self.n_seen)])}
+
+    def set_state(self, state):
+        self.n_seen = int(state["n_seen"][0])
+
+
+def car_model(transfer, **kwargs):
+    return FittedRMax("MountainCar-v0", degree=1, transfer=transfer, **kwargs)
+
+
+def test_bounds_of_a_method_of_ones_own_are_used_from_when_its_version_grows(tmp_path):
+    model = car_model(Bounded(), seed=0).learn(49)
+    planner = model.agent.planner
+    assert planner.values.max() == 0.0 and (planner.upper == 0.0).all()
+    model.learn(2, reset_num_timesteps=False)
+    bound = np.minimum(0.0, -20.0 * (1.0 - model.agent.grid.points()[:, 0]))  # not above max_value
+    np.testing.assert_allclose(planner.upper, bound)
+    assert (planner.values <= bound + 1e-9).all()
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model", env="MountainCar-v0")
+    np.testing.assert_array_equal(loaded.agent.planner.upper, planner.upper)
+    np.testing.assert_allclose(loaded.agent.planner.values, planner.values)
+
+
+def test_bounds_of_a_wrong_shape_are_refused_with_what_would_be_right():
+    with pytest.raises(ValueError, match=r"value_bound\(\) must return None or a finite number for each of the \d+ states"):
+        car_model(Bounded(shape=7), seed=0).learn(60)
+
+
+def same_as_in_learning(model):
+    """In which part of the states the frozen policy chooses the action that the agent would choose to learn."""
+    space = model.observation_space
+    states = np.random.default_rng(0).uniform(space.low, space.high, (300, len(space.low))).astype(np.float32)
+    frozen, _ = model.predict(states, deterministic=True)
+    scaling = model.policy.scaling
+    learning = [int(model.agent.q_values(scaling.to_unit(state.astype(np.float64))).argmax()) for state in states]
+    return float((frozen == learning).mean())
+
+
+def test_a_frozen_policy_acts_on_bounded_values_as_in_learning_and_without_bounds_on_what_is_known():
+    bounded = car_model(Bounded(), seed=0).learn(150)
+    unbounded = car_model(Bounded(n_steps=1000), seed=0).learn(150)
+    assert same_as_in_learning(bounded) == 1.0
+    assert same_as_in_learning(unbounded) < 0.9

@@ -9,7 +9,6 @@ from helpers import factored as f
 from helpers.factored import bound, inside, show
 from helpers.naive_transfer import random_source
 from helpers.ring import Ring
-from helpers.walk import Walk, walk_source
 
 from sb3_combrel import FittedRMax, SoftHomomorphism, SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
@@ -27,7 +26,7 @@ def lopsided(states, actions):
 
 
 def test_swapped_variables_are_found_from_a_few_transitions():
-    method = bound(SoftHomomorphism(f.oscillator_source(), mirrored=False, n_starts=2), 2, 3)
+    method = bound(SoftHomomorphism(f.oscillator_source(), mirrored=False, n_starts=1), 2, 3)
     walked = f.walk(SWAPPED, 100)
     show(method, walked, ends=f.ends((walked[0] + walked[2])[:, ::-1]))
     state, action = method.mixture()
@@ -59,7 +58,7 @@ def test_a_mirrored_variable_and_renamed_actions_are_found():
         return lopsided(states, actions) + np.array([[0.0, 0.05], [0.0, 0.0], [0.04, -0.05]])[actions]
 
     effects = pushed(at, renamed[actions])
-    method = bound(SoftHomomorphism(f.oscillator_source(effects=pushed)), 2, 2)
+    method = bound(SoftHomomorphism(f.oscillator_source(effects=pushed), n_starts=2), 2, 2)
     show(method, (states, actions, np.column_stack([-effects[:, 1], effects[:, 0]])))
     state, action = method.mixture()
     assert state[0, 0, 0, 1] > 0.95 and state[0, 1, 1, 0] > 0.95
@@ -68,7 +67,7 @@ def test_a_mirrored_variable_and_renamed_actions_are_found():
 
 def test_two_copies_of_the_source_are_told_apart():
     mapping = f.copies_mapping(2, (0, 2, 1, 3))
-    method = bound(SoftHomomorphism(f.oscillator_source(), mirrored=False, n_starts=2), 4, 5)
+    method = bound(SoftHomomorphism(f.oscillator_source(), mirrored=False, n_starts=1), 4, 5)
     show(method, f.walk(mapping, 200))
     state, _ = method.mixture()
     read = [tuple(copy.argmax(axis=1).tolist()) for copy in state[:, 0]]
@@ -79,15 +78,10 @@ def test_two_copies_of_the_source_are_told_apart():
 
 
 def test_the_prior_changes_with_each_fit_and_with_nothing_else():
-    method = bound(SoftHomomorphism(f.oscillator_source(200), max_transitions=40), 2, 3)
+    method = bound(SoftHomomorphism(f.oscillator_source(200), n_starts=1, max_transitions=40), 2, 3)
     versions = show(method, f.walk(SWAPPED, 60))
-    fitted = np.flatnonzero(np.diff([0, *versions])) + 1
-    expected, due = [], 10.0
-    for n in range(1, 41):
-        if n >= due:
-            expected.append(n)
-            due = n * 2**0.5
-    assert fitted.tolist() == expected == [10, 15, 22, 32]
+    # When there are square root of 2 times as many transitions as at the last fit.
+    assert (np.flatnonzero(np.diff([0, *versions])) + 1).tolist() == [10, 15, 22, 32]
     assert method.statistics()["transfer/fits"] == 4
 
 
@@ -106,50 +100,28 @@ def test_before_the_first_fit_nothing_is_predicted():
 def test_a_target_that_has_nothing_in_common_is_not_claimed_to_be_known():
     rng = np.random.default_rng(2)
     states, actions = rng.random((100, 2)), rng.integers(3, size=100)
-    method = bound(SoftHomomorphism(f.oscillator_source(), n_starts=2), 2, 3)
+    method = bound(SoftHomomorphism(f.oscillator_source(), n_starts=1), 2, 3)
     show(method, (states, actions, 0.1 * np.sin(40.0 * states[:, ::-1])))
     assert method._claims.trust.tolist() == [0.0, 0.0, 0.0]
     assert method.prior(*inside(50, 2, 3)).weight.max() == 0.0
 
 
-def test_noise_in_a_variable_that_an_action_leaves_alone_takes_no_trust():
-    def effects(states, actions):
-        return 0.05 * np.column_stack([actions == 1, actions == 2])
-
-    rng = np.random.default_rng(0)
-    states, actions = rng.random((100, 2)), rng.integers(3, size=100)
-    moved = effects(states, actions)
-    moved = np.where(moved == 0.0, 0.004 * rng.normal(size=moved.shape), moved)
-    method = bound(SoftHomomorphism(f.oscillator_source(effects=effects), mirrored=False), 2, 3)
-    show(method, (states, actions, moved))
-    assert method._claims.trust.min() >= 0.7
-
-
 def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doubted():
-    source = f.oscillator_source(1500)
-    method = bound(SoftHomomorphism(source, mirrored=False), 2, 3)
+    method = bound(SoftHomomorphism(f.oscillator_source(1500), mirrored=False, n_starts=1), 2, 3)
     show(method, f.walk(SWAPPED, 100))
     # The source's x, which ends episodes above 0.9, is the target's second variable.
-    at_end, actions = np.array([[0.5, 0.93]]), np.array([0])
-    assert method.prior(at_end, actions).end[0] > 0.5
-    assert method.prior(at_end, actions).weight[0] == 0.0
-    before = method.prior_version()
-    method.observe(at_end[0], 0, -1.0, at_end[0] + f.target_effects(SWAPPED, at_end, actions)[0], True)
+    at_end, actions, amid = np.array([[0.5, 0.93]]), np.array([0]), inside(5, 2, 3)
+    assert method.prior(at_end, actions).end[0] > 0.5 and method.prior(at_end, actions).weight[0] == 0.0
+    before, [after] = method.prior_version(), at_end + f.target_effects(SWAPPED, at_end, actions)
+    method.observe(at_end[0], 0, -1.0, after, True)
     assert method.prior_version() == before + 1
     assert method.prior(at_end, actions).weight[0] > 0.0
-    assert method.prior(*inside(5, 2, 3)).weight.min() > 0.0
     for _ in range(2):
         # It stays for an episode where an end is predicted.
-        method.observe(at_end[0], 0, -1.0, at_end[0] + f.target_effects(SWAPPED, at_end, actions)[0], False)
+        method.observe(at_end[0], 0, -1.0, after, False)
         method.end_episode(truncated=True)
-    # Ends are believed no more, and nothing else is doubted.
     assert method.statistics()["transfer/prior_doubted"] == 0.0
-    assert method.prior(at_end, actions).weight[0] == 0.0 and method.prior(*inside(5, 2, 3)).weight.min() > 0.0
-    for state in inside(3, 2, 3)[0]:
-        method.observe(state, 0, -1.0, state + f.target_effects(SWAPPED, state[None], actions)[0], True)
-        method.end_episode(truncated=False)
-    assert method.statistics()["transfer/prior_doubted"] == 1.0
-    assert method.prior(*inside(5, 2, 3)).weight.max() == 0.0
+    assert method.prior(at_end, actions).weight[0] == 0.0 and method.prior(*amid).weight.min() > 0.0
 
 
 def test_periodic_variables_are_taken():
@@ -166,19 +138,12 @@ def test_periodic_variables_are_taken():
     assert model.policy.transfer.statistics()["transfer/prediction_error"] < 0.2
 
 
-def test_what_does_not_fit_the_target_is_refused_when_bound():
-    two = [f.oscillator_source(60)] * 2
-    with pytest.raises(ValueError, match="source must be one source with SoftHomomorphism, got 2"):
-        bound(SoftHomomorphism(two), 2, 3)
-    with pytest.raises(ValueError, match="source must be"):
-        bound(SoftHomomorphism(5), 2, 3)
+def test_too_many_mappings_are_refused_when_bound():
     five = random_source(np.random.default_rng(0), 20, 5, 1)
     assert count_mappings(5, 5, True) == 3840 > MAX_MAPPINGS
-    with pytest.raises(ValueError, match=r"at most 2,000 mappings of states, got 3,840 of 5 target to 5 .*mirrored=False"):
+    with pytest.raises(ValueError, match=r"at most 2,000 mappings of states, got 3,840 .*mirrored=False"):
         bound(SoftHomomorphism(five), 5, 3)
     bound(SoftHomomorphism(five, mirrored=False), 5, 3)
-    with pytest.raises(ValueError, match="degree=0"):
-        FittedRMax(Walk(), transfer=SoftHomomorphism(walk_source()), degree=0)
 
 
 def test_a_source_with_more_variables_than_the_target_leaves_some_out():
@@ -218,11 +183,7 @@ def test_all_mappings_are_listed_once_and_counted(size):
     ]
     assert sorted(rows, key=str) == sorted(naive_mappings(*size), key=str)
     assert len(rows) == soft.count_mappings(*size)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_different_readings_have_different_logits_and_the_same_one_the_same(size):
-    readings = soft.all_readings(*size)
+    # Different readings have different logits, and the same one the same.
     means = set(zip(readings.number.ravel(), readings.variable.ravel(), readings.sign.ravel(), strict=True))
     assert sorted(number for number, _, _ in means) == list(range(1 + readings.number.max()))
 
@@ -284,14 +245,10 @@ def problem(seed=0, n=6, n_copies=2):
     return readings, logits, data
 
 
-def test_probabilities_are_products_normalised_over_the_mappings():
-    readings, logits, _ = problem()
-    for ours, theirs in zip(soft.probabilities(logits, readings), naive_probabilities(logits, readings), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
-
-
-def test_the_error_of_several_starts_is_that_of_plain_loops():
+def test_probabilities_and_the_error_of_several_starts_are_those_of_plain_loops():
     readings, one, data = problem(0)
+    for ours, theirs in zip(soft.probabilities(one, readings), naive_probabilities(one, readings), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
     _, other, _ = problem(1)
     starts = [th.from_numpy(np.stack(pair)) for pair in zip(one, other, strict=True)]
     expected = [naive_loss(one, readings, data), naive_loss(other, readings, data)]

@@ -5,13 +5,13 @@ import copy
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
-from helpers.asking import bound, changed_pairs, transferred_at, transferred_to_pairs
+from helpers.asking import bound, changed_pairs, pairs_of, transferred_at, transferred_to_pairs
 from helpers.walk import same_parameters
 from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
-from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
+from sb3_combrel.mappings.named_sets import InterTaskMapping
 
 POINTS = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 ONE = InterTaskMapping([0, None, 1], [1, 0])
@@ -28,14 +28,13 @@ def task():
     return naive.target_task(POINTS, 2)
 
 
-def transferred_to_all(method, task, own=0.0):
-    pairs = np.arange(task.n_actions * len(task.sample_states))
-    return copy.deepcopy(transferred_to_pairs(method, pairs, np.full(len(pairs), own)))
+def given_to_all(method, task, own=0.0):
+    return copy.deepcopy(transferred_to_pairs(method, pairs_of(task), np.full(len(pairs_of(task)), own)))
 
 
 def assert_transfers(method, task, drawn_from, breadth):
     """Every pair gets what the naive version takes from ``drawn_from(action)``; at an exact state, too."""
-    on_grid, n_points, n_transferred = transferred_to_all(method, task), len(task.sample_states), 0
+    on_grid, n_points, n_transferred = given_to_all(method, task), len(task.sample_states), 0
     for point, state in enumerate(task.sample_states):
         at = transferred_at(method, state, np.zeros(task.n_actions))
         for action in range(task.n_actions):
@@ -49,19 +48,18 @@ def assert_transfers(method, task, drawn_from, breadth):
     assert n_transferred > len(task.sample_states)
 
 
-def test_one_mapping_serves_all_actions(source, task):
-    method = bound(TIMBREL(source, ONE, breadth=0.2), task)
-    assert_transfers(method, task, lambda action: [(source, ONE, action)], 0.2)
-
-
-def test_each_action_may_have_a_mapping_of_its_own(source, task):
-    method = bound(TIMBREL(source, [ONE, OTHER], breadth=0.2), task)
-    assert_transfers(method, task, lambda action: [(source, [ONE, OTHER][action], action)], 0.2)
-
-
-def test_the_pool_holds_the_translations_by_all_mappings(source, task):
-    method = bound(TIMBREL(source, "pool", mappings=[ONE, OTHER], breadth=0.1), task)
-    assert_transfers(method, task, lambda action: [(source, ONE, action), (source, OTHER, action)], 0.1)
+@pytest.mark.parametrize(
+    ("given", "of_action"),
+    [
+        ({"mapping": ONE}, [[ONE]] * 2),
+        ({"mapping": [ONE, OTHER]}, [[ONE], [OTHER]]),
+        ({"mapping": "pool", "mappings": [ONE, OTHER]}, [[ONE, OTHER]] * 2),
+    ],
+    ids=["one for all actions", "one for each action", "pool"],
+)
+def test_what_a_mapping_transfers(given, of_action, source, task):
+    method = bound(TIMBREL(source, **given, breadth=0.15), task)
+    assert_transfers(method, task, lambda action: [(source, mapping, action) for mapping in of_action[action]], 0.15)
 
 
 def test_random_draws_a_mapping_of_the_set_with_each_transition(source, task):
@@ -91,24 +89,6 @@ def test_at_first_everything_has_changed_and_then_nothing(source, task):
     assert changed_pairs(method, known).tolist() == np.flatnonzero(~known).tolist()
     method.observe(POINTS[5], 0, -1.0, POINTS[6], False)
     assert changed_pairs(method, known).tolist() == []
-
-
-def test_pairs_that_are_known_are_given_nothing(source, task):
-    method = bound(TIMBREL(source, ONE, breadth=0.3), task)
-    assert transferred_to_all(method, task, own=0.5).length.any()
-    assert not transferred_to_all(method, task, own=1.0).length.any()
-    assert transferred_at(method, POINTS[12], np.array([0.0, 1.0])).length.tolist()[1] == 0
-    assert transferred_at(method, POINTS[12], np.array([1.0, 0.0])).length.tolist()[0] == 0
-    assert not transferred_at(method, POINTS[12], np.array([1.0, 3.0])).length.any()
-
-
-def test_uses_are_counted_by_name_where_the_agent_acts_and_not_where_it_predicts(source, task):
-    method = bound(TIMBREL(source, ONE, breadth=0.3), task)
-    for _ in range(3):
-        method.note_use(transferred_at(method, POINTS[13], np.zeros(2)))
-        transferred_at(method, POINTS[12], np.zeros(2))
-    method.note_use(transferred_at(method, POINTS[13], np.array([0.0, 1.0])))
-    assert method.mapping_counts() == [("a0<-a1 with s0<-s0, s2<-s1", 4), ("a1<-a0 with s0<-s0, s2<-s1", 3)]
 
 
 def mountain_car(transfer, seed=0, **kwargs):
@@ -174,12 +154,3 @@ def test_the_object_that_was_given_is_left_alone_and_serves_two_models(method):
     assert vars(given) == before and given.source is source
     assert len({id(transfer) for transfer in (given, *(model.transfer for model in models))}) == 4
     assert same_parameters(models[0], models[1]) and same_parameters(models[0], models[2])
-
-
-def test_random_and_pool_draw_from_the_injective_mappings_by_default():
-    source = naive.random_source(np.random.default_rng(0), 50, 2, 3)
-    model = mountain_car(TIMBREL(source))
-    expected = {(0, 1), (1, 0)}
-    assert {tuple(row) for row in model.policy.transfer.candidates.sets[0].state_mappings.tolist()} == expected
-    all_of_them = mountain_car(TIMBREL(source, "pool", mappings=MappingSet.all(2, 2, 3, 3, signs=True)))
-    assert all_of_them.policy.transfer.candidates.sets[0].n_state_mappings > len(expected)

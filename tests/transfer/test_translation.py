@@ -116,19 +116,6 @@ def row_of_instances(at, effect=0.1, terminated=False):
 ONTO_X = InterTaskMapping([0, None], [0])
 
 
-def given_to(state, own, source, mapping=ONTO_X, breadth=0.1, **rules):
-    task = naive.target_task(np.array([state]), 1, **rules)
-    return translated(np.array([state]), np.array([own]), [mapping], source, task, breadth)[0]
-
-
-def test_nothing_is_transferred_where_it_would_not_reach_the_threshold():
-    source = row_of_instances([0.55, 0.45])
-    assert given_to([0.5, 0.2], 0.0, source).length[0] == 2
-    assert given_to([0.5, 0.2], 0.0, source, threshold=1.6).length[0] == 0
-    assert given_to([0.5, 0.2], 0.1, source, threshold=1.6).length[0] == 2, "the own weight counts"
-    assert given_to([0.0, 0.2], 0.99, source).length[0] == 0
-
-
 @pytest.mark.parametrize("min_fraction", [0.01, 0.1, 0.5])
 def test_a_method_has_room_for_all_that_a_pair_may_need(min_fraction):
     """Nearest first, ``min_fraction`` bounds the useful instances; nothing may be lost for lack of room below that."""

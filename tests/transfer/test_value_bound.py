@@ -1,5 +1,7 @@
 """An upper bound on the values of the target, from the source's: against optimal returns that can be counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import factored as f
@@ -81,19 +83,11 @@ def test_where_the_source_has_no_data_everything_may_be_beyond():
 
 def test_of_several_copies_the_one_that_is_worth_least_bounds_the_target():
     target = task(2)
-    of_two = value_bound([line_source()], target, [[0, -1], [-1, 0]])
+    of_two = value_bound([line_source(), line_source(goal=0.6)], target, [[0, -1], [-1, 0]], source=[0, 1])
     found, one, two = (of_two.through(all_of(*copies)) for copies in ((0, 1), (0,), (1,)))
     np.testing.assert_array_equal(found, np.minimum(one, two))
+    np.testing.assert_allclose(two, best_return(target.sample_states[:, 1], goal=0.6), atol=1.6)
     assert (found < one).any() and (found < two).any()
-
-
-def test_of_two_sources_each_bounds_by_its_own_values():
-    target = task(2)
-    sources = [line_source(), line_source(goal=0.6)]
-    of_two = value_bound(sources, target, [[0, -1], [-1, 0]], source=[0, 1])
-    found = of_two.through(all_of(1))
-    np.testing.assert_allclose(found, best_return(target.sample_states[:, 1], goal=0.6), atol=1.6)
-    np.testing.assert_array_equal(of_two.through(all_of(0, 1)), np.minimum(of_two.through(all_of(0)), found))
 
 
 @pytest.mark.parametrize("rewards", [(-1.0, -2.0), (1.0, 1.0), (np.linspace(-1.0, -2.0, 400), -1.0)])
@@ -112,16 +106,7 @@ def test_nothing_bounds_a_target_whose_actions_are_those_of_different_copies():
 
 def test_a_copy_that_leaves_out_variables_of_its_source_bounds_nothing():
     source, states = f.oscillator_source(), np.array([[0, 1, -1, -1], [-1, -1, 0, -1]])
-    target = TargetTask(
-        StateScaling(np.zeros(4), np.ones(4)),
-        5,
-        np.random.default_rng(0).random((50, 4)),
-        1.0,
-        0.01,
-        0.1,
-        tuple("abcd"),
-        tuple("vwxyz"),
-    )
+    target = replace(f.target_task(4, 5), sample_states=np.random.default_rng(0).random((50, 4)))
     parts = value_bound([source], target, states)
     assert parts.through(all_of(1, n_actions=5)) is None
     np.testing.assert_array_equal(parts.through(all_of(0, 1, n_actions=5)), parts.through(all_of(0, n_actions=5)))

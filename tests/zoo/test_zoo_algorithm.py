@@ -68,15 +68,13 @@ def test_what_a_study_draws_replaces_what_the_configuration_says(algo, source):
     assert model.agent.model_settings.model_breadth == trial.params["model_breadth"]
 
 
-@pytest.mark.parametrize(("drawn", "expected"), [(None, 4), ("coarser", 3), ("finer", 5)])
-def test_a_drawn_grid_is_relative_to_the_one_that_suits_the_task(drawn, expected):
-    model = ZooFittedRMax("FittedRMaxPolicy", box(3), model_breadth=0.2, resolution=drawn)
-    assert model.agent.grid.resolution == (expected,) * 3
+def test_a_drawn_grid_is_relative_to_the_one_that_suits_the_task_and_stays_within_memory():
+    def resolution(n_variables, drawn, **arguments):
+        return ZooFittedRMax("FittedRMaxPolicy", box(n_variables), resolution=drawn, **arguments).agent.grid.resolution
 
-
-def test_a_finer_grid_of_many_variables_stays_within_memory():
-    suited, finer = (ZooFittedRMax("FittedRMaxPolicy", box(5), resolution=drawn) for drawn in (None, "finer"))
-    assert finer.agent.grid.resolution == suited.agent.grid.resolution
+    drawn = [resolution(3, each, model_breadth=0.2) for each in (None, "coarser", "finer")]
+    assert drawn == [(4,) * 3, (3,) * 3, (5,) * 3]
+    assert resolution(5, "finer") == resolution(5, None)
 
 
 def with_combrel(**arguments):
