@@ -115,7 +115,10 @@ class Physics(mujoco.Physics):
         self._angles[:] = self._targets[:] = np.deg2rad(degrees)
 
     def move_joint(self, joint: int, step: float, max_lag: float) -> None:
-        """Moves one joint's target by `step` degrees; first, lest forces grow, targets to within `max_lag` of joints."""
+        """Moves one joint's target by `step` degrees, after bringing all targets to within `max_lag` degrees of their joints.
+
+        The controller of a blocked joint would otherwise exert an ever larger force.
+        """
         max_lag /= _DEGREES
         # Single numbers: for a handful of them NumPy takes several times as long.
         near = zip(self._targets.tolist(), self._angles.tolist(), strict=True)

@@ -10,7 +10,11 @@ from combrel_envs.gym_env import DmControlEnv
 
 
 class ICubStrikeEnv(DmControlEnv):
-    """Common base class of both tasks; :class:`ICubTorsoStrikeEnv` says what the arguments are, else a ``ValueError``."""
+    """
+    Common base class of both tasks; :class:`ICubTorsoStrikeEnv` says what the arguments are.
+
+    :raises ValueError: when an argument isn't possible; ModuleNotFoundError when the meshes aren't installed
+    """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium declares it
     cameras = ("front", "top")

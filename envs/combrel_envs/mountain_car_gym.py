@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 
 class MountainCarEnv(RenderedEnv):
-    """Common base class of the three cars; :class:`MountainCar2DEnv` says what the arguments are, else a ``ValueError``."""
+    """
+    Common base class of the three cars; :class:`MountainCar2DEnv` says what the arguments are. A wrong one: ``ValueError``.
+    """
 
     n_axes: ClassVar[int]
 
