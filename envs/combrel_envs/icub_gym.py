@@ -10,11 +10,7 @@ from combrel_envs.gym_env import DmControlEnv
 
 
 class ICubStrikeEnv(DmControlEnv):
-    """
-    Common base class of both tasks; :class:`ICubTorsoStrikeEnv` says what the arguments are.
-
-    :raises ValueError: when an argument isn't possible; ModuleNotFoundError when the meshes aren't installed
-    """
+    """Common base class, arguments as :class:`ICubTorsoStrikeEnv`; else `ValueError`, `ModuleNotFoundError` without meshes."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium declares it
     cameras = ("front", "top")

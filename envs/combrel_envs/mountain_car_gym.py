@@ -15,9 +15,7 @@ if TYPE_CHECKING:
 
 
 class MountainCarEnv(RenderedEnv):
-    """
-    Common base class of the three cars; :class:`MountainCar2DEnv` says what the arguments are. A wrong one: ``ValueError``.
-    """
+    """Common base class of the three cars, arguments as :class:`MountainCar2DEnv` says; `ValueError` for others."""
 
     n_axes: ClassVar[int]
 
