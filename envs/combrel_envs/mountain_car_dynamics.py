@@ -78,7 +78,7 @@ def check_action_noise(action_noise: Any) -> float:
 
 
 def executed_push(action: SupportsIndex, n_axes: int, action_noise: float, uniform: Uniform) -> Axes:
-    """What the engine does on each axis; a random action is executed instead with probability ``action_noise``."""
+    """What the engine does on each axis, at random with probability ``action_noise``; `ValueError`: no such action."""
     number = check_action(action, ACTION_NAMES[n_axes])
     pushes = PUSHES[n_axes]
     if action_noise and uniform(0.0, 1.0) < action_noise:

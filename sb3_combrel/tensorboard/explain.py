@@ -26,12 +26,15 @@ def explain(
     at: ArrayLike | None = None,
 ) -> TransferReport:
     """
-    Say what transfer did in a model that has learned: which mappings, how sure, what contradicted them, how many steps rested
-    on it.
+    Say what transfer did in a model that has learned.
+
+    Which mappings, by name; how sure they are, against the next best and against "no change"; where the target's own
+    transitions contradicted the source; how many steps rested on it.
 
     :param model: the model, or the path of its file
-    :param output: a folder for the report, ``report.txt``, the dashboard's pictures as PNG, and its table of the mappings used
-        most, ``mappings.md``. A transfer method without mappings has the report and V only. None: nothing is written
+    :param output: a folder for the report, ``report.txt``, the pictures of the dashboard as PNG (V and policy over two state
+        variables, and the source action of each target action), and its table of the mappings used most, ``mappings.md``. A
+        transfer method without mappings has the report and V only. None: nothing is written
     :param variables: pairs of state variables, by number or name, over which is drawn; None for the first two
     :param at: state (raw units) through which the pictures' plane goes; None for the middle of the state space
     :return: the report; ``print`` it, or read its fields
