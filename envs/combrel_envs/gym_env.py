@@ -38,13 +38,11 @@ def _register(name: str, entry_point: str, max_episode_steps: int, kwargs: dict[
 
 class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
     """
-    An environment with flat float32 observations and discrete actions, drawn by MuJoCo.
+    An environment with flat float32 observations and discrete actions, drawn by MuJoCo; a wrong argument is a ValueError.
 
     :param render_mode: ``"rgb_array"`` or None
-    :param width: width of a frame in pixels
-    :param height: height of a frame in pixels
+    :param width: of a frame in pixels, as ``height``
     :param camera: name of one of ``cameras``; the first of them if None
-    :raises ValueError: when an argument isn't one of these
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012 - as Gymnasium declares it
@@ -68,12 +66,7 @@ class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
         self._camera: str | int = camera or (self.cameras[0] if self.cameras else -1)
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """
-        Draw the present state.
-
-        :return: a picture as an array of shape (height, width, 3), uint8; None without a render mode
-        :raises RenderingError: when OpenGL is missing; the message says what to install
-        """
+        """Draw the state, uint8, shape (height, width, 3), or None without a render mode; `RenderingError` without OpenGL."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs a render mode, for instance gymnasium.make(..., render_mode='rgb_array')")
             return None
@@ -97,8 +90,7 @@ class DmControlEnv(RenderedEnv):
     step is terminated. ``info["is_success"]`` is True if it terminated.
 
     :param environment: the environment; its actions must be discrete
-    :param low: least value of each entry of the observation; None takes the specification's
-    :param high: greatest value of each entry of the observation; None takes the specification's
+    :param low: least value of each entry of the observation, ``high``: the greatest; None takes the specification's
     :param picture: ``render_mode``, ``width``, ``height`` and ``camera``, see :class:`RenderedEnv`
     :raises ValueError: when the actions aren't discrete or an argument isn't one of these
     """
@@ -128,13 +120,7 @@ class DmControlEnv(RenderedEnv):
         return self._environment
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        Begin an episode.
-
-        :param seed: seed of this and the following episodes; None continues with the present random state
-        :param options: see :meth:`_apply_options`
-        :return: the first observation, and an empty dictionary
-        """
+        """Begin an episode; ``seed`` is that of the following ones too. For ``options`` see :meth:`_apply_options`."""
         super().reset(seed=seed)
         if seed is not None:
             self._environment.task.random.seed(int(self.np_random.integers(2**32)))

@@ -1,8 +1,7 @@
 """The iCub strikes a ball: a dm_control domain with the tasks of Section 4.2 of the COMBREL paper.
 
-``torso_strike`` moves two joints of the torso (the paper's source task), ``arm_strike`` four of the right arm (its target
-task); the ``_noisy`` variants add the noise that makes them stochastic. The robot is blind: it observes the encoders of the
-joints that it moves, in degrees. A command moves one joint by a fixed extent and takes 0.1 s of simulated time.
+``torso_strike`` moves two joints of the torso (its source task), ``arm_strike`` four of the right arm (its target task); the
+``_noisy`` variants are stochastic. The robot observes only the encoders of these joints, in degrees; a command takes 0.1 s.
 """
 
 import collections
@@ -74,8 +73,7 @@ def make_environment(
       task: "torso_strike" or "arm_strike".
       time_limit: Seconds until an episode is cut off; a command takes 0.1 s.
       look: "primitives" or "meshes".
-      random, start, extent, motor_noise, encoder_noise: See `Strike`.
-      environment_kwargs: Arguments of `control.Environment`.
+      environment_kwargs: Arguments of `control.Environment`; for all others see `Strike`.
     """
     check_choice("look", look, icub_tasks.LOOKS)
     check_number("time_limit", time_limit, "a number of seconds above 0", lambda seconds: seconds > 0)
@@ -117,10 +115,9 @@ class Physics(mujoco.Physics):
         self._angles[:] = self._targets[:] = np.deg2rad(degrees)
 
     def move_joint(self, joint: int, step: float, max_lag: float) -> None:
-        """Moves the target of one joint of the task by `step` degrees.
+        """Moves one joint's target by `step` degrees, after bringing all targets to within `max_lag` degrees of their joints.
 
-        Beforehand, targets are brought to within `max_lag` degrees of their joints: the controller of a blocked joint would
-        otherwise exert an ever larger force.
+        The controller of a blocked joint would otherwise exert an ever larger force.
         """
         max_lag /= _DEGREES
         # Single numbers: for a handful of them NumPy takes several times as long.
@@ -174,12 +171,11 @@ class Strike(control.Task):
         """Initializes an instance of `Strike`.
 
         Args:
-          strike: Which joints move.
           start: Angles of the joints, in degrees, at which an episode begins; None for those of the task.
           extent: Degrees by which a command moves a joint.
           motor_noise: Standard deviation of the extent, as a fraction of it.
           encoder_noise: Standard deviation of an observed angle, in degrees.
-          random: A `numpy.random.RandomState` instance, an integer seed for one, or None to select a seed.
+          random: A `numpy.random.RandomState`, a seed for one, or None to select a seed.
         """
         self._strike, self._action_names = strike, strike.action_names
         joints = [icub_tasks.JOINTS[name] for name in strike.state_names]

@@ -10,13 +10,7 @@ from combrel_envs.gym_env import DmControlEnv
 
 
 class ICubStrikeEnv(DmControlEnv):
-    """
-    Common base class of both tasks; :class:`ICubTorsoStrikeEnv` says what the arguments are.
-
-    :param picture: ``render_mode``, ``width``, ``height`` and ``camera``
-    :raises ValueError: when an argument isn't possible
-    :raises ModuleNotFoundError: when the meshes aren't installed
-    """
+    """Common base class, arguments as :class:`ICubTorsoStrikeEnv`; else `ValueError`, `ModuleNotFoundError` without meshes."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium declares it
     cameras = ("front", "top")
@@ -60,13 +54,6 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
     still. This is the source task of Section 4.2 in Fachantidis, Partalas, Taylor and Vlahavas, *Transfer learning with
     probabilistic mapping selection* (Adaptive Behavior, 2015); the target task is `combrel/ICubArmStrike-v0`.
 
-    ```python
-    import gymnasium
-    import combrel_envs
-
-    env = gymnasium.make("combrel/ICubTorsoStrike-v0")
-    ```
-
     ## Observation Space
 
     A `Box` of float32 with shape (2,): the encoders of the joints, in degrees. The bounds are the limits of the real robot.
@@ -78,25 +65,18 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
 
     ## Action Space
 
-    `Discrete(4)`, named as in the paper's Table 4: joint and direction.
-
-    | Num | Action | Joint       | Degrees |
-    |-----|--------|-------------|---------|
-    | 0   | S1-    | torso_pitch | -2      |
-    | 1   | S1+    | torso_pitch | +2      |
-    | 2   | S2-    | torso_yaw   | -2      |
-    | 3   | S2+    | torso_yaw   | +2      |
+    `Discrete(4)`: S1-, S1+, S2-, S2+, as in the paper's Table 4: joint (S1: torso_pitch, S2: torso_yaw) and direction, 2
+    degrees each.
 
     ## Transition Dynamics
 
-    MuJoCo simulates the robot (kinematics, inertias and limits of iCubGazeboV2_5), the table and the ball. An action moves
-    the target angle of one joint by the extent, 2 degrees, but not beyond the joint's limits; position controllers follow
-    the targets for 0.1 s, in which a free joint comes to within about 0.1 degrees of its target. The hand can be blocked by
-    the table: before each action every target is brought to within one extent of its joint. Only the right hand collides.
+    MuJoCo simulates the robot (kinematics, inertias and limits of iCubGazeboV2_5), the table and the ball. An action moves the
+    target angle of one joint by the extent, within the joint's limits; position controllers follow the targets for 0.1 s, in
+    which a free joint comes to within about 0.1 degrees of its target. The hand, which alone collides, can be blocked by the
+    table: before each action every target is brought to within one extent of its joint.
 
-    The simulation is deterministic: the same actions lead to the same observations, bit by bit. The variant
-    `combrel/ICubTorsoStrikeNoisy-v0` adds noise: the extent of each action is drawn from N(2, 0.2) degrees, and each encoder
-    reading is off by N(0, 0.2) degrees.
+    The same actions lead to the same observations, bit by bit. `combrel/ICubTorsoStrikeNoisy-v0` adds noise: the extent of
+    each action is drawn from N(2, 0.2) degrees, and each encoder reading is off by N(0, 0.2) degrees.
 
     ## Rewards
 
@@ -109,32 +89,25 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
 
     ## Episode End
 
-    - Termination: the ball has been moved by more than 2 mm.
+    - Termination: the ball has been moved by more than 2 mm; `info["is_success"]` is True then.
     - Truncation: after 400 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
-      this. As always with this wrapper, a hit on the very last step is reported as both terminated and truncated; treat it as
-      terminated. The class itself, made without `gymnasium.make`, has no limit.
+      this; a hit on the very last step is reported as both: treat it as terminated. The class itself has no limit.
 
-    `info["is_success"]` is True if the ball has been hit. The tests replay a plan of 26 actions that hits; random actions hit
-    in about 6 % of the episodes.
+    The tests replay a plan of 26 actions that hits; random actions hit in about 6 % of the episodes.
 
     ## Arguments
 
-    - `start`: two angles in degrees, in the order of the observation: another start. The hand must not touch the ball there,
-      nor be inside the table.
+    - `start`: two angles in degrees, in the order of the observation. The hand must not touch the ball there, nor be inside
+      the table.
     - `extent`: degrees by which an action moves a joint, 2 by default.
     - `motor_noise`: standard deviation of an action's extent, as a fraction of it; 0 by default, 0.1 in the noisy variant.
-    - `encoder_noise`: standard deviation of an encoder reading in degrees; 0 by default, 0.2 in the noisy variant. The seed
-      of `reset` decides both.
+    - `encoder_noise`: standard deviation of an encoder reading in degrees; 0 by default, 0.2 in the noisy variant.
     - `look`: `"primitives"` (the default) or `"meshes"`, the robot's true shape, for which the package `icub-models` is needed
       (`pip install 'sb3-combrel[icub]'`). The dynamics are the same.
     - `render_mode`: `None` or `"rgb_array"`; needs OpenGL (`MUJOCO_GL=egl` without a display).
     - `width`, `height` of the pictures, 640 x 480 by default; `camera`: `"front"` (the default) or `"top"`.
 
-    `reset` takes the option `{"start": [...]}`, which overrides `start` for one episode.
-
-    ## Version History
-
-    - v0: first version.
+    The seed of `reset` decides the noise; its option `{"start": [...]}` overrides `start` for one episode.
     """
 
     task = "torso_strike"
@@ -147,8 +120,7 @@ class ICubArmStrikeEnv(ICubStrikeEnv):
     ## Description
 
     `combrel/ICubArmStrike-v0`: as in `combrel/ICubTorsoStrike-v0` the iCub must strike the ball, but by moving four joints of
-    its right arm; its torso leans forward and stands still. This is the target task of Section 4.2 in Fachantidis, Partalas,
-    Taylor and Vlahavas, *Transfer learning with probabilistic mapping selection* (Adaptive Behavior, 2015).
+    its right arm; its torso leans forward and stands still. This is the target task of the same paper.
 
     ## Observation Space
 

@@ -41,17 +41,11 @@ JOINTS: dict[str, Joint] = {
 
 
 class Strike(NamedTuple):
-    """
-    One of the tasks.
+    """One of the tasks."""
 
-    :param prefix: first letter of the action names
-    :param start: where an episode begins: the task's joints, in the order of its observation
-    :param fixed: angles of the joints that do not move, where they differ from 0
-    """
-
-    prefix: str
-    start: Mapping[str, float]
-    fixed: Mapping[str, float]
+    prefix: str  # first letter of the action names
+    start: Mapping[str, float]  # where an episode begins: the task's joints, in the order of its observation
+    fixed: Mapping[str, float]  # angles of the joints that do not move, where they differ from 0
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -83,12 +77,7 @@ TASKS: dict[str, Strike] = {
 
 
 def check_start(start: Any, strike: Strike) -> tuple[float, ...]:
-    """
-    Check the angles at which an episode begins.
-
-    :param start: angles of the task's joints in degrees, or None for the task's own start
-    :raises ValueError: when they aren't one number for each joint, or one is beyond its joint's limits
-    """
+    """Return the start's angles, in degrees; None: the task's; ``ValueError`` unless one for each joint, within its limits."""
     if start is None:
         return tuple(strike.start.values())
     try:

@@ -1,9 +1,8 @@
 """Mountain Car as a dm_control domain: an underpowered car that must first drive away from its goal.
 
 ``climb_2d`` is the car in a valley between two hills (Singh and Sutton 1996), ``climb_4d`` the car on a surface with hills
-along two axes, ``climb_6d`` the car with a third axis. One control step is one second of simulated time, so that the default
-time limit, 4000, is in steps too. The dynamics are those of :mod:`combrel_envs.mountain_car_dynamics`; MuJoCo stores the state
-and draws it.
+along two axes, ``climb_6d`` has a third. A control step is one second, so the default time limit, 4000, is in steps too.
+:mod:`combrel_envs.mountain_car_dynamics` steps the car; MuJoCo stores the state and draws it.
 """
 
 import collections
@@ -60,8 +59,7 @@ def make_environment(
     Args:
       n_axes: Number of axes along which the car moves: 1 in 2D, 2 in 4D, 3 in 6D.
       time_limit: Steps until an episode is cut off.
-      random, start, action_noise: See `Climb`.
-      environment_kwargs: Arguments of `control.Environment`.
+      environment_kwargs: Arguments of `control.Environment`; for all others see `Climb`.
     """
     task = Climb(start=start, random=random, action_noise=action_noise)
     return control.Environment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
@@ -133,10 +131,10 @@ class Climb(base.Task):
         """Initializes an instance of `Climb`.
 
         Args:
-          start: Where an episode begins: "offset" (at rest at the bottom, moved by a random offset in [-0.005, 0.005], the
-            same on every axis), "fixed" (at rest at the bottom) or "random" (anywhere but at the goal, at any velocity).
-          random: A `numpy.random.RandomState` instance, an integer seed for one, or None to select a seed.
-          action_noise: Probability with which a random action, drawn from all, is executed instead of the one that was chosen.
+          start: "offset" (at rest at the bottom, moved by a random offset in [-0.005, 0.005], the same on every axis), "fixed"
+            (at rest at the bottom) or "random" (anywhere but at the goal, at any velocity).
+          random: A `numpy.random.RandomState`, a seed for one, or None to select a seed.
+          action_noise: Probability with which a random action, drawn from all, is executed instead of the one chosen.
         """
         self._start = check_choice("start", start, dynamics.STARTS)
         self._action_noise = dynamics.check_action_noise(action_noise)

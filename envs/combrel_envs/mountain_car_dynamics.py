@@ -1,8 +1,7 @@
-"""The equations of Mountain Car, in plain Python floats: for two to six scalars several times faster than arrays.
+"""
+The equations of Mountain Car in plain Python floats, faster than arrays for two to six scalars; both interfaces use them.
 
-Both interfaces of the environment, dm_control's and Gymnasium's, step the car with :func:`step_car`. A state is a pair
-``(positions, velocities)`` of tuples with one float an axis: ``((x,), (v,))``, ``((x, y), (vx, vy))`` or
-``((x, y, z), (vx, vy, vz))``.
+A state is a pair of tuples ``(positions, velocities)`` with one float an axis, ``((x, y), (vx, vy))`` in 4D.
 """
 
 import math
@@ -47,12 +46,7 @@ Uniform = Callable[[float, float], float]
 
 
 def step_axis(position: float, velocity: float, push: float) -> tuple[float, float]:
-    """
-    Advance one axis by one step: engine and gravity change the velocity, the new velocity moves the car, the walls stop it.
-
-    :param push: what the engine does on this axis: -1, 0 or 1
-    :return: position and velocity after the step
-    """
+    """Advance position and velocity on one axis; ``push`` is -1, 0 or 1. The new velocity moves it, walls stop it."""
     velocity += ENGINE * push - GRAVITY * math.cos(3 * position)
     if velocity > MAX_SPEED:
         velocity = MAX_SPEED
@@ -84,13 +78,7 @@ def check_action_noise(action_noise: Any) -> float:
 
 
 def executed_push(action: SupportsIndex, n_axes: int, action_noise: float, uniform: Uniform) -> Axes:
-    """
-    What the engine does on each axis when an action is chosen.
-
-    :param action: number of the action, any integer type
-    :param action_noise: probability with which a random action, drawn from all, is executed instead
-    :raises ValueError: when there is no such action
-    """
+    """What the engine does on each axis, at random with probability ``action_noise``; `ValueError`: no such action."""
     number = check_action(action, ACTION_NAMES[n_axes])
     pushes = PUSHES[n_axes]
     if action_noise and uniform(0.0, 1.0) < action_noise:
@@ -99,12 +87,7 @@ def executed_push(action: SupportsIndex, n_axes: int, action_noise: float, unifo
 
 
 def sample_start(start: str, n_axes: int, uniform: Uniform) -> State:
-    """
-    Draw the state in which an episode begins.
-
-    :param start: ``"offset"``: at rest at the bottom of the valley, moved by one offset, the same on every axis;
-        ``"fixed"``: at rest exactly at the bottom; ``"random"``: anywhere but at the goal, at any velocity
-    """
+    """Draw the state in which an episode begins; ``start`` as in :class:`~combrel_envs.mountain_car.Climb`."""
     if start == "random":
         positions = _uniform_axes(n_axes, uniform, MIN_POSITION, MAX_POSITION)
         while at_goal(positions):

@@ -15,12 +15,7 @@ if TYPE_CHECKING:
 
 
 class MountainCarEnv(RenderedEnv):
-    """
-    Common base class of the three cars; :class:`MountainCar2DEnv` says what the arguments are.
-
-    :param picture: ``render_mode``, ``width``, ``height`` and ``camera``
-    :raises ValueError: when an argument isn't possible
-    """
+    """Common base class of the three cars, arguments as :class:`MountainCar2DEnv` says; `ValueError` for others."""
 
     n_axes: ClassVar[int]
 
@@ -43,12 +38,10 @@ class MountainCarEnv(RenderedEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
-        Begin an episode.
+        Begin an episode; ``seed`` is that of the following ones too, None continues.
 
-        :param seed: seed of this and the following episodes; None continues with the present generator
-        :param options: ``{"start": ...}`` overrides the environment's start option for this episode,
-            ``{"state": [...]}`` begins in exactly that state, in the order of ``state_names``
-        :return: the first observation, and an empty dictionary
+        :param options: ``{"start": ...}`` overrides the environment's start option for this episode, ``{"state": [...]}``
+            begins in exactly that state, in the order of ``state_names``
         :raises ValueError: when an option is unknown or its value isn't possible
         """
         super().reset(seed=seed)
@@ -113,16 +106,9 @@ class MountainCar2DEnv(MountainCarEnv):
     """
     ## Description
 
-    A car stands in a valley. Its engine is weaker than gravity, so it can't just drive up the hill on the right: it must
-    first go left, away from the goal, and swing up. This is the task of Singh and Sutton, *Reinforcement Learning with
-    Replacing Eligibility Traces* (Machine Learning, 1996).
-
-    ```python
-    import gymnasium
-    import combrel_envs
-
-    env = gymnasium.make("combrel/MountainCar2D-v0")
-    ```
+    A car stands in a valley. Its engine is weaker than gravity, so it can't just drive up the hill on the right: it must first
+    go left, away from the goal, and swing up. This is the task of Singh and Sutton, *Reinforcement Learning with Replacing
+    Eligibility Traces* (Machine Learning, 1996).
 
     ## Observation Space
 
@@ -135,15 +121,8 @@ class MountainCar2DEnv(MountainCarEnv):
 
     ## Action Space
 
-    `Discrete(3)`.
-
-    | Num | Action  | Push |
-    |-----|---------|------|
-    | 0   | Neutral | 0    |
-    | 1   | Left    | -1   |
-    | 2   | Right   | +1   |
-
-    Gymnasium's own `MountainCar-v0` has another order: 0 is left, 1 is none, 2 is right.
+    `Discrete(3)`: Neutral, Left, Right; they push by 0, -1 and +1. (In Gymnasium's own `MountainCar-v0` 0 is left, 1 none, 2
+    right.)
 
     ## Transition Dynamics
 
@@ -159,18 +138,13 @@ class MountainCar2DEnv(MountainCarEnv):
 
     ## Starting State
 
-    At rest at the bottom of the valley, x = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset. The
-    argument `start` changes this.
+    At rest at the bottom of the valley, x = -pi/6, moved by an offset that is drawn from [-0.005, 0.005] at every reset.
 
     ## Episode End
 
-    - Termination: x >= 0.5.
+    - Termination: x >= 0.5; `info["is_success"]` is True then. From the bottom it can be reached in 103 steps.
     - Truncation: after 4000 steps, by the `TimeLimit` wrapper of `gymnasium.make`, whose argument `max_episode_steps` changes
-      this. As always with this wrapper, a car that reaches the goal on the very last step is reported as both terminated and
-      truncated; treat it as terminated. The class itself, made without `gymnasium.make`, has no limit.
-
-    `info["is_success"]` is True if the car is at the goal after the step. From the bottom the goal can be reached in 103
-    steps.
+      this; a car at the goal on the very last step is reported as both: treat it as terminated. The class itself has no limit.
 
     ## Arguments
 
@@ -183,10 +157,6 @@ class MountainCar2DEnv(MountainCarEnv):
 
     `reset` takes the options `{"start": ...}`, to override `start` for one episode, and `{"state": [x, v]}`, to begin in
     exactly that state.
-
-    ## Version History
-
-    - v0: first version.
     """
 
     n_axes = 1
@@ -205,8 +175,8 @@ class MountainCar4DEnv(MountainCarEnv):
 
     ## Observation Space
 
-    A `Box` of float32 with shape (4,); `env.unwrapped.state` is the same in float64. Some other versions of this task order
-    it (x, vx, y, vy).
+    A `Box` of float32 with shape (4,); `env.unwrapped.state` is the same in float64. Some other versions of this task order it
+    (x, vx, y, vy).
 
     | Num | Observation             | Name | Min   | Max  |
     |-----|-------------------------|------|-------|------|
@@ -217,15 +187,7 @@ class MountainCar4DEnv(MountainCarEnv):
 
     ## Action Space
 
-    `Discrete(5)`.
-
-    | Num | Action  | Push along x | Push along y |
-    |-----|---------|--------------|--------------|
-    | 0   | Neutral | 0            | 0            |
-    | 1   | West    | -1           | 0            |
-    | 2   | East    | +1           | 0            |
-    | 3   | South   | 0            | -1           |
-    | 4   | North   | 0            | +1           |
+    `Discrete(5)`: Neutral, West, East, South, North; West and East push by -1 and +1 along x, South and North along y.
 
     ## Everything Else
 

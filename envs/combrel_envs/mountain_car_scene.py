@@ -1,10 +1,9 @@
-"""The pictures of Mountain Car: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
+"""
+The pictures of Mountain Car: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
 
-The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale of the picture (heights do not enter the
-dynamics). In 6D there are two pieces of ground, each with a car: the surface of 4D for x and y, and in front of it the strip
-of 2D for z. The meshes are computed from these formulas when a scene is built, so the picture agrees with the task.
-
-Except in :func:`model_and_assets` and in ``GROUNDS``, ``n_axes`` is the number of axes of one piece of ground: 1 or 2.
+The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale. In 6D there are two pieces of ground, each with
+a car: 4D's for x and y, and in front of it 2D's for z. Except in :func:`model_and_assets` and in ``GROUNDS``, ``n_axes`` is
+the number of axes of one piece of ground: 1 or 2.
 """
 
 import functools
@@ -82,12 +81,9 @@ def _assets(n_axes: int) -> dict[str, bytes]:
 
 def car_pose(positions: dynamics.Axes, velocities: dynamics.Axes) -> tuple[np.ndarray, np.ndarray]:
     """
-    The pose in which a car is drawn on its ground: wheels on the ground, roof along the ground's normal.
+    The pose in which a car is drawn: position relative to its ground's body; rotation, columns nose, left side and roof.
 
     In 2D the nose points right, as the car can reverse; in 4D it points in the direction of motion (north-east at rest).
-
-    :param positions: position on each axis of this ground; ``velocities``: the velocities
-    :return: position relative to the body that carries the ground, and a rotation matrix: columns nose, left side and roof
     """
     n_axes = len(positions)
     x, y = (positions[0], 0.0) if n_axes == 1 else positions

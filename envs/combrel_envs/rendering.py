@@ -24,9 +24,9 @@ def import_dm_control() -> None:
     """
     Import dm_control; call this before the first import of it.
 
-    dm_control reads ``MUJOCO_GL`` when it is imported, and fails at once if that backend doesn't start. The dynamics don't
-    need OpenGL, so dm_control is then imported without a renderer, and the error is raised when a picture is requested.
-    On Linux without a display EGL is the default; a value that the user set is never changed.
+    dm_control reads ``MUJOCO_GL`` when it is imported, and fails at once if that backend doesn't start. It is then imported
+    without a renderer, and the error raised when a picture is requested. Without a display EGL is the default on Linux, unless
+    set.
     """
     global _failure
     if "dm_control.mujoco" in sys.modules:
@@ -48,12 +48,7 @@ def import_dm_control() -> None:
 
 
 def open_gl(physics: Any) -> None:
-    """
-    Start OpenGL for a physics, if it isn't yet started.
-
-    :param physics: a ``dm_control.mujoco.Physics``
-    :raises RenderingError: if that fails; the message says what to install and which variable to set
-    """
+    """Start OpenGL for a ``dm_control.mujoco.Physics``, if it isn't started; a RenderingError says what to install or set."""
     global _failure
     # No second attempt after a failure: with some drivers it ends the process.
     if _failure is None:
@@ -66,11 +61,7 @@ def open_gl(physics: Any) -> None:
 
 
 def _import_triton() -> None:
-    """Import triton, where it is installed, before Mesa is loaded.
-
-    Each contains a copy of LLVM. PyTorch's wheels for CUDA install triton and import it with the first optimizer; if Mesa
-    was loaded before, that import ends the process with a segmentation fault.
-    """
+    """Import triton, if there, before Mesa: each has an LLVM, and PyTorch, importing it after Mesa's, ends the process."""
     # It is often not installed; where it is broken, PyTorch reports that itself.
     with contextlib.suppress(Exception):
         importlib.import_module("triton")

@@ -22,7 +22,6 @@ def load(
     :param task: name of one of its tasks, for instance ``"climb_4d"``
     :param task_kwargs: arguments of the task, for instance ``random`` (a seed), ``time_limit``, ``start``
     :param environment_kwargs: arguments of ``dm_control.rl.control.Environment``, for instance ``flat_observation``
-    :return: the environment
     :raises ValueError: when there is no such domain or task
     """
     # Imported, and dm_control with it, when a task of the domain is asked for.

@@ -36,32 +36,28 @@ MAX_POINTS = 500
 
 class DashboardCallback(BaseCallback):
     """
-    Shows in TensorBoard what Fitted R-Max has learned and what was transferred.
+    Shows in TensorBoard what Fitted R-Max has learned and what was transferred; what is learned is the same without it.
 
-    ``FittedRMax.learn`` adds one where there is a TensorBoard log (``tensorboard_log``, or a logger of the user's with that
-    format) and none was given; its pictures come at the end, and before where they take less than a twentieth of the time.
-    Pass one to choose what is shown. Without such a log it does nothing; what is learned is the same in any case.
+    ``FittedRMax.learn`` adds one where there is a TensorBoard log and none was given; its pictures come at the end, and before
+    where they take less than a twentieth of the time. Without such a log it does nothing.
 
-    - Scalars: ``rollout/`` and ``time/`` with every log of the algorithm (``log_interval``); ``model/``, ``planner/`` and
-      ``transfer/`` with these and between them, up to 500 times in a run; and a page of custom scalars on which runs with
-      and without transfer can be compared. With ``log_interval=None`` there are none.
-    - Pictures: V and the greedy policy over two state variables; the source action that each target action is
-      mapped to (Figure 4 of the COMBREL paper); which state mappings were chosen when. They need matplotlib.
+    - Scalars: ``rollout/`` and ``time/`` with every log of the algorithm (``log_interval``; None: no scalars); ``model/``,
+      ``planner/`` and ``transfer/`` with these and between them, up to 500 times in a run; and a page of custom scalars to
+      compare runs.
+    - Pictures: V and the greedy policy over two state variables; the source action that each target action is mapped to
+      (Figure 4 of the COMBREL paper); which state mappings were chosen when. They need matplotlib.
     - Text: the mappings used most (Table 2 of that paper). HPARAMS: the settings.
 
-    :param picture_freq: environment steps between two sets of pictures and tables; the last set comes at the end of
-        ``learn``. None: no pictures, and a table at the end only.
-    :param variables: pairs of state variables, by number or name, over which V, policy and source actions are drawn;
-        None for the first two
-    :param at: state (raw units) through which the pictures' plane goes: the values of all other variables; None for the
-        middle of the state space
-    :param scalar_share: fraction of the time that scalars may take, half of it between logs. A log that would exceed it has
-        ``rollout/`` and ``time/`` only; 1 for all of them in every log.
-    :param picture_share: the same for pictures, each set complete or not at all, but for the last, which always comes; 1 for
-        one every ``picture_freq`` steps
+    :param picture_freq: environment steps between two sets of pictures and tables; the last comes at the end of ``learn``.
+        None: no pictures, and a table at the end only
+    :param variables: pairs of state variables, by number or name, over which is drawn; None for the first two
+    :param at: state (raw units) through which the pictures' plane goes; None for the middle of the state space
+    :param scalar_share: fraction of the time that scalars may take, half of it between logs; a log that would exceed it has
+        ``rollout/`` and ``time/`` only. 1 for all of them in every log
+    :param picture_share: the same for pictures, each set complete or not at all, but for the last, which always comes
     :param verbose: verbosity level, as in any callback
-    :raises ValueError: if ``picture_freq`` is below 1 or a share not in (0, 1]; when learning starts, if variables or state
-        do not fit the task
+    :raises ValueError: if ``picture_freq`` is below 1 or a share not in (0, 1]; when learning starts, if variables or state do
+        not fit the task
     :raises ModuleNotFoundError: when learning starts, if pictures are wanted and matplotlib is not installed
     """
 
@@ -221,12 +217,7 @@ class DashboardCallback(BaseCallback):
 
 
 class _Allowance:
-    """
-    A share of the time, and what of it is spent.
-
-    :param share: of the time since it was made; 1 for all that is asked for
-    :param next_seconds: what is expected of the next piece of work: what the last one took
-    """
+    """A share of the time since it was made; 1 for all. The next piece of work is expected to take as long as the last."""
 
     def __init__(self, share: float, next_seconds: float = 0.0) -> None:
         self.share, self.next_seconds, self.spent = share, next_seconds, 0.0
@@ -247,13 +238,7 @@ def tensorboard_writer(logger: Logger) -> SummaryWriter | None:
 
 
 def with_dashboard(callback: MaybeCallback, logger: Logger) -> MaybeCallback:
-    """
-    Add a :class:`DashboardCallback` to callbacks where there is a TensorBoard log and none is among them.
-
-    :param callback: what the user gave to ``learn``
-    :param logger: the algorithm's logger
-    :return: what ``learn`` uses in place of ``callback``
-    """
+    """Add a :class:`DashboardCallback` to callbacks where there is a TensorBoard log and none is among them."""
     if tensorboard_writer(logger) is None or _has_dashboard(callback):
         return callback
     picture_freq = DEFAULT_PICTURE_FREQ if has_matplotlib() else None

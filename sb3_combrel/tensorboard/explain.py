@@ -29,16 +29,12 @@ def explain(
     Say what transfer did in a model that has learned.
 
     Which mappings, by name; how sure they are, against the next best and against "no change"; where the target's own
-    transitions contradicted the source; how many steps rested on it::
-
-        report = sb3_combrel.explain("car.zip", output="explained")
-        print(report)
-        print(report.mappings[0].target_action, report.mappings[0].compliance)
+    transitions contradicted the source; how many steps rested on it.
 
     :param model: the model, or the path of its file
-    :param output: a folder for the report, ``report.txt``, and the dashboard's pictures as PNG: V and policy over two state
-        variables, and the source action that each target action is mapped to; and its table of the mappings used most,
-        ``mappings.md``. A transfer method without mappings has the report and V only. None: nothing is written
+    :param output: a folder for the report, ``report.txt``, the pictures of the dashboard as PNG (V and policy over two state
+        variables, and the source action of each target action), and its table of the mappings used most, ``mappings.md``. A
+        transfer method without mappings has the report and V only. None: nothing is written
     :param variables: pairs of state variables, by number or name, over which is drawn; None for the first two
     :param at: state (raw units) through which the pictures' plane goes; None for the middle of the state space
     :return: the report; ``print`` it, or read its fields

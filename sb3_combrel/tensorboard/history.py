@@ -9,9 +9,8 @@ MAX_COLUMNS = 200
 
 class ChoiceHistory:
     """
-    How many pairs of the sample chose each candidate, at times spread over the run so far.
+    How many pairs of the sample chose each candidate (``counts``), at times spread over the run (``steps``, of environments).
 
-    ``steps`` are the times, in environment steps; ``counts`` has for each of them the number of pairs of each candidate.
     When there are too many times, every second one is dropped, and from then on half as many are added.
     """
 
@@ -22,12 +21,7 @@ class ChoiceHistory:
         self._n_offered = 0
 
     def note(self, step: int, choices: np.ndarray) -> None:
-        """
-        Add a time, unless it is left out.
-
-        :param step: environment steps so far
-        :param choices: each pair's candidate, -1 for none, int64
-        """
+        """Add a time, in environment steps, unless it is left out; ``choices``: each pair's candidate, -1 for none, int64."""
         if self.steps and self.steps[-1] == step:
             return
         if self._n_offered % self._every == 0:

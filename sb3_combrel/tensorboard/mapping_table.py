@@ -13,14 +13,9 @@ ROWS = 9
 
 def mapping_table(transfer: MappingTransfer, action_names: Sequence[str]) -> str:
     """
-    Make a table of each mapping's share, in per cent, in the transfers of each target action, as Markdown.
+    Make a Markdown table of each mapping's share, in per cent, in the transfers of each target action; or say there were none.
 
-    A row is a source action with the pairs of target and source variables; the other source actions of a mapping have no
-    effect on the transfers of a target action. Every step of the agent's that used transferred instances counts.
-
-    :param transfer: a bound transfer method
-    :param action_names: names of the target's actions
-    :return: the table, or a sentence if nothing was transferred
+    A row is a source action with pairs of variables. Every step of the agent's that used transferred instances counts.
     """
     uses = transfer.uses()
     if not uses:

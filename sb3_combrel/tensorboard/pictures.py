@@ -1,8 +1,7 @@
 """
-Pictures for TensorBoard's images tab, drawn without a display. Importing this imports matplotlib.
+Pictures for TensorBoard's images tab, as wide as its cards: RGB arrays, uint8, shape (height, width, 3).
 
-Each is an RGB array, uint8, shape (height, width, 3), as wide as the tab's cards, which would leave out pixels of wider ones;
-``dpi`` makes them larger for files.
+Importing this imports matplotlib; no display is needed. ``dpi`` makes them larger for files.
 """
 
 from __future__ import annotations
@@ -78,11 +77,7 @@ def greedy_actions(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
 
 
 def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Plane, dpi: int = DPI) -> np.ndarray:
-    """
-    Draw the source action that each target action is mapped to, over a plane (Figure 4 of the COMBREL paper).
-
-    A dot marks a grid point where the target's own instances suffice, so that nothing is transferred.
-    """
+    """Draw each target action's source action over a plane (Figure 4 of the COMBREL paper); a dot: own instances suffice."""
     names, numbers = chosen_source_actions(transfer, plane.points, agent.task.n_actions)
     action_names = agent.task.action_names
     n_columns = min(len(action_names), 3 if max(map(len, action_names)) <= 14 else 2)
@@ -100,12 +95,7 @@ def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Pla
 
 
 def chosen_source_actions(transfer: MappingTransfer, points: np.ndarray, n_actions: int) -> tuple[list[str], np.ndarray]:
-    """
-    Find the source action chosen for every target action at points of the sample.
-
-    :param points: int64, any shape
-    :return: names of all source actions, and for each target action and point a number into them, -1 for none
-    """
+    """Find names of all source actions, and numbers of those chosen, by target action and point; -1 for none."""
     names = transfer.source_action_names()
     chosen = transfer.choices().reshape(n_actions, -1)[:, points]
     found = np.full(chosen.shape, -1, dtype=np.int64)
@@ -136,12 +126,7 @@ def state_mappings(history: ChoiceHistory, transfer: MappingTransfer, dpi: int =
 
 
 def state_mapping_shares(history: ChoiceHistory, transfer: MappingTransfer) -> tuple[list[str], np.ndarray]:
-    """
-    Find the state mappings chosen most, by name, and their shares of the choices at each time.
-
-    :return: names, the most chosen first and "others" last; float64, shape (n_names, n_times), columns add up to 1, or
-        are 0 while nothing is chosen
-    """
+    """Find the state mappings chosen most, by name, "others" last, and their shares at each time, shape (n_names, n_times)."""
     table = history.table()
     by_name: dict[str, np.ndarray] = {}
     for candidate in np.flatnonzero(table.sum(axis=1)):

@@ -17,19 +17,12 @@ VariablePair = tuple[int | str, int | str]
 
 
 class Plane(NamedTuple):
-    """
-    The grid points of a plane, and the texts for a picture of it.
+    """The grid points of a plane, and the texts for a picture of it."""
 
-    :param points: numbers of the grid points, int64, shape (points along the second variable, along the first)
-    :param names: names of the two variables; the second is empty for a task with one variable
-    :param extent: edges of the picture in raw units: left, right, bottom, top; half a cell beyond the outer points
-    :param held: the other variables and their values, as text
-    """
-
-    points: np.ndarray
-    names: tuple[str, str]
-    extent: tuple[float, float, float, float]
-    held: str
+    points: np.ndarray  # numbers, int64, shape (points along the second variable, along the first)
+    names: tuple[str, str]  # the second is empty for a task with one variable
+    extent: tuple[float, float, float, float]  # raw units: left, right, bottom, top, half a cell beyond the outer points
+    held: str  # the other variables and their values
 
 
 def has_matplotlib() -> bool:
@@ -45,11 +38,8 @@ def check_matplotlib(otherwise: str) -> None:
 
 def planes_of(agent: FittedRMaxAgent, variables: Sequence[VariablePair] | None, at: ArrayLike | None) -> list[Plane]:
     """
-    Find the planes over which pictures are drawn.
+    Find the planes over which pictures are drawn; for the arguments see :func:`~sb3_combrel.tensorboard.explain.explain`.
 
-    :param agent: the agent to show
-    :param variables: pairs of state variables, by number or name; None for the first two
-    :param at: a state of the planes, raw units, shape (n_variables,); None for the middle of the state space
     :raises ValueError: if they do not fit the task
     """
     task = agent.task
@@ -67,12 +57,8 @@ def plane_through(
     at: ArrayLike | None = None,
 ) -> Plane:
     """
-    Find the plane of two variables through the grid points nearest to a state; a margin of the grid is left out.
+    Find the plane of two variables, twice the same for a line, through the grid points nearest to a state; without margin.
 
-    :param grid: the grid
-    :param scaling: raw <-> unit coordinates
-    :param names: of all state variables
-    :param variables: numbers of the two variables, the horizontal one first; twice the same for a line
     :param at: raw units, shape (n_variables,); None for the middle of the state space
     """
     across, up = variables

@@ -16,21 +16,12 @@ MAX_PAIRS = 2000
 
 
 def spread(n: int, max_count: int = MAX_POINTS) -> np.ndarray:
-    """
-    Choose at most ``max_count`` of the numbers below ``n``, evenly spread, int64.
-
-    The distance is not a whole number in general, so points of a regular grid do not all lie on one of its axes.
-    """
+    """Choose at most ``max_count`` numbers below ``n``, evenly spread, so that grid points do not all lie on one axis."""
     return np.arange(n) if n <= max_count else (np.arange(max_count) * (n / max_count)).astype(np.int64)
 
 
 def action_values(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
-    """
-    Compute Q of every action at grid points, from the rows of the model and the planner's values.
-
-    :param points: int64, any shape
-    :return: float64, one axis more, the actions in front; NaN for an optimistic pair
-    """
+    """Compute Q of every action, the first axis, at grid points of any shape; NaN for an optimistic pair."""
     arrays = agent.mdp.arrays
     pairs = np.add.outer(np.arange(agent.task.n_actions) * agent.grid.n_points, points)
     flat = pairs.reshape(-1)
@@ -45,11 +36,7 @@ def action_values(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
 
 
 def bellman_residual(agent: FittedRMaxAgent) -> float:
-    """
-    Compute by how much a backup would change V at a grid point: the largest change among points spread over the grid.
-
-    Points with an optimistic action have their final value and are left out; 0 if there are no others.
-    """
+    """Compute the most that a backup would change V at points spread over the grid, those with optimistic actions left out."""
     points = spread(agent.grid.n_points)
     points = points[agent.mdp.arrays.n_optimistic[points] == 0]
     if len(points) == 0:
@@ -59,11 +46,7 @@ def bellman_residual(agent: FittedRMaxAgent) -> float:
 
 
 def mean_compliance(transfer: Transfer) -> float | None:
-    """
-    Compute the mean compliance of the chosen mappings (Eq. 6 of the COMBREL paper) over pairs spread over the sample.
-
-    :return: None if the method computes no compliance, or has not chosen anything yet
-    """
+    """Compute the chosen mappings' mean compliance (Eq. 6 of the COMBREL paper) over pairs spread out; None without any."""
     if not isinstance(transfer, COMBREL):
         return None
     pairs = np.flatnonzero(transfer.choices() >= 0)

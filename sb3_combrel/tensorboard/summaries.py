@@ -53,22 +53,13 @@ def scalars_summary(scalars: Mapping[str, float]) -> Summary:
 
 
 def settings_summaries(settings: Mapping[str, Any]) -> list[Summary]:
-    """
-    Make the records of the HPARAMS tab: settings of this run, plain values by name.
-
-    Not the record of the columns: without it TensorBoard finds them, and those in which runs differ, in all runs.
-    """
+    """Make the HPARAMS tab's records of this run; without that of the columns TensorBoard finds these in all runs."""
     _, *start_and_end = hparams(dict(settings), metric_dict={})
     return start_and_end
 
 
 def hyperparameters(model: FittedRMax) -> dict[str, Plain]:
-    """
-    Collect the settings of the algorithm and, as ``transfer.NAME``, of its transfer method, with the defaults in use.
-
-    :param model: the algorithm, set up
-    :return: values by name
-    """
+    """Collect the settings of the algorithm and, as ``transfer.NAME``, of its transfer method, with the defaults in use."""
     transfer = model.agent.transfer
     method = "none" if transfer is None else type(transfer).__name__
     algorithm = type(model).__name__ if transfer is None else f"{type(model).__name__} + {method}"

@@ -25,9 +25,7 @@ class ZooFittedRMax(FittedRMax):
     factor of two a variable (if that takes less than about 1.5 GB).
 
     :param policy: "FittedRMaxPolicy"; must be given, as RL-Zoo needs it to continue with a trained agent
-    :param env: the environment to learn from
-    :param transfer_kwargs: arguments of the transfer method that replace those in ``transfer``, so that a study
-        or ``--hyperparams`` can change one of them
+    :param transfer_kwargs: arguments of the transfer method that replace those in ``transfer``, one by one
     :param kwargs: all other arguments of :class:`~sb3_combrel.FittedRMax`
     :raises ValueError: if ``policy`` is missing, or an argument is unknown or out of range
     """
@@ -72,13 +70,7 @@ class ZooFittedRMax(FittedRMax):
 
 
 def with_arguments(transfer: Any, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Replace arguments in a description of a transfer method.
-
-    :param transfer: a dict of one entry, from the method's name to its arguments
-    :param changes: new values by name
-    :raises ValueError: if it is something else
-    """
+    """Replace arguments in ``{method: arguments}``, which ``transfer`` must be (else a ValueError)."""
     if not isinstance(transfer, dict) or len(transfer) != 1:
         raise ValueError(
             f"transfer_kwargs={dict(changes)!r} needs a transfer method in the configuration file, such as "

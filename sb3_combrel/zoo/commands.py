@@ -40,11 +40,8 @@ CHECKS = {"all_plots": with_evaluations, "plot_train": check_window}
 
 def main(args: Sequence[str] | None = None) -> int:
     """
-    Run one of RL-Zoo's commands.
+    Run one of RL-Zoo's commands; an error is reported in one sentence, with ``--verbose 2`` as a traceback.
 
-    An error in a configuration file or an argument is reported in one sentence; ``--verbose 2`` shows the traceback.
-
-    :param args: command and its arguments, those of the process by default
     :return: exit status: 0, or 1 if something was wrong, or 2 if there is no such command
     """
     command, *rest = list(sys.argv[1:] if args is None else args) or ["--help"]

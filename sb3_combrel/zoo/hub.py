@@ -27,13 +27,10 @@ TAG = "sb3_combrel"
 @contextmanager
 def mended() -> Iterator[None]:
     """
-    Let RL-Zoo's ``push_to_hub`` and ``load_from_hub`` work while it lasts.
+    Let RL-Zoo's ``push_to_hub`` and ``load_from_hub`` work while it lasts; a ConnectionError if the hub cannot be reached.
 
-    RL-Zoo 2.9 takes a function from huggingface_sb3 that version 3 has under another name, and expects that a file that is
-    missing on the hub is reported by an exception of ``requests``, which huggingface_hub no longer uses. RL-Zoo's commands are
-    scripts, which import these functions by name when they run: they must be replaced where they are defined, before.
-
-    :raises ConnectionError: if the hub cannot be reached
+    RL-Zoo 2.9 takes a function from huggingface_sb3 that version 3 has under another name, and expects exceptions of
+    ``requests``, which huggingface_hub no longer uses. Its commands are scripts, which import both by name when they run.
     """
     import huggingface_sb3
     from huggingface_hub import errors, repocard

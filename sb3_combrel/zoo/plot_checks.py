@@ -9,11 +9,7 @@ from pathlib import Path
 
 
 def with_evaluations(args: Sequence[str]) -> list[str]:
-    """
-    Take algorithms without evaluations out of the arguments of ``all_plots``, which shows zeros for them, and say so.
-
-    :raises ValueError: if no algorithm has evaluations
-    """
+    """Take algorithms without evaluations, shown as zeros, out of ``all_plots``, and say so; a ValueError if none has any."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for names in (("-a", "--algos"), ("-e", "--env"), ("-f", "--exp-folders")):
         parser.add_argument(*names, nargs="+", default=[])
@@ -39,12 +35,7 @@ def _has_evaluations(folders: Sequence[str], algo: str, env: str) -> bool:
 
 
 def check_window(args: Sequence[str]) -> list[str]:
-    """
-    Say which runs have fewer episodes than the window of ``plot_train``, which leaves them out.
-
-    :return: the arguments, unchanged
-    :raises ValueError: if all runs have fewer
-    """
+    """Say which runs ``plot_train`` leaves out, with fewer episodes than its window; a ValueError if all; return ``args``."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-a", "--algo", default="")
     parser.add_argument("-e", "--env", nargs="+", default=[])

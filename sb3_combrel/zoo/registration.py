@@ -18,9 +18,8 @@ def sample_fitted_rmax_params(trial: Trial, *_: Any) -> dict[str, Any]:
     """
     Draw arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`; the others are those of the configuration file.
 
-    ``max_value``, ``gamma`` and ``bounds`` belong to the task and are not drawn. The grid is drawn relative to the one
-    that suits task and breadth: a number that is right for two variables would not fit into memory for six, and an
-    error in the constructor ends the whole study.
+    The grid is drawn relative to the one that suits task and breadth, as one that is right for two variables does not fit into
+    memory for six. ``max_value``, ``gamma`` and ``bounds`` belong to the task.
     """
     return convert_fitted_rmax_params(
         {
@@ -79,11 +78,7 @@ ALGORITHMS: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def register() -> None:
-    """
-    Add the algorithms to RL-Zoo's tables and the environments to Gymnasium; may be called more than once.
-
-    :raises ImportError: if RL-Zoo is not installed
-    """
+    """Add the algorithms to RL-Zoo's tables and the environments to Gymnasium; may be called more than once."""
     from rl_zoo3 import ALGOS
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 

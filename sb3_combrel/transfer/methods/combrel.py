@@ -27,11 +27,10 @@ class COMBREL(MappingTransfer):
     """
     COmpliance-aware transfer for Model-Based REinforcement Learning: finds by itself how two tasks correspond.
 
-    Paper: Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection" (Algorithm
-    1). Each mapping makes a virtual source task. For a state and an action, the mapping with the highest mean compliance
-    with the nearest recorded target transitions of that action is selected; it translates the source instances that are
-    missing. Because compliance with transitions of that action depends only on the state mapping and on the one source
-    action that the target action maps to, any number of action mappings costs nothing.
+    Paper: Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection" (Algorithm 1).
+    Each mapping makes a virtual source task. For a state and an action, the mapping with the highest mean compliance with the
+    nearest recorded target transitions of that action is selected; it translates the source instances that are missing. Such
+    compliance depends only on the state mapping and the one source action, so any number of action mappings costs nothing.
 
     That is one reading of the paper (Section 5.1). Its Table 2 contradicts it, where two mappings with the same source action
     for an action have different shares: ``neighbors="state_action"`` is the other reading.
@@ -40,12 +39,6 @@ class COMBREL(MappingTransfer):
     mapping is chosen for all states, or with sets that are not factored one for each target action: after 10 transitions, and
     again whenever there are 1.4 times as many. How the source's values bound those of what is unknown is said in
     :class:`~sb3_combrel.transfer.prior.value_bound.ValueBound`.
-
-    ::
-
-        source = SourceInstances.from_q_learning("combrel/MountainCar2D-v0", n_instances=1000, seed=0)
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=COMBREL(source), seed=0).learn(total_timesteps=5_000)
-        print(model.transfer.report())
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
 
@@ -56,23 +49,22 @@ class COMBREL(MappingTransfer):
         target variable is mapped, as in "surjective", translated instances lie on diagonals of the target's space and help
         much less
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
-    :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the
-        nearest whatever their action, each judged by the source action that the mapping has for *its* action. So whole
-        mappings differ; they must be at most 20,000
-    :param choice: "best": the mapping with the highest mean compliance is selected, as in the paper; or "drawn": one is
-        drawn, each with a probability in proportion to its mean compliance
+    :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the nearest
+        whatever their action, each judged by the source action that the mapping has for *its* action; at most 20,000 mappings
+        then
+    :param choice: "best": the mapping with the highest mean compliance, as in the paper; or "drawn": with a probability in
+        proportion to it
     :param neighbor_radius: how far, in unit coordinates, a target transition may be and still count as a neighbour; without
-        any nothing is transferred. None: the nearest count however far they are, as in the paper
+        any nothing is transferred. None: however far they are, as in the paper
     :param measured: which transitions are recorded: "online": those of all episodes, used from the first step on; or
         "first_episode": those of the first episode, used after its end, as in the paper
     :param max_transitions: target transitions that are recorded, at most
-    :param min_compliance: a mapping transfers nothing where its mean compliance does not exceed this many times that of
-        the no-change baseline, the prediction that no variable ever changes. It excludes sources that predict large changes
-        wrongly, but none of small random effects: these ``breadth_decay`` ends. 0: any mapping that has evidence may transfer,
-        as in the paper
+    :param min_compliance: a mapping transfers nothing where its mean compliance does not exceed this many times that of the
+        prediction that no variable ever changes. It excludes sources that predict large changes wrongly, but none of small
+        random effects: these ``breadth_decay`` ends. 0: any mapping that has evidence may transfer, as in the paper
     :param min_evidence: a mapping's compliance with a transition counts as 0 where the start kernels of its instances (Eq. 2,
-        before they are normalized) add up to less: all are far away. 0.1 is one instance at 1.5 times the square root of the
-        bandwidth. 0: every mapping counts, as in the paper
+        before they are normalized) add up to less. 0.1 is one instance at 1.5 times the square root of the bandwidth. 0: every
+        mapping counts, as in the paper
     :param use: as there; of the arguments after ``mappings`` only ``max_transitions``, ``transfer_terminals`` and
         ``source_breadth`` have a meaning for a prior. None: "prior" with factored ``mappings``; "instances" with others, and
         where an argument that has a meaning for instances only differs from its default; else "prior" where the target's model
@@ -120,7 +112,6 @@ class COMBREL(MappingTransfer):
         """
         COMBREL as the paper has it: instances of the mapping that complies best with the transitions of the first episode.
 
-        :param source: as of the class; ``mappings``: the same
         :param arguments: others of the class, which come before the paper's
         """
         as_published = dict(
@@ -167,10 +158,10 @@ class COMBREL(MappingTransfer):
 
     def chosen_compliance(self, pairs: np.ndarray) -> np.ndarray:
         """
-        Return the mean compliance of the chosen mapping with the nearest transitions (line 19 of Algorithm 1).
+        Return the chosen mapping's mean compliance with the nearest transitions (line 19 of Algorithm 1), NaN where none is
+        chosen.
 
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
-        :return: float64, shape (n,); NaN where nothing is chosen
         """
         if self.use == "prior":
             assert self.task is not None

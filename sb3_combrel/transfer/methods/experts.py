@@ -32,17 +32,13 @@ class Expert(NamedTuple):
 
 @dataclass
 class Playing:
-    """
-    An episode that is going on: who acts (agent or expert), the sum of rewards, steps, and how many an expert decided.
-
-    :param state: the state that was reached, unit coordinates; None before the first step
-    """
+    """An episode that is going on: who acts (agent or expert), sum of rewards, steps, and how many an expert decided."""
 
     arm: int
     total: float = 0.0
     steps: int = 0
     acted: int = 0
-    state: np.ndarray | None = None
+    state: np.ndarray | None = None  # reached last, unit coordinates; None before the first step
 
 
 @dataclass(repr=False, eq=False)
@@ -50,41 +46,29 @@ class MappingExperts(Transfer):
     """
     Every mapping gives a policy, and what acts in an episode, one of these or the agent, is chosen by the returns so far.
 
-    Paper: Talvitie & Singh, "An experts algorithm for transfer learning" (IJCAI 2007). An expert is a mapping: a state of the
-    target is seen as one of the source, and one of the target actions that map to the action that is greedy there is taken, at
-    random if there are several. If none maps to it, the best source action to which one does; where the source has no data,
-    the agent decides. The value function is planned from the source's instances
-    (:class:`~sb3_combrel.transfer.source_policy.SourcePolicy`). Whatever acts, the agent learns from every transition, and
-    nothing else is transferred: the model is that of no transfer.
+    Paper: Talvitie & Singh, "An experts algorithm for transfer learning" (IJCAI 2007). An expert is a mapping: a target state
+    is seen as one of the source, whose greedy action decides among the target actions that map to it, at random if there are
+    several. If none does, the best source action to which one maps; where the source has no data, the agent decides. The value
+    function is planned from the source's instances (:class:`~sb3_combrel.transfer.source_policy.SourcePolicy`). The agent
+    learns from every transition; nothing else is transferred.
 
-    Who acts is chosen by UCB1 (Auer, Cesa-Bianchi & Fischer 2002) at the start of each episode. First the agent, then each
-    expert in turn, acts in one episode; then whoever has the highest
+    Who acts is chosen by UCB1 (Auer, Cesa-Bianchi & Fischer 2002) at the start of each episode, once the agent and each expert
+    have acted in one: whoever has the highest mean return + (largest - least return so far) * ``exploration`` * sqrt(2
+    ln(episodes) / own episodes).
 
-        mean return + (largest - least return so far) * ``exploration`` * sqrt(2 ln(episodes) / own episodes).
-
-    What differs from the paper:
-
-    - The paper's algorithm, ATEASE, is for tasks without episodes: it follows each expert for a number of steps that grows, a
-      guess of the experts' mixing time, then the best as long as it keeps its promise. Here there are episodes, and UCB1. What
-      is kept of the distrust is ``patience``: an expert that takes longer than the agent does hands over to it.
-    - The learning agent is among those who may act. As it gets better, its mean is that of the later half of its episodes.
-    - The paper's algorithm is given its experts; here at most ``max_experts`` are drawn from a set of mappings. An episode of
-      the target goes to each before anything is repeated.
-
-    Example::
-
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=MappingExperts(source, max_experts=5))
-        model.learn(total_timesteps=5_000)
+    What differs from the paper: its ATEASE, for tasks without episodes, follows each expert for about its mixing time and
+    drops those that break their promise; here that is UCB1 and ``patience``. The learning agent takes part: its mean is that
+    of the later half of its episodes. The paper's experts are given; here they are drawn from a set of mappings.
 
     :param source: source instances, a path to them, or a list of several, see
         :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`
     :param mappings: the set that the experts are drawn from, see there
-    :param max_experts: experts at most; of a larger set so many are drawn without replacement, when learning begins, all
-        mappings being equally likely
-    :param exploration: factor on the bonus for what has been tried seldom. 1 is UCB1's, whose bonus outweighs all differences
-        of returns for hundreds of episodes; 0: always the best so far
+    :param max_experts: experts at most; of a larger set so many are drawn without replacement, all mappings being equally
+        likely
+    :param exploration: factor on the bonus for what has been tried seldom. 1 is UCB1's, which outweighs all differences of
+        returns for hundreds of episodes; 0: always the best so far
     :param patience: an expert acts in an episode for at most this many times the steps of the agent's last own episode, then
-        the agent takes over until its end. The return of all of it counts for the expert. None: no limit
+        the agent takes over. The return of all of it counts for the expert. None: no limit
     :param gamma: discount factor of the source's value function, below 1
     :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
@@ -158,12 +142,7 @@ class MappingExperts(Transfer):
         return action
 
     def expert_action(self, number: int, state: np.ndarray) -> int | None:
-        """
-        Return what an expert does at a state; None where its source has no data.
-
-        :param number: of the expert, from 1 on
-        :param state: unit coordinates of the target, shape (n_variables,)
-        """
+        """Return what expert ``number``, from 1 on, does at a state, unit coordinates; None where its source has no data."""
         source, mapping = self.experts[number - 1]
         seen = mapping.target_to_source(state, self.sources[source].n_variables)
         q = self._policies[source].q_values(np.where(np.isnan(seen), self._typical[source], seen))
@@ -283,11 +262,7 @@ def mean_return(arm: int, returns: list[float]) -> float:
 
 
 def best_by_ucb1(returns: list[list[float]], exploration: float) -> int:
-    """
-    Choose by UCB1, on returns in parts of the range that they have had; the first of equal ones.
-
-    :param returns: of the agent and of each expert; those that have none are not chosen
-    """
+    """Choose by UCB1, on returns in parts of their range; who has none is left out; of equals, the first."""
     everything = [total for of_arm in returns for total in of_arm]
     bonus = (max(everything) - min(everything)) * exploration
 

@@ -24,17 +24,11 @@ DEFAULT_SAMPLE_STEPS = 200
 
 
 class Triplets(NamedTuple):
-    """
-    Transitions of one task without rewards, in its unit coordinates.
+    """Transitions of one task without rewards, in its unit coordinates."""
 
-    :param state: float64, shape (n, n_variables)
-    :param action: int64, shape (n,)
-    :param effect: next state minus state, float64, shape (n, n_variables)
-    """
-
-    state: np.ndarray
-    action: np.ndarray
-    effect: np.ndarray
+    state: np.ndarray  # float64, shape (n, n_variables)
+    action: np.ndarray  # int64, shape (n,)
+    effect: np.ndarray  # next state minus state, float64, shape (n, n_variables)
 
     def columns(self, n_actions: int) -> np.ndarray:
         """Return them as numbers, state, action (one column each) and effect: shape (n, 2 * n_variables + n_actions)."""
@@ -75,17 +69,16 @@ class LearnedTranslation(Transfer):
     Learns a mapping from random samples of both tasks, once; then all source data are instances in target coordinates.
 
     The first ``n_random_steps`` transitions of the target, with random actions, are its sample; until then nothing is
-    transferred. The sample of the source is drawn from its instances. Then a subclass translates all source instances, with
-    their rewards and ends, which takes some seconds, and nothing is learned any more. Where the target's own instances do not
-    suffice, the nearest translated ones come first: :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL` is given them with
-    the identity as its mapping.
+    transferred. The source's is drawn from its instances. Then a subclass translates all of these, with their rewards and
+    ends, in some seconds. Where the target's own do not suffice, the nearest translated ones come first, as in
+    :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
 
     :param source: source instances, or a path to them
     :param n_random_steps: steps of the target that its sample takes
     :param n_source_samples: source instances that the mapping is learned from, at most
     :param breadth: kernel breadth of transferred instances, unit coordinates of the target
-    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`;
-        ``transfer_terminals``: the same
+    :param breadth_decay: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; ``transfer_terminals``:
+        the same
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic
     """
 
@@ -108,11 +101,9 @@ class LearnedTranslation(Transfer):
     @abstractmethod
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
         """
-        Learn a mapping, and translate with it.
+        Learn a mapping from samples of both tasks; return all the source's ``instances``, in order, in target coordinates.
 
-        :param source: the source's sample; ``target``: the target's
-        :param instances: all of the source
-        :return: ``instances``, in their order, in target coordinates; they are brought into the target's box afterwards
+        They are brought into the target's box afterwards.
         """
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:

@@ -49,21 +49,18 @@ class MappingTransfer(Transfer):
     """
     Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
 
-    :param source: source instances, a path to them, or a list of several; or the id of an environment, "MountainCar-v0",
-        which is then learned by Q-learning (30,000 steps, 1000 instances) when it is first needed, and kept in a file; or a
-        recipe, ``{"env": "MountainCar-v0", "total_timesteps": 50_000}``: :func:`~sb3_combrel.sources.recipes.find_source`
-    :param mappings: the name of a set: "injective" (each source variable is mapped to by one target variable, the other target
-        variables are left unmapped), "surjective", "all", "balanced", these with ``signed_`` before them (variables may be
-        mirrored as well), or that of one of the paper's experiments, "paper_mountain_car" or "paper_icub"; a mapping, a list
-        of mappings or a ``MappingSet``
-    :param breadth: kernel breadth of transferred instances, in unit coordinates; the papers name none. It needs to be wide
-        enough for the instances to cover the source
+    :param source: source instances, a path to them, or a list of several; or the id of an environment, which is then learned
+        by Q-learning (30,000 steps, 1000 instances) when first needed, and kept in a file; or a recipe, ``{"env":
+        "MountainCar-v0", "total_timesteps": 50_000}``: :func:`~sb3_combrel.sources.recipes.find_source`
+    :param mappings: the name of a set: "injective" (each source variable is mapped to by one target variable, the others are
+        left unmapped), "surjective", "all", "balanced", these with ``signed_`` before them (variables may be mirrored as
+        well), "paper_mountain_car" or "paper_icub"; a mapping, a list of mappings or a ``MappingSet``
+    :param breadth: kernel breadth of transferred instances, in unit coordinates, wide enough for them to cover the source; the
+        papers name none
     :param breadth_decay: factor on ``breadth`` for each episode that reaches its time limit after new evidence against what
-        was transferred: the target's own transitions were predicted worse than by "no change", or ends were predicted that
-        never came, or there was nothing left to find out (see
-        :class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck`). So pairs for which the source is wrong are
-        explored in the end, whatever the source. 1: never, as in the papers
-    :param transfer_terminals: whether a source instance that ended its episode ends the target's too. The papers do not say.
+        was transferred (:class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck` says which), so that pairs for
+        which the source is wrong are explored in the end. 1: never, as in the papers
+    :param transfer_terminals: whether a source instance that ended its episode ends the target's too (the papers do not say).
         Where this is wrong the target's own transitions correct it; without it no path leads to an end at first
     :param relevance: True: instances come in the order of their relevance (Eq. 7) to the target's transitions, not of their
         distance. COMBREL's paper finds it harmful: it favours instances that are far from these. "near": of a relevance that
@@ -72,10 +69,9 @@ class MappingTransfer(Transfer):
     :param bandwidths: (start, outcome, reward) bandwidths of compliance and relevance, delta_sa, delta_s' and delta_r of Eq.
         2; None: from the data, that of starts in proportion to how many variables a mapping compares
     :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own local linear
-        model, seen through the mappings, is the prior of the target's model (``FittedRMax(degree=1)``): the target's own
-        instances are fitted to what it leaves over. What it claims to know without them is said in
-        :class:`~sb3_combrel.transfer.prior.claims.Claims`. ``breadth``, ``breadth_decay``, relevance and its arguments have no
-        meaning then
+        model, seen through the mappings, is the prior of the target's (``FittedRMax(degree=1)``), whose own instances are
+        fitted to what it leaves over. :class:`~sb3_combrel.transfer.prior.claims.Claims` says what it claims to know without
+        them. ``breadth``, ``breadth_decay``, relevance and its arguments have no meaning then
     :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
@@ -200,11 +196,7 @@ class MappingTransfer(Transfer):
 
     @property
     def source_prior(self) -> SourcePrior:
-        """
-        The source as the prior of the target's model, once bound.
-
-        :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
-        """
+        """The source as the prior of the target's model; a ValueError with ``use="instances"``, or if not bound."""
         self._check_bound("source_prior")
         if not isinstance(self._source_use, SourcePrior):
             raise ValueError(f'use must be "prior" for what the source is taken for, got {self.use!r}')
@@ -253,9 +245,7 @@ class MappingTransfer(Transfer):
         """
         Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
 
-        Target variables come first, then the source variables that they are taken for, where these have other names.
-
-        :raises ValueError: with ``use="instances"``, or if no algorithm uses this object
+        Target variables come first, then the source's where these have other names; a ValueError as of :attr:`source_prior`.
         """
         self._check_bound("describe_prior")
         return self.source_prior.describe()
@@ -274,20 +264,15 @@ class MappingTransfer(Transfer):
         return self._source_use.makes_choices
 
     def choices(self) -> np.ndarray:
-        """
-        Return the candidate selected for each state-action pair of the sample.
-
-        :return: int64, shape (n_actions * n_points,), by action; -1 where there is none, or not a single one
-        """
+        """Return each pair's candidate, int64, shape (n_actions * n_points,), by action; -1 for none, or not a single one."""
         return self._source_use.choices()
 
     def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """
-        Return the candidate selected for states and actions, whether or not its instances are needed there.
+        Return the candidates selected, whether or not their instances are needed: int64, shape (n,), -1 as in :meth:`choices`.
 
         :param states: unit coordinates, shape (n, n_variables)
         :param actions: int64, shape (n,)
-        :return: int64, shape (n,); -1 where there is none, or not a single one
         """
         return self._source_use.selected(states, actions)
 
@@ -311,8 +296,7 @@ class MappingTransfer(Transfer):
         Say what was transferred: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
         :return: a report to print, with all its figures as fields
-        :raises NotBoundError: (a ValueError) if no algorithm uses this object
-        :raises ValueError: before the first step of learning
+        :raises ValueError: before the first step of learning; NotBoundError, which is one, if no algorithm uses this object
         """
         self._check_bound("report")
         if self._source_use.n_observed == 0:
@@ -329,19 +313,13 @@ class MappingTransfer(Transfer):
 
 
 def check_either(name: str, value: object, one: str, other: str) -> None:
-    """
-    :raises ValueError: unless ``value`` is one of two words
-    """
+    """Raise a ValueError unless ``value`` is one of two words."""
     if value not in (one, other):
         raise ValueError(f'{name} must be "{one}" or "{other}", got {value!r}')
 
 
 def check_action_mappings(sets: Sequence[MappingSet]) -> None:
-    """
-    Check that the mappings of these sets can be compared.
-
-    :raises ValueError: if there are too many
-    """
+    """Raise a ValueError if these sets have too many mappings to compare."""
     for mappings in sets:
         one_by_one = mappings.pairs is None and not isinstance(mappings.actions, AllActionMappings)
         if one_by_one and mappings.n_action_mappings > MAX_ACTION_MAPPINGS:

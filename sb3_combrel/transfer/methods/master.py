@@ -32,33 +32,25 @@ class MASTER(MappingTransfer):
     Modeling Approximate State Transitions by Exploiting Regression: finds a mapping by random actions, then transfers.
 
     Paper: Taylor, Kuhlmann & Stone, "Autonomous transfer for reinforcement learning" (AAMAS 2008). The first
-    ``n_random_steps`` actions in the target are drawn uniformly. The effects that the source's model predicts of these
-    transitions through each mapping are compared with what happened. The one mapping, of the states and of the actions
-    together, with the least mean squared error over all target variables (unit coordinates; a variable that it does not map is
-    predicted to stay as it is) is transferred with for the rest of the run.
+    ``n_random_steps`` actions in the target are drawn uniformly. The one mapping, of states and actions together, through
+    which the source's model predicts these transitions' effects with the least mean squared error over all target variables
+    (unit coordinates; a variable that it does not map is predicted to stay as it is) is transferred with for the rest of the
+    run.
 
-    What differs from the paper:
+    What differs from the paper: it fits a model to the few transitions of the target and tests it on the many of the source;
+    here the source's (:class:`~sb3_combrel.transfer.source_model.SourceModel`) is tested on the target's. Its mappings give
+    every target variable a source variable, as ``mappings="surjective"`` does. The learner is Fitted R-Max, which transfers as
+    with TIMBREL.
 
-    - The paper fits a model to the few transitions of the target and tests it on the many of the source. Here the model is
-      the source's (:class:`~sb3_combrel.transfer.source_model.SourceModel`), and is tested on the target's transitions.
-    - The paper's mappings give every target variable a source variable, as ``mappings="surjective"`` does. By default the
-      variables that a mapping leaves out stay as they are, as in COMBREL.
-    - The learner is Fitted R-Max, and what is transferred is what TIMBREL transfers through a mapping that is given.
-
-    The agent learns from the random steps as from any others; until they are over nothing is transferred. From Mountain Car 2D
-    to 4D 20 are enough; noisy tasks need more.
-
-    Example::
-
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=MASTER(source, n_random_steps=20))
-        model.learn(total_timesteps=5_000)
+    The agent learns from the random steps too; until they are over nothing is transferred. From Mountain Car 2D to 4D 20 are
+    enough; noisy tasks need more.
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; it has
     neither ``relevance`` and its fraction nor ``bandwidths``.
 
     :param mappings: the mappings to choose from, a set as there. Of mappings with the same error the first is chosen
-    :param n_random_steps: random actions by which is chosen; with several environments all of them act randomly until there
-        are so many transitions. A target action that was never drawn has no say
+    :param n_random_steps: random actions by which is chosen, of all environments together. A target action that was never
+        drawn has no say
     :param use: as there; None: "prior" where the target's model takes one (``FittedRMax(degree=1)``), unless ``breadth`` or
         ``breadth_decay``, which mean nothing then, differ from their defaults
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
@@ -131,23 +123,17 @@ class MASTER(MappingTransfer):
 
 
 def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
-    """
-    Return the squared errors of the predicted effects, added up over the transitions of each target action.
-
-    :param copies: one for each state mapping; variables that it does not map are predicted to stay as they are
-    :param sums: over the target's transitions
-    :return: unit coordinates of the target, shape (n_copies, n_target_actions, most source actions)
-    """
+    """Return effects' squared errors, summed, unit coordinates, shape (n_copies, n_target_actions, most source actions)."""
     left_out = (copies.state < 0).astype(np.float64)
     return np.asarray(sums.error.sum(axis=3) + (left_out @ sums.effect.T)[:, :, None])
 
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
     """
-    Find the mapping of a set with the least error, the first of equal ones.
+    Find the mapping with the least error, the first of equals: its error, state mapping, and each target action's source
+    action.
 
     :param errors: shape (n_state_mappings, n_target_actions, n_source_actions)
-    :return: the error of all target actions together, the state mapping, and the source action of each target action
     """
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # Every combination is in the set: the best source action of each target action can be found on its own.
@@ -163,12 +149,7 @@ def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float,
 
 
 def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySums) -> Choice:
-    """
-    Choose the mapping with the least mean squared error of the predicted effects, of all sources.
-
-    :param copies: the state mappings of all sets, one below the other
-    :param sums: over the target's transitions
-    """
+    """Choose the mapping with the least squared error of all sets, whose state mappings ``copies`` has in order."""
     errors, first, found = squared_errors(copies, sums), 0, []
     for number, mappings in enumerate(sets):
         rows = slice(first, first + mappings.n_state_mappings)
@@ -180,13 +161,7 @@ def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySum
 
 
 class LeastErrorSelector(FixedSelector):
-    """
-    Selects nothing until it has seen so many transitions; then, for good, the mapping that predicted their effects best.
-
-    :param parts: see :class:`~sb3_combrel.transfer.instances.selectors.SelectorParts`
-    :param copies: the candidates' state mappings with the sources' models
-    :param n_transitions: transitions by which is chosen
-    """
+    """Selects nothing until it has seen ``n_transitions``; then, for good, the mapping that predicted their effects best."""
 
     needs_transitions = True
 

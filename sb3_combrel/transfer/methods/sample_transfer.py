@@ -31,32 +31,24 @@ class SampleTransfer(MappingTransfer):
     """
     Draws instances of all sources, through all mappings, more from tasks that comply with the target and more relevant ones.
 
-    Paper: Lazaric, Restelli & Bonarini, "Transfer of samples in batch reinforcement learning" (ICML 2008). The compliance of a
-    source task with the target is the mean probability of the target's transitions under it (Eqs. 1-6). A fixed number of
-    instances is transferred, from each task in proportion to its compliance, and of a task in proportion to their relevance
-    (Eq. 7). Every mapping to every source makes a virtual source task: (source, mapping) is one task among all.
+    Paper: Lazaric, Restelli & Bonarini, "Transfer of samples in batch reinforcement learning" (ICML 2008). Every mapping to
+    every source makes a virtual source task, whose compliance is the mean probability of the target's transitions under it
+    (Eqs. 1-6). A fixed number of instances is drawn, from each task in proportion to its compliance, and of a task in
+    proportion to their relevance (Eq. 7).
 
     What differs from the paper:
 
-    - The paper's tasks have the same variables and actions. Here each mapping of each source is a task, all sources being
-      equally likely beforehand, and all mappings to one source. There are thousands, whose compliances are never listed: those
-      of all tasks with the same state mapping and source action for a target action are added up.
-    - Instances are drawn for each target action, the same number for all, without replacement.
-    - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice, as
-      in :class:`~sb3_combrel.transfer.methods.timbrel.TIMBREL`.
-    - The paper draws once, after a batch of transitions of the target. Here instances are drawn after ``min_transitions``, and
-      again whenever there are 1.2 times as many, with the same random numbers, so that more of those drawn stay. With
-      ``min_transitions`` and ``max_transitions`` equal they are drawn once.
+    - Its tasks have the same variables and actions. Here each mapping of each source is a task, all sources being equally
+      likely beforehand, and all mappings to one; compliances of tasks with the same state mapping and source action are added
+      up.
+    - Instances are drawn for each target action, the same number for all, without replacement: after ``min_transitions``, and
+      again whenever there are 1.2 times as many, with the same random numbers. The paper draws once, as with
+      ``max_transitions`` equal.
+    - The learner is Fitted R-Max, not fitted Q-iteration. Drawn instances help only where the target's own do not suffice.
 
-    What to expect: where tasks differ in one action or one pair of variables, as mappings do, their mean compliances over all
-    transitions differ little, and many instances come through wrong mappings. COMBREL chooses by state and action instead.
-    The number of instances does not depend on whether any task complies well: sources of no use are transferred too. No steps
-    of the target are spent on it but the first ``min_transitions``, in which the agent learns as without transfer.
-
-    Example::
-
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SampleTransfer(source, relevance="near"))
-        model.learn(total_timesteps=5_000)
+    What to expect: mappings that differ in one action or pair of variables comply about equally, so many instances come
+    through wrong ones, and as many are transferred where no task complies well. Only the first ``min_transitions`` are without
+    transfer.
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; it has
     neither ``use`` nor ``source_breadth``.
@@ -139,11 +131,9 @@ class SampleTransfer(MappingTransfer):
 
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
         """
-        Return the compliance of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
+        Return the compliance, 0 to 1, of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
 
-        :param mapping: from the target to the source; its state mapping must be of the set
-        :param source: number of the source
-        :return: value in [0, 1]; 0 before the first transition
+        :param mapping: from the target to the source numbered ``source``
         :raises ValueError: if the set has no such state mapping
         """
         return self._tasks.task_compliance(source, mapping)
@@ -227,13 +217,10 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
     """
     Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
 
-    The compliance of a task, Lambda_X of Eq. 6, is the sum over target actions of the compliances of their transitions,
-    divided by the number of all transitions.
+    A task's, Lambda_X of Eq. 6, is the sum of its transitions' compliances, divided by the number of all transitions.
 
     :param mappings: the mappings to one source, each as likely as any other
-    :param sums: compliances of the target's transitions added up, by state mapping, target action and source action, shape
-        (n_state_mappings, n_target_actions, n_source_actions)
-    :param n_transitions: of all target actions together
+    :param sums: of the transitions' compliances, shape (n_state_mappings, n_target_actions, n_source_actions)
     :return: sum over X of Lambda_X / n_mappings, shape of ``sums``
     """
     n_rows, n_actions, n_source_actions = sums.shape
@@ -253,11 +240,9 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
 
 def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
     """
-    Return for each candidate the compliance of all virtual source tasks that have it, added up.
+    Return for each candidate the compliance of all virtual source tasks that have it, added up, shape (n_candidates,).
 
     :param sums: see :func:`mean_compliances`; the state mappings of all sources one below the other, their actions numbered on
-    :param n_transitions: of all target actions together
-    :return: shape (n_candidates,); of each target action they add up to the mean compliance of all tasks
     """
     origins = np.array(candidates.origins, dtype=np.int64)
     found, row, action = np.zeros(len(origins)), 0, 0
@@ -281,10 +266,9 @@ def draw_instances(
     """
     Draw translated instances for each target action, without replacement.
 
-    Each time, a candidate is drawn in proportion to its compliance, and of it an instance in proportion to its relevance, of
-    those that are left: the n largest of log-probabilities with Gumbel noise, which is the same.
+    A candidate in proportion to its compliance, and of it an instance in proportion to its relevance, of those that are left:
+    the n largest of log-probabilities with Gumbel noise, which is the same.
 
-    :param compliances: of each candidate, shape (n_candidates,)
     :param relevances: of each candidate's instances, shape (n_candidates, most instances of an action)
     :param n: instances of each target action, at most; fewer if no more have a probability above 0
     :return: candidate and number of its instance, one a row, in order, int64, shape (n_drawn, 2)

@@ -36,28 +36,17 @@ class SoftHomomorphism(Transfer):
     distribution over source states, such that the expected model of the source is that of the target.
 
     Here the mapping is a mixture of deterministic ones: every source variable reads one target variable, as it is or mirrored,
-    no two the same; the parameters are logits of what each variable reads, and of the source action for each target
-    action. Given a target state and action, the prediction is the mean over the mixture of what the source's local linear
-    model predicts, each brought back to target coordinates by the mapping that it was made through. Parameters are fitted by
-    gradient descent after 10 transitions, and again whenever there are 1.4 times as many; only then, and when the source's
-    ends or rewards are confirmed or come to be doubted, the prior changes.
+    no two the same; parameters are logits of what each variable reads, and of the source action for each target action. The
+    prediction is the mean over the mixture of what the source's local linear model predicts, brought back to target
+    coordinates. It is fitted by gradient descent after 10 transitions, and again whenever there are 1.4 times as many (about 1
+    s for MountainCar2D to 4D), which costs no steps of the target.
 
-    What was changed. The paper maps to a finite set of source states, or by features made by hand; a distribution over ways to
-    read variables needs neither. It transfers the source's value function; here the mixture's model is the prior, and the
-    agent plans. Actions are mapped as well, by parameters of their own. A target with twice the variables of the source is
-    taken for two copies of it, mapped each in its own way; their predictions are added. Scale and offset are not parameters:
-    in unit coordinates, ranges correspond. As only the mean is fitted, a source action can also come out as the mean of others
-    that it equals, such as no push as half a push to either side.
+    What differs from the paper: it maps to a finite set of source states, or by features made by hand, and transfers the
+    source's value function; here the mixture's model is the prior (``FittedRMax(degree=1)``), actions are mapped as well, and
+    a target with twice the source's variables is taken for two copies, whose predictions are added. An action can come out as
+    a mean of others.
 
     What it claims to know without instances of the target: see :class:`~sb3_combrel.transfer.prior.claims.Claims`.
-
-    No steps of the target are spent on the mapping: it is fitted to what the agent does anyhow. A fit takes about 1 s for
-    MountainCar2D to 4D (48 mappings, two copies). It needs ``FittedRMax(degree=1)``.
-
-    Example::
-
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SoftHomomorphism(source))
-        model.learn(total_timesteps=5_000)
 
     :param source: source instances, or a path to them
     :param n_copies: copies of the source that the target is made of; None: as many as it has variables for, at least one
@@ -225,9 +214,9 @@ class SoftHomomorphism(Transfer):
         """
         Return the stochastic mapping.
 
-        :return: probability that each source variable of each copy reads each target variable, as it is, shape (n_copies, 2,
-            n_source_variables, n_target_variables), [:, 0], or mirrored, [:, 1]; and of each source action for each target
-            action, shape (n_copies, n_target_actions, n_source_actions)
+        :return: probability that each source variable reads each target variable, [:, 0] as it is or [:, 1] mirrored, shape
+            (n_copies, 2, n_source_variables, n_target_variables); of source actions, shape (n_copies, n_target_actions,
+            n_source_actions)
         :raises ValueError: before the first fit, after 10 transitions
         """
         if self._logits is None:
@@ -241,11 +230,7 @@ class SoftHomomorphism(Transfer):
         return found, of_action
 
     def describe(self) -> str:
-        """
-        Say what each target action is taken for most probably: "East: Right on (x, vx) 0.97, Neutral on (y, vy) 0.41; ...".
-
-        Probabilities are those of mapping and source action together, low where the mean of several is what fits.
-        """
+        """Say what each target action is most probably taken for, mapping and action: "East: Right on (x, vx) 0.97, ..."."""
         assert self.task is not None
         if self._logits is None:
             return "; ".join(f"{name}: nothing" for name in self.task.action_names)

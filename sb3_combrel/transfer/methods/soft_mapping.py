@@ -30,15 +30,11 @@ class Readings(NamedTuple):
 
     In each, every source variable reads a target variable of its own, as it is or mirrored, in unit coordinates. Where the
     source has more variables than the target, the others read nothing, and stand at their mean in the source's instances.
-
-    :param variable: int64, shape (n_mappings, n_source_variables): target variable that is read, -1 for none
-    :param sign: float64, same shape: -1 where it is mirrored
-    :param number: int64, same shape: column of the logits; of a mirrored variable, n_target_variables further on
     """
 
-    variable: np.ndarray
-    sign: np.ndarray
-    number: np.ndarray
+    variable: np.ndarray  # int64, shape (n_mappings, n_source_variables): target variable that is read, -1 for none
+    sign: np.ndarray  # float64, same shape: -1 where it is mirrored
+    number: np.ndarray  # int64, same shape: column of the logits; of a mirrored variable, n_target_variables further on
 
 
 def count_mappings(n_source: int, n_target: int, mirrored: bool) -> int:
@@ -66,9 +62,8 @@ def to_source(states: np.ndarray, readings: Readings, mapping: np.ndarray | int,
     """
     Return target states as mappings have them in the source, unit coordinates, shape (n, n_source_variables).
 
-    :param states: of the target, shape (n, n_target_variables)
     :param mapping: the number of each state's mapping, shape (n,), or of that of all
-    :param mean: of the source's instances, shape (n_source_variables,), for variables that read nothing
+    :param mean: of the source's instances, for variables that read nothing
     """
     variable, sign = (np.broadcast_to(array[mapping], (len(states), len(mean))) for array in readings[:2])
     read = np.take_along_axis(states, np.maximum(variable, 0), axis=1)
@@ -76,35 +71,20 @@ def to_source(states: np.ndarray, readings: Readings, mapping: np.ndarray | int,
 
 
 def to_target(effects: np.ndarray, readings: Readings, mapping: np.ndarray | int, n_target: int) -> np.ndarray:
-    """
-    Return effects of the source in target coordinates: each target variable moves as the source variable that reads it.
-
-    :param effects: unit coordinates of the source, shape (n, n_source_variables)
-    :param mapping: see :func:`to_source`
-    :return: shape (n, n_target): 0 for variables that are not read
-    """
+    """Return the source's effects in target coordinates, shape (n, n_target); 0 for variables that are not read."""
     variable, sign = readings.variable[mapping], readings.sign[mapping]
     return np.column_stack([np.where(variable == v, sign * effects, 0.0).sum(axis=-1) for v in range(n_target)])
 
 
 class Logits(NamedTuple):
-    """
-    Parameters of several stochastic mappings that together make up a target task, one for each copy of the source.
+    """Parameters of several stochastic mappings that together make up a target task, one for each copy of the source."""
 
-    :param state: float64, shape (n_copies, n_source_variables, n_readings): softmax over what each source variable reads
-    :param action: float64, shape (n_copies, n_target_actions, n_source_actions): softmax over source actions
-    """
-
-    state: np.ndarray
-    action: np.ndarray
+    state: np.ndarray  # float64, shape (n_copies, n_source_variables, n_readings): softmax over what is read
+    action: np.ndarray  # float64, shape (n_copies, n_target_actions, n_source_actions): softmax over source actions
 
 
 def probabilities(logits: Logits, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the probabilities of the deterministic mappings, shape (n_copies, n_mappings), and of source actions.
-
-    A mapping's is the product of those of its source variables' readings, normalised over the mappings listed.
-    """
+    """Return probabilities of mappings, shape (n_copies, n_mappings), products over their readings, and of source actions."""
     state, action = _log_probabilities(th.from_numpy(logits.state), th.from_numpy(logits.action), readings.number)
     return state.exp().numpy(), action.exp().numpy()
 
@@ -115,28 +95,20 @@ def _log_probabilities(state: th.Tensor, action: th.Tensor, number: np.ndarray) 
 
 
 class FitData(NamedTuple):
-    """
-    Target transitions, actions and effects, and what every deterministic mapping predicts of them.
+    """Target transitions, actions and effects, and what every deterministic mapping predicts of them."""
 
-    :param predicted: float64, shape (n, n_mappings, n_source_actions, n_target_variables): effects, target coordinates
-    :param scale: float64, shape (n_target_variables,), above 0: errors are measured in it
-    """
-
-    predicted: np.ndarray
+    predicted: np.ndarray  # effects, float64, shape (n, n_mappings, n_source_actions, n_target_variables)
     action: np.ndarray
     effect: np.ndarray
-    scale: np.ndarray
+    scale: np.ndarray  # float64, shape (n_target_variables,), above 0: errors are measured in it
 
 
 def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData) -> th.Tensor:
     """
-    Compute the error of mixtures, to be minimised; differentiable.
+    Compute the error of mixtures, to be minimised, shape (n_starts,); differentiable.
 
-    Of a transition, the sum over variables of sqrt(1 + (error / scale)^2) - 1: like a squared error where errors are small,
-    but a few large effects do not decide alone. Added is the negative logarithm of the logits' normal prior.
-
-    :param state: logits of ``n_starts`` sets of parameters, shape (n_starts, *logits.state.shape); ``action``: the same
-    :return: shape (n_starts,)
+    Of a transition, the sum over variables of sqrt(1 + (error / scale)^2) - 1, so that a few large effects do not decide
+    alone. Added is the negative logarithm of the logits' normal prior. Logits have one axis more, the starts, in front.
     """
     of_mapping, of_action = (each.exp() for each in _log_probabilities(state, action, readings.number))
     n, m, b, d = data.predicted.shape
@@ -151,13 +123,7 @@ def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData)
 
 
 def fit(before: Logits | None, shape: Logits, readings: Readings, data: FitData, n_starts: int, seed: int) -> Logits:
-    """
-    Fit the parameters by gradient descent (Adam) from several starts; the best are returned.
-
-    :param before: parameters to start from as well, those of the last fit
-    :param shape: any parameters of the shapes wanted
-    :param n_starts: random starts, which ``seed`` decides
-    """
+    """Fit the parameters (like ``shape``) by Adam from ``n_starts`` random starts and those of ``before``; return the best."""
     generator = th.Generator().manual_seed(seed)
     starts = []
     for k, like in enumerate(shape):
@@ -175,28 +141,17 @@ def fit(before: Logits | None, shape: Logits, readings: Readings, data: FitData,
 
 
 class Terms(NamedTuple):
-    """
-    The most probable parts of the mixture, listed by target action and copy.
+    """The most probable parts of the mixture, listed by target action and copy."""
 
-    :param first: int64, shape (n_target_actions + 1,): those of action a are ``first[a]`` to ``first[a + 1]``
-    :param copy: int64, shape (n_terms,); ``mapping`` (row of :class:`Readings`) and source ``action``: the same
-    :param share: float64, same shape: probability; those of a copy under an action add up to 1
-    """
-
-    first: np.ndarray
-    copy: np.ndarray
-    mapping: np.ndarray
-    action: np.ndarray
-    share: np.ndarray
+    first: np.ndarray  # int64, shape (n_target_actions + 1,): those of action a are first[a] to first[a + 1]
+    copy: np.ndarray  # int64, shape (n_terms,), as the next two
+    mapping: np.ndarray  # row of Readings
+    action: np.ndarray  # of the source
+    share: np.ndarray  # float64, same shape: probability; those of a copy under an action add up to 1
 
 
 def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int, mass: float) -> Terms:
-    """
-    List the parts of the mixture by falling probability, until they have ``mass`` together or are ``max_terms``.
-
-    :param of_mapping: shape (n_copies, n_mappings); ``of_action``: shape (n_copies, n_target_actions, n_source_actions)
-    :param max_terms: of one copy under one action
-    """
+    """List a copy's parts under an action by falling probability, until they have ``mass`` together or are ``max_terms``."""
     first, rows = [0], []
     for a in range(of_action.shape[1]):
         for c, (mappings, actions) in enumerate(zip(of_mapping, of_action[:, a], strict=True)):
@@ -215,11 +170,8 @@ class MixturePredictions:
     """
     Predicts pairs of the target by the mean over a mixture.
 
-    The effect is the sum of the copies'; the reward is the mean of theirs; an end, the product; the weight of the source's
-    data, the least.
+    The effect is the copies' sum; the reward, their mean; an end, the product; the weight of the source's data, the least.
 
-    :param model: of the source
-    :param readings: the deterministic mappings
     :param mean: of the source's states, unit coordinates, shape (n_source_variables,)
     :param sample: states that are asked for again and again, unit coordinates, shape (n_points, n_target_variables)
     """

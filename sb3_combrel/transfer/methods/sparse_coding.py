@@ -29,12 +29,7 @@ class Codes(NamedTuple):
 
 
 def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity: float, seed: int) -> Codes:
-    """
-    Code the triplets of both tasks over one dictionary, see :class:`SparseCodingMapping`.
-
-    :param source: standardised triplets, one a row; ``target``: the same
-    :param seed: of the dictionaries' first atoms
-    """
+    """Code standardised triplets of both tasks, one a row, over one dictionary, see :class:`SparseCodingMapping`."""
     from sklearn.decomposition import DictionaryLearning, sparse_encode
     from sklearn.exceptions import ConvergenceWarning
 
@@ -55,12 +50,7 @@ def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity:
 
 
 def fit_regression(source: np.ndarray, target: np.ndarray, seed: int) -> GaussianProcessRegressor:
-    """
-    Fit a Gaussian process from standardised source triplets to target triplets, all columns with one kernel.
-
-    :param source: shape (n, n_source_columns); ``target``: shape (n, n_target_columns)
-    :param seed: of the regression's optimiser
-    """
+    """Fit a Gaussian process from standardised source triplets to target triplets, all columns with one kernel."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -79,24 +69,18 @@ class SparseCodingMapping(LearnedTranslation):
     Pairs random transitions of both tasks by their sparse codes, and transfers all source data by regression on the pairs.
 
     Paper: Ammar, Tuyls, Taylor, Driessens & Weiss, "Reinforcement learning transfer via sparse coding" (AAMAS 2012). Source
-    triplets (state, action, next state) are coded over a dictionary with as many atoms as a target triplet has columns. A
-    second, larger dictionary is learned for these codes; the target's triplets are coded over it too. Each source triplet is
-    paired with the target triplet whose code is nearest; a Gaussian process learns the mapping from these pairs, and carries
-    all source data over to the target. Nothing is learned about the mapping afterwards.
+    triplets (state, action, next state) are coded over a dictionary with as many atoms as a target triplet has columns; a
+    second, larger dictionary is learned for these codes, over which the target's triplets are coded too. Each source triplet
+    is paired with the target triplet whose code is nearest; a Gaussian process learns from the pairs, and carries all source
+    data over.
 
-    What was changed. Triplets are of unit coordinates, with the effect in place of the next state and one column for each
-    action, standardised, the first codes too. The regression is an exact Gaussian process, not a sparse one. Translated data
-    are instances that join the target's own, nearest first, instead of what fitted Q-iteration or LSPI starts from. Rewards
-    and ends are the source's.
+    What differs from the paper: triplets are of unit coordinates, with the effect in place of the next state and one column
+    for each action, standardised, the first codes too. The Gaussian process is exact. Translated data are instances that join
+    the target's own, nearest first, instead of starting fitted Q-iteration or LSPI. Rewards and ends are the source's.
 
-    What to expect. The atoms of the first dictionary come in any order and with any sign, and are compared with the columns of
-    the target's triplets one by one: nothing in the method makes pairs correspond, and the regression fits whatever pairs it
-    is given. ``transfer/prediction_error`` says how well the instances that were used then predicted the target.
-
-    Example::
-
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SparseCodingMapping(source, n_random_steps=100))
-        model.learn(total_timesteps=5_000)
+    What to expect: the first dictionary's atoms, in any order and with any sign, are compared with the columns of target
+    triplets one by one, so nothing makes pairs correspond. ``transfer/prediction_error`` says how well the instances used
+    predicted.
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.learned_translation.LearnedTranslation`.
 

@@ -24,25 +24,16 @@ class ThreeWayRBM(LearnedTranslation):
 
     Paper: Ammar, Mocanu, Taylor, Driessens, Tuyls & Weiss, "Automatically mapped transfer between reinforcement learning tasks
     via three-way restricted Boltzmann machines" (ECML 2013). One layer of units holds a source triplet (state, action, next
-    state), one a target triplet, and hidden units gate the weights between them; the tensor of weights is factored. It is
-    trained on random samples of both tasks by contrastive divergence; source data are then clamped, and the target's layer is
-    reconstructed. Nothing is learned about the mapping afterwards.
+    state), one a target triplet, and hidden units gate the factored weights between them. It is trained by contrastive
+    divergence; source data are then clamped, and the target's layer is reconstructed.
 
-    What was changed. Triplets are of unit coordinates, with the effect in place of the next state and one column for each
-    action, standardised. The machine is of the target's units given the source's: with real units in both layers the joint
-    energy has no lower bound for some weights, the conditional one always has. Reconstruction is a fixed number of mean-field
-    iterations. Translated data are instances that join the target's own, nearest first, instead of what fitted Q-iteration
-    starts from. Rewards and ends are the source's.
+    What differs from the paper: triplets are of unit coordinates, with the effect in place of the next state and one column
+    for each action, standardised. The energy is of the target's units given the source's (the joint one has no lower bound).
+    Translated data are instances that join the target's own, instead of starting fitted Q-iteration. Rewards and ends are the
+    source's.
 
-    What to expect. Nobody says which source and target triplets belong together, so those that the machine is shown together
-    are drawn independently of each other: any relation that it learns is one of chance, and what it reconstructs lies near the
-    mean of the target's sample, whatever the source triplet (``transfer/translated_spread`` tells how near). Given pairs that
-    belong together it does learn what relates them, but no task gives such pairs.
-
-    Example::
-
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=ThreeWayRBM(source, n_random_steps=100))
-        model.learn(total_timesteps=5_000)
+    What to expect: source and target triplets are shown together at random, so any relation that it learns is one of chance,
+    and what it reconstructs lies near the mean of the target's sample (``transfer/translated_spread`` tells how near).
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.learned_translation.LearnedTranslation`.
 
@@ -84,19 +75,14 @@ class Machine(NamedTuple):
     """
     Parameters of a machine with source and target units that are real numbers and hidden units that are 0 or 1.
 
-    The weight between source unit i, hidden unit j and target unit k is the sum over factors f of
-    ``source[i, f] * hidden[j, f] * target[k, f]``.
-
-    :param source: float64, shape (n_source, n_factors); ``hidden``: shape (n_hidden, n_factors)
-    :param target: shape (n_target, n_factors)
-    :param hidden_bias: shape (n_hidden,); ``target_bias``: shape (n_target,)
+    The weight of source unit i, hidden unit j and target unit k: sum over factors of ``source[i] * hidden[j] * target[k]``.
     """
 
-    source: th.Tensor
-    hidden: th.Tensor
-    target: th.Tensor
-    hidden_bias: th.Tensor
-    target_bias: th.Tensor
+    source: th.Tensor  # float64, shape (n_source, n_factors)
+    hidden: th.Tensor  # shape (n_hidden, n_factors)
+    target: th.Tensor  # shape (n_target, n_factors)
+    hidden_bias: th.Tensor  # shape (n_hidden,)
+    target_bias: th.Tensor  # shape (n_target,)
 
 
 def hidden_input(machine: Machine, source: th.Tensor, target: th.Tensor) -> th.Tensor:
@@ -116,11 +102,7 @@ def free_energy(machine: Machine, source: th.Tensor, target: th.Tensor) -> th.Te
 
 
 def contrastive_divergence(machine: Machine, source: th.Tensor, target: th.Tensor, generator: th.Generator) -> th.Tensor:
-    """
-    Return what has the gradient of contrastive divergence (CD-1): the mean free energy of data less that of reconstructions.
-
-    Hidden units are drawn given the data, and the target's units are reconstructed by their mean; the source's stay.
-    """
+    """Return what has CD-1's gradient: mean free energy of data less that of target units reconstructed from them."""
     with th.no_grad():
         on = th.sigmoid(hidden_input(machine, source, target))
         drawn = (th.rand(on.shape, generator=generator, dtype=th.float64) < on).double()
@@ -131,12 +113,7 @@ def contrastive_divergence(machine: Machine, source: th.Tensor, target: th.Tenso
 def train(
     source: np.ndarray, target: np.ndarray, *, n_hidden: int, n_factors: int, n_updates: int, seed: int, paired: bool = False
 ) -> Machine:
-    """
-    Train a machine on samples of both tasks, in batches, by Adam.
-
-    :param source: standardised triplets, one a row; ``target``: the same
-    :param paired: whether rows of the same number belong together; otherwise rows are paired at random, anew in each batch
-    """
+    """Train a machine by Adam on standardised triplets, one a row; unless ``paired``, rows meet at random."""
     generator = th.Generator().manual_seed(seed)
     sizes = source.shape[1], n_hidden, target.shape[1]
     weights = [th.randn((n, n_factors), generator=generator, dtype=th.float64) * FIRST_DEVIATION for n in sizes]

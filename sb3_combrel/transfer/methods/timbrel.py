@@ -25,23 +25,16 @@ class TIMBREL(MappingTransfer):
     """
     Where the target has too few instances, source instances translated by a given mapping are added to the model's.
 
-    Paper: Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning" (ECML 2008). The
-    nearest translated instances come first, until they and the target's own reach the threshold that makes a
-    state-action pair known; if they cannot, nothing is transferred. A pair whose own instances suffice uses none.
+    Paper: Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning" (ECML 2008). The nearest
+    translated instances come first, until they and the target's own reach the threshold that makes a state-action pair known;
+    if they cannot, nothing is transferred. A pair whose own instances suffice uses none.
 
-    ::
+    Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
 
-        right = {"Neutral": "Neutral", "West": "Left", "East": "Right", "South": "Neutral", "North": "Neutral"}
-        along_x = InterTaskMapping(state={"x": "x", "vx": "v"}, action=right)
-        model = FittedRMax("combrel/MountainCar4D-v0", transfer=TIMBREL(source, along_x), seed=0).learn(total_timesteps=5_000)
-
-    All arguments but ``mapping`` and ``mappings``: see
-    :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
-
-    :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of
-        ``mappings`` drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever
-        it is asked for, elsewhere with each transition; or "pool" for the translations by all of ``mappings`` in one pool
-        (Figure 3). With ``use="prior"`` also a ``FactoredMapping``; and "random" is drawn once, for the whole run
+    :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of ``mappings``
+        drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever it is asked for,
+        elsewhere with each transition; or "pool" for the translations by all of ``mappings`` in one pool (Figure 3). With
+        ``use="prior"`` also a ``FactoredMapping``; and "random" is drawn once, for the whole run
     :param mappings: the set that "random" and "pool" draw from; also "factored" and "signed_factored" (``use="prior"`` only:
         of as many variables as possible, in as few copies as possible)
     :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
