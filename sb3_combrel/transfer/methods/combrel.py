@@ -42,6 +42,12 @@ class COMBREL(MappingTransfer):
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
 
+    ::
+
+        source = SourceInstances.from_q_learning("combrel/MountainCar2D-v0", n_instances=1000, seed=0)
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=COMBREL(source), seed=0).learn(total_timesteps=5_000)
+        print(model.transfer.report())
+
     :param source: as there; of several sources is selected as well
     :param mappings: a set as there, by default "injective" with ``use="instances"``; with ``use="prior"`` also "factored", the
         default, or "signed_factored": the target's variables are divided among copies of the source, or of some of its

@@ -60,6 +60,11 @@ class MappingExperts(Transfer):
     drops those that break their promise; here that is UCB1 and ``patience``. The learning agent takes part: its mean is that
     of the later half of its episodes. The paper's experts are given; here they are drawn from a set of mappings.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=MappingExperts(source, max_experts=5))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, a path to them, or a list of several, see
         :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`
     :param mappings: the set that the experts are drawn from, see there

@@ -48,6 +48,11 @@ class MASTER(MappingTransfer):
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; it has
     neither ``relevance`` and its fraction nor ``bandwidths``.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=MASTER(source, n_random_steps=20))
+        model.learn(total_timesteps=5_000)
+
     :param mappings: the mappings to choose from, a set as there. Of mappings with the same error the first is chosen
     :param n_random_steps: random actions by which is chosen, of all environments together. A target action that was never
         drawn has no say

@@ -53,6 +53,11 @@ class SampleTransfer(MappingTransfer):
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`; it has
     neither ``use`` nor ``source_breadth``.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SampleTransfer(source, relevance="near"))
+        model.learn(total_timesteps=5_000)
+
     :param mappings: the mappings to each source, a set as there
     :param n_instances: source instances that are drawn, at most; the same number for each target action
     :param min_transitions: transitions of the target after which instances are first drawn

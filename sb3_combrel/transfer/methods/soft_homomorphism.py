@@ -48,6 +48,11 @@ class SoftHomomorphism(Transfer):
 
     What it claims to know without instances of the target: see :class:`~sb3_combrel.transfer.prior.claims.Claims`.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SoftHomomorphism(source))
+        model.learn(total_timesteps=5_000)
+
     :param source: source instances, or a path to them
     :param n_copies: copies of the source that the target is made of; None: as many as it has variables for, at least one
     :param mirrored: whether target variables may be read mirrored as well

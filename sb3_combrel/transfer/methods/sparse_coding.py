@@ -84,6 +84,11 @@ class SparseCodingMapping(LearnedTranslation):
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.learned_translation.LearnedTranslation`.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=SparseCodingMapping(source, n_random_steps=100))
+        model.learn(total_timesteps=5_000)
+
     :param n_atoms: atoms of the second dictionary; None: twice the columns of a target triplet
     :param sparsity: weight of the codes' absolute values beside half the squared error
     :raises ValueError: if an argument is out of range; when learning starts, if a state variable of either task is periodic

@@ -37,6 +37,11 @@ class ThreeWayRBM(LearnedTranslation):
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.learned_translation.LearnedTranslation`.
 
+    Example::
+
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=ThreeWayRBM(source, n_random_steps=100))
+        model.learn(total_timesteps=5_000)
+
     :param n_hidden: hidden units
     :param n_factors: factors of the tensor of weights
     :param n_updates: batches of 64 that it is trained on

@@ -31,6 +31,12 @@ class TIMBREL(MappingTransfer):
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
 
+    ::
+
+        right = {"Neutral": "Neutral", "West": "Left", "East": "Right", "South": "Neutral", "North": "Neutral"}
+        along_x = InterTaskMapping(state={"x": "x", "vx": "v"}, action=right)
+        model = FittedRMax("combrel/MountainCar4D-v0", transfer=TIMBREL(source, along_x), seed=0).learn(total_timesteps=5_000)
+
     :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of ``mappings``
         drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever it is asked for,
         elsewhere with each transition; or "pool" for the translations by all of ``mappings`` in one pool (Figure 3). With
