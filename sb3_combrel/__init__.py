@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sb3_combrel.common.version import __version__
+from sb3_combrel.common.version import __version__ as __version__
+from sb3_combrel.fitted_rmax import source_learner  # noqa: F401 - sources.SourceInstances.from_fitted_rmax finds it
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -36,7 +37,6 @@ __all__ = [
     "SourceInstances",
     "SparseCodingMapping",
     "ThreeWayRBM",
-    "__version__",
     "compare",
     "explain",
 ]

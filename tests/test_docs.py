@@ -92,8 +92,11 @@ def check_module_call(module, words):
     """Check that a module can be run, that it knows the options, and that files and algorithms exist."""
     assert importlib.util.find_spec(module) is not None, module
     if module.startswith("sb3_combrel.experiments."):
-        known = re.findall(r'"(--[\w-]+)"', inspect.getsource(importlib.import_module(module)))
-        assert {word for word in words if word.startswith("--")} <= set(known), (module, words)
+        # The command is the function that the module is named after, or, of "suite.command", its folder.
+        name = module.replace(".command", "").rpartition(".")[2]
+        parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters
+        known = {f"--{parameter.replace('_', '-')}" for parameter in parameters}
+        assert {word for word in words if word.startswith("--")} <= known, (module, words)
     if module == "sb3_combrel.zoo":
         from sb3_combrel.zoo import ALGORITHMS
         from sb3_combrel.zoo.commands import FUNCTIONS, SCRIPTS

@@ -1,4 +1,4 @@
-"""Results are copied into the documentation, and tables and files filled in between their marks."""
+"""Results are copied into the documentation, and tables filled in between their marks."""
 
 import pytest
 
@@ -15,18 +15,15 @@ def test_tables_are_found_without_their_titles():
     assert tables_in("no table | here") == []
 
 
-def test_tables_and_files_are_filled_in_and_what_is_around_stays(tmp_path):
+def test_tables_are_filled_in_and_what_is_around_stays(tmp_path):
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "t.md").write_text(TABLES)
-    (tmp_path / "results" / "all.md").write_text("text ![one](one.png) ![two](https://a.org/two.png)\n")
     page = tmp_path / "page.md"
-    file = "<!-- results: results/all.md -->\n{}<!-- end of results -->"
-    page.write_text(f"before\n\n{MARKS.format(2, 'old')}\n\nbetween\n\n{MARKS.format(1, '')}\n{file.format('old')}\n\nafter\n")
-    content = "text ![one](results/one.png) ![two](https://a.org/two.png)\n"
+    page.write_text(f"before\n\n{MARKS.format(2, 'old')}\n\nbetween\n\n{MARKS.format(1, '')}\n\nafter\n")
     for _ in range(2):
-        assert fill_in(page) == 3
-        filled = MARKS.format(2, SECOND + "\n"), MARKS.format(1, FIRST + "\n"), file.format(content)
-        assert page.read_text() == "before\n\n{}\n\nbetween\n\n{}\n{}\n\nafter\n".format(*filled)
+        assert fill_in(page) == 2
+        filled = MARKS.format(2, SECOND + "\n"), MARKS.format(1, FIRST + "\n")
+        assert page.read_text() == "before\n\n{}\n\nbetween\n\n{}\n\nafter\n".format(*filled)
 
 
 def test_a_table_that_is_not_there_is_named(tmp_path):

@@ -10,7 +10,7 @@ import jupytext
 import pytest
 from nbclient.exceptions import CellExecutionError
 
-from sb3_combrel.experiments.tutorials import execute, figures_of, main, recorded_outputs, tutorial_files, with_outputs
+from sb3_combrel.experiments.tutorials import execute, figures_of, recorded_outputs, tutorial_files, tutorials, with_outputs
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "tutorials"
@@ -54,11 +54,10 @@ def test_outputs_replace_older_ones_and_outputs_and_figures_are_read_again():
         with_outputs(TEXT, ["", ""])
 
 
-def test_the_command_executes_the_cells_in_their_folder_and_environment_and_writes_outputs(tmp_path, monkeypatch):
+def test_the_command_executes_the_cells_in_their_folder_and_environment_and_writes_outputs(tmp_path):
     file = tmp_path / "1_small.md"
     file.write_text(TEXT)
-    monkeypatch.setattr("sys.argv", ["tutorials", str(file)])
-    main()
+    tutorials((file,))
     assert recorded_outputs(file.read_text()) == [None, "2", f"{sys.prefix}\n{os.path.realpath(tmp_path)}"]
 
 
