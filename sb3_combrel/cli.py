@@ -19,8 +19,7 @@ def demo(
     workers: int | None = None,
     fresh: bool = False,
 ) -> None:
-    """
-    Learn 4D Mountain Car without transfer, with TIMBREL and with COMBREL from the 2D one, and compare.
+    """Learn 4D Mountain Car without transfer, with TIMBREL and with COMBREL from the 2D one, and compare.
 
     It can be stopped at any time; the same command continues from there.
 
@@ -47,8 +46,7 @@ def record(
     method: str = "random",
     overwrite: bool = False,
 ) -> None:
-    """
-    Learn a source task by Q-learning and keep a sample of its experience as source instances.
+    """Learn a source task by Q-learning and keep a sample of its experience as source instances.
 
     :param env_id: id of a task with few state variables and discrete actions, such as combrel/MountainCar2D-v0 or
         package:Task-v0
@@ -89,8 +87,7 @@ def reproduce(
     backend: str = "loky",
     address: str | None = None,
 ) -> None:
-    """
-    Reproduce a figure or table of the COMBREL paper, with controls.
+    """Reproduce a figure or table of the COMBREL paper, with controls.
 
     It can be stopped at any time; the same command continues from there.
 
@@ -114,8 +111,7 @@ def reproduce(
 
 
 def explain(model: Path, /, output: Path | None = None) -> None:
-    """
-    Say what transfer did in a model: which mappings, how sure, what the target contradicted, how many steps rested on it.
+    """Say what transfer did in a model: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
     :param model: file of a model that FittedRMax has saved
     :param output: folder for the report, a table of mappings, and pictures of value, policy and mappings; by default the
@@ -140,8 +136,7 @@ def benchmark(
     address: str | None = None,
     output: Path = Path("benchmark"),
 ) -> None:
-    """
-    Compare methods of transfer on pairs of tasks with a known answer: a table and a picture a pair, and mean ranks.
+    """Compare methods of transfer on pairs of tasks with a known answer: a table and a picture a pair, and mean ranks.
 
     It can be stopped at any time; the same command continues from there. More in docs/benchmark.md.
 
@@ -172,8 +167,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run the command line.
+    """Run the command line.
 
     :param args: arguments, those of the process by default
     :return: exit status: 0, or 1 if something was wrong with the arguments or a run failed, or 130 if the user stopped it

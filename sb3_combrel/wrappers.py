@@ -27,8 +27,7 @@ class AngleObservation(
     gym.ObservationWrapper[NDArray[Any], Any, NDArray[Any]],  # type: ignore[misc]
     gym.utils.RecordConstructorArgs,
 ):
-    """
-    Turns pairs of observations (cos, sin) into one observation each: the angle, from -pi to pi.
+    """Turns pairs of observations (cos, sin) into one observation each: the angle, from -pi to pi.
 
     The state of Acrobot or Pendulum is one of angles and velocities; with a cosine and a sine in place of each angle it lies
     on a curved surface in a space of more variables, most of which no state has. An angle stands where its cosine was, the
@@ -73,8 +72,7 @@ class AngleObservation(
         return tuple(f"angle_{of_all[k]}" if angle else of_all[k] for angle, k in zip(self._angles, self._kept, strict=True))
 
     def observation(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """
-        Replace the pairs of one observation by angles.
+        """Replace the pairs of one observation by angles.
 
         :param observation: of the wrapped environment, shape (n,)
         :return: of the wrapper, shape (n - n_pairs,), same type
@@ -102,8 +100,7 @@ def _list_of(env: gym.Env[Any, Any], name: str, kind: Any, n: int) -> Sequence[A
 
 
 def _checked_pairs(pairs: Any, box: spaces.Box) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """
-    Return the indices of the cosines and of the sines.
+    """Return the indices of the cosines and of the sines.
 
     :raises ValueError: see :class:`AngleObservation`
     """

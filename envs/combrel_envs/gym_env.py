@@ -37,8 +37,7 @@ def _register(name: str, entry_point: str, max_episode_steps: int, kwargs: dict[
 
 
 class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
-    """
-    An environment with flat float32 observations and discrete actions, drawn by MuJoCo; a wrong argument is a ValueError.
+    """An environment with flat float32 observations and discrete actions, drawn by MuJoCo; a wrong argument is a ValueError.
 
     :param render_mode: ``"rgb_array"`` or None
     :param width: of a frame in pixels, as ``height``
@@ -82,8 +81,7 @@ class RenderedEnv(gymnasium.Env[np.ndarray, np.int64]):
 
 
 class DmControlEnv(RenderedEnv):
-    """
-    A dm_control environment as a Gymnasium environment.
+    """A dm_control environment as a Gymnasium environment.
 
     The observations, in the order of the environment's specification, become one flat float32 vector. The episode terminates
     when the task gives a discount of 0 and is truncated at the environment's time limit; a task that ends on the very last

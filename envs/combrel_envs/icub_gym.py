@@ -46,8 +46,7 @@ class ICubStrikeEnv(DmControlEnv):
 
 
 class ICubTorsoStrikeEnv(ICubStrikeEnv):
-    """
-    ## Description
+    """## Description
 
     The iCub humanoid sits at a table on which a ball lies. It is blind, and must find the ball with the fingertips of its
     stretched right arm by bending and turning its torso: lean forward, then turn left. Everything else of the robot stands
@@ -116,8 +115,7 @@ class ICubTorsoStrikeEnv(ICubStrikeEnv):
 
 
 class ICubArmStrikeEnv(ICubStrikeEnv):
-    """
-    ## Description
+    """## Description
 
     `combrel/ICubArmStrike-v0`: as in `combrel/ICubTorsoStrike-v0` the iCub must strike the ball, but by moving four joints of
     its right arm; its torso leans forward and stands still. This is the target task of the same paper.

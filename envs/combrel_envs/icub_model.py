@@ -28,8 +28,7 @@ _DRAWN, _HIDDEN = 1, 3
 
 
 def make_model(strike: Strike, look: str) -> mujoco.MjModel:
-    """
-    Compile the model of a task; its joints are the task's, in their order, and then the ball's.
+    """Compile the model of a task; its joints are the task's, in their order, and then the ball's.
 
     :param look: ``"primitives"``, or ``"meshes"`` for those of the package ``icub_models``
     :raises ModuleNotFoundError: when the meshes aren't installed

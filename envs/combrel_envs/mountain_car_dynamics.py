@@ -1,5 +1,4 @@
-"""
-The equations of Mountain Car in plain Python floats, faster than arrays for two to six scalars; both interfaces use them.
+"""The equations of Mountain Car in plain Python floats, faster than arrays for two to six scalars; both interfaces use them.
 
 A state is a pair of tuples ``(positions, velocities)`` with one float an axis, ``((x, y), (vx, vy))`` in 4D.
 """

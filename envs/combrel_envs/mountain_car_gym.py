@@ -37,8 +37,7 @@ class MountainCarEnv(RenderedEnv):
         return np.array(positions + velocities)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """
-        Begin an episode; ``seed`` is that of the following ones too, None continues.
+        """Begin an episode; ``seed`` is that of the following ones too, None continues.
 
         :param options: ``{"start": ...}`` overrides the environment's start option for this episode, ``{"state": [...]}``
             begins in exactly that state, in the order of ``state_names``
@@ -103,8 +102,7 @@ class MountainCarEnv(RenderedEnv):
 
 
 class MountainCar2DEnv(MountainCarEnv):
-    """
-    ## Description
+    """## Description
 
     A car stands in a valley. Its engine is weaker than gravity, so it can't just drive up the hill on the right: it must first
     go left, away from the goal, and swing up. This is the task of Singh and Sutton, *Reinforcement Learning with Replacing
@@ -166,8 +164,7 @@ class MountainCar2DEnv(MountainCarEnv):
 
 
 class MountainCar4DEnv(MountainCarEnv):
-    """
-    ## Description
+    """## Description
 
     `combrel/MountainCar4D-v0`: a car stands at the bottom of a basin with hills along two axes, of height sin(3x) + sin(3y).
     Its engine is weaker than gravity and pushes along one axis at a time; the goal is the hill in the north-east corner. The
@@ -204,8 +201,7 @@ class MountainCar4DEnv(MountainCarEnv):
 
 
 class MountainCar6DEnv(MountainCarEnv):
-    """
-    ## Description
+    """## Description
 
     `combrel/MountainCar6D-v0`: `combrel/MountainCar4D-v0` with one axis more, hills of height sin(3x) + sin(3y) + sin(3z); the
     goal is the upper end of all three axes together. Pictures show x and y as in 4D, and z as a second car on a strip in front

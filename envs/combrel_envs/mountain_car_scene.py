@@ -1,5 +1,4 @@
-"""
-The pictures of Mountain Car: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
+"""The pictures of Mountain Car: the hills as meshes and textures for MuJoCo, and the pose of the car on them.
 
 The hills are ``sin(3x)`` in 2D and ``sin(3x) + sin(3y)`` in 4D, times a scale. In 6D there are two pieces of ground, each with
 a car: 4D's for x and y, and in front of it 2D's for z. Except in :func:`model_and_assets` and in ``GROUNDS``, ``n_axes`` is
@@ -80,8 +79,7 @@ def _assets(n_axes: int) -> dict[str, bytes]:
 
 
 def car_pose(positions: dynamics.Axes, velocities: dynamics.Axes) -> tuple[np.ndarray, np.ndarray]:
-    """
-    The pose in which a car is drawn: position relative to its ground's body; rotation, columns nose, left side and roof.
+    """The pose in which a car is drawn: position relative to its ground's body; rotation, columns nose, left side and roof.
 
     In 2D the nose points right, as the car can reverse; in 4D it points in the direction of motion (north-east at rest).
     """

@@ -21,8 +21,7 @@ class RenderingError(RuntimeError):
 
 
 def import_dm_control() -> None:
-    """
-    Import dm_control; call this before the first import of it.
+    """Import dm_control; call this before the first import of it.
 
     dm_control reads ``MUJOCO_GL`` when it is imported, and fails at once if that backend doesn't start. It is then imported
     without a renderer, and the error raised when a picture is requested. Without a display EGL is the default on Linux, unless

@@ -15,8 +15,7 @@ def load(
     task_kwargs: dict[str, Any] | None = None,
     environment_kwargs: dict[str, Any] | None = None,
 ) -> "control.Environment":
-    """
-    Make a dm_control environment.
+    """Make a dm_control environment.
 
     :param domain: ``"mountain_car"`` or ``"icub"``
     :param task: name of one of its tasks, for instance ``"climb_4d"``

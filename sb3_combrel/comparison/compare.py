@@ -45,8 +45,7 @@ def compare(
     n_jobs: int | None = 1,
     progress_bar: bool = False,
 ) -> CompareResult:
-    """
-    Learn a task with several methods of transfer and without, and say whether transfer helped.
+    """Learn a task with several methods of transfer and without, and say whether transfer helped.
 
     Each method learns with the same seeds; everything is tested before the first run begins::
 

@@ -20,8 +20,7 @@ MONITOR_SUFFIX = "monitor.csv"
 
 @dataclass(frozen=True, eq=False)
 class LearningCurves:
-    """
-    The episodes of several runs of one method, from the first on.
+    """The episodes of several runs of one method, from the first on.
 
     Runs may have different numbers of episodes: what is left of a row is NaN, in both arrays. :meth:`from_rows` fills it in.
 
@@ -50,8 +49,7 @@ class LearningCurves:
 
     @classmethod
     def from_rows(cls, returns: Sequence[Sequence[float]], steps: Sequence[Sequence[float]]) -> LearningCurves:
-        """
-        Make them of runs that may have different numbers of episodes.
+        """Make them of runs that may have different numbers of episodes.
 
         :param returns: for each run, the return of each episode
         :param steps: for each run, the environment steps of each episode
@@ -78,8 +76,7 @@ class LearningCurves:
         return np.nansum(self.steps, axis=1)
 
     def first_episodes(self, n: int | None = None) -> LearningCurves:
-        """
-        The first episodes of each run.
+        """The first episodes of each run.
 
         :param n: their number; None: as many as the shortest run has
         :raises ValueError: if a run has fewer
@@ -104,8 +101,7 @@ def episodes_of_all(name: str, n: int | None, curves: LearningCurves) -> int:
 
 
 def returns_over_steps(curves: LearningCurves, at: np.ndarray) -> np.ndarray:
-    """
-    Return, for each run, the return of the episode that was under way after so many environment steps.
+    """Return, for each run, the return of the episode that was under way after so many environment steps.
 
     :param at: environment steps, each fewer than the shortest run has, shape (n_points,)
     :return: shape (n_runs, n_points)
@@ -116,8 +112,7 @@ def returns_over_steps(curves: LearningCurves, at: np.ndarray) -> np.ndarray:
 
 
 def moving_average(samples: np.ndarray, window: int) -> np.ndarray:
-    """
-    Compute the mean of ``window`` successive episodes, or of all where there are fewer.
+    """Compute the mean of ``window`` successive episodes, or of all where there are fewer.
 
     :param samples: one run a row, shape (n_runs, n_episodes)
     :return: shape (n_runs, n_episodes - window + 1)
@@ -127,8 +122,7 @@ def moving_average(samples: np.ndarray, window: int) -> np.ndarray:
 
 
 def read_monitor_logs(paths: str | Path | Sequence[str | Path]) -> LearningCurves:
-    """
-    Read what Stable-Baselines3's Monitor has written.
+    """Read what Stable-Baselines3's Monitor has written.
 
     :param paths: a folder: each ``*monitor.csv`` in it is a run, in order of their names. Or a list, each entry a run: a
         Monitor file, or a folder whose Monitor files belong to the parallel environments of one run, so their episodes are

@@ -1,5 +1,4 @@
-"""
-Measures of learning, and of transfer: what learning with transfer gains over learning without it.
+"""Measures of learning, and of transfer: what learning with transfer gains over learning without it.
 
 The five of Taylor & Stone, "Transfer Learning for Reinforcement Learning Domains: A Survey", JMLR 10, 2009: jumpstart,
 asymptotic performance, total reward, transfer ratio, time to threshold. Performance is the undiscounted return of an episode
@@ -28,8 +27,7 @@ N_FIRST, N_LAST, WINDOW = 5, 10, 5
 
 
 def initial_return(curves: LearningCurves, n_first: int = N_FIRST) -> np.ndarray:
-    """
-    Compute the mean return of the first episodes of each run: with transfer minus without it is the jumpstart.
+    """Compute the mean return of the first episodes of each run: with transfer minus without it is the jumpstart.
 
     :param n_first: number of episodes; the fewer, the less of learning is in it, and the more of chance
     :return: shape (n_runs,)
@@ -40,8 +38,7 @@ def initial_return(curves: LearningCurves, n_first: int = N_FIRST) -> np.ndarray
 
 
 def asymptotic_return(curves: LearningCurves, n_last: int = N_LAST) -> np.ndarray:
-    """
-    Compute the mean return of the last episodes of each run, each run's own: the asymptote if learning has ended by then.
+    """Compute the mean return of the last episodes of each run, each run's own: the asymptote if learning has ended by then.
 
     :param n_last: number of episodes
     :return: shape (n_runs,)
@@ -53,8 +50,7 @@ def asymptotic_return(curves: LearningCurves, n_last: int = N_LAST) -> np.ndarra
 
 
 def total_reward(curves: LearningCurves, n_episodes: int | None = None) -> np.ndarray:
-    """
-    Compute the reward that each run collects, the area under its returns with every episode of width 1.
+    """Compute the reward that each run collects, the area under its returns with every episode of width 1.
 
     :param n_episodes: count so many episodes; None: as many as the shortest run has
     :return: in units of return, shape (n_runs,)
@@ -65,8 +61,7 @@ def total_reward(curves: LearningCurves, n_episodes: int | None = None) -> np.nd
 
 
 def total_reward_by_steps(curves: LearningCurves, n_steps: int | None = None) -> np.ndarray:
-    """
-    Compute the area under each run's returns over environment steps: every episode is as wide as it has steps.
+    """Compute the area under each run's returns over environment steps: every episode is as wide as it has steps.
 
     To prefer where episodes differ in length, for it compares runs after the same experience. It is not the reward collected
     in so many steps: where each step costs 1, that is the same for all methods.
@@ -108,8 +103,7 @@ def counts_within(n_episodes: int) -> dict[str, int]:
 
 
 def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
-    """
-    Count the episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
+    """Count the episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
 
     :param steps: steps of each episode, or NaN after the last of a run, shape (n_runs, n_episodes)
     """
@@ -131,8 +125,7 @@ def _steps_of(steps: np.ndarray, n_episodes: np.ndarray) -> np.ndarray:
 
 
 class Comparison(NamedTuple):
-    """
-    A measure of runs with transfer against runs without.
+    """A measure of runs with transfer against runs without.
 
     :param with_transfer: the measure of each run with transfer, shape (n_with,); ``without``: likewise, shape (n_without,)
     :param effect: what transfer adds: below 0 if it lowers the measure
@@ -151,8 +144,7 @@ class Comparison(NamedTuple):
 
 
 class TransferMeasures(NamedTuple):
-    """
-    Taylor & Stone's measures of transfer, see :func:`compare_learning`.
+    """Taylor & Stone's measures of transfer, see :func:`compare_learning`.
 
     :param jumpstart: difference of the mean returns at the start, in units of return
     :param asymptotic_performance: difference of the mean returns at the end, in units of return
@@ -188,8 +180,7 @@ def compare_learning(
     n_resamples: int = 2000,
     seed: int = 0,
 ) -> TransferMeasures:
-    """
-    Compute Taylor & Stone's measures of transfer, with 95% bootstrap intervals and p-values.
+    """Compute Taylor & Stone's measures of transfer, with 95% bootstrap intervals and p-values.
 
     Each is with transfer minus without. Areas end where the shortest run of both does, in episodes or in environment steps;
     the asymptotic performance and the time to threshold use all episodes of every run. Effects are differences of means,

@@ -31,8 +31,7 @@ N_POINTS = 200
 
 @dataclass(frozen=True, eq=False)
 class CompareResult:
-    """
-    Learning with several methods of transfer, and without; ``print`` it for the sentence and the table.
+    """Learning with several methods of transfer, and without; ``print`` it for the sentence and the table.
 
     :param curves: for each method its runs, by the order of the seeds
     :param baseline: name of the method that all others are compared with
@@ -64,8 +63,7 @@ class CompareResult:
         return markdown_table(header, [row for method in self.measures for row in self._rows(method)], n_names=2)
 
     def figure(self) -> Figure:
-        """
-        Draw the learning curves: return over environment steps, mean of the runs with 95% bootstrap bands.
+        """Draw the learning curves: return over environment steps, mean of the runs with 95% bootstrap bands.
 
         :return: a figure of its own, which pyplot does not know: save it with ``figure.savefig("curves.png")``
         """

@@ -1,5 +1,4 @@
-"""
-Statistics of several runs: means and bootstrap intervals, differences, effect sizes, tests and their correction.
+"""Statistics of several runs: means and bootstrap intervals, differences, effect sizes, tests and their correction.
 
 Values may be infinite, such as the steps of runs that never reached a threshold.
 """
@@ -38,8 +37,7 @@ class Estimate(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """
-    What one sample of runs has more than another.
+    """What one sample of runs has more than another.
 
     :param value: the difference
     :param low: lower bound of its 95% interval, NaN where there is none; ``high``: upper bound
@@ -51,8 +49,7 @@ class Difference(NamedTuple):
 
 
 class Saving(NamedTuple):
-    """
-    Steps that a method saves over another.
+    """Steps that a method saves over another.
 
     :param steps: difference of the means
     :param low: lower bound of its 95% confidence interval, NaN with fewer than two runs of each; ``high``: upper bound
@@ -78,8 +75,7 @@ def mean_of_runs(samples: np.ndarray) -> Estimate:
 
 
 def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
-    """
-    Compute what transfer saves of the steps of each run, by Welch's t-test: runs are independent, their variances differ.
+    """Compute what transfer saves of the steps of each run, by Welch's t-test: runs are independent, their variances differ.
     """
     without, with_transfer = (np.asarray(steps, dtype=np.float64) for steps in (without, with_transfer))
     steps = float(without.mean() - with_transfer.mean())
@@ -103,8 +99,7 @@ STATISTICS: dict[str, Callable[..., np.ndarray]] = {"mean": np.mean, "median": n
 
 
 def bootstrap_band(samples: np.ndarray, statistic: str = "mean", n_resamples: int = 2000, seed: int = 0) -> Estimate:
-    """
-    Compute a statistic over runs at every point of a curve, with its 95% bootstrap interval (percentiles).
+    """Compute a statistic over runs at every point of a curve, with its 95% bootstrap interval (percentiles).
 
     Whole runs are drawn with replacement; all points share the draws. The interval holds for each point by itself. With few
     runs it is too narrow: of normal samples it contains the true mean in about 84% of cases with 5 runs, 91% with 10.
@@ -134,8 +129,7 @@ def bootstrap_band(samples: np.ndarray, statistic: str = "mean", n_resamples: in
 def bootstrap_difference(
     first: np.ndarray, second: np.ndarray, statistic: str = "mean", n_resamples: int = 2000, seed: int = 0
 ) -> Difference:
-    """
-    Compute the difference of the means, or of another statistic, of two samples of runs, with its 95% bootstrap interval.
+    """Compute the difference of the means, or of another statistic, of two samples of runs, with its 95% bootstrap interval.
 
     With infinite values take ``"median"``: while fewer than half of each sample are infinite, the medians are finite. The
     interval may still end at -inf or inf: the runs do not bound the difference on that side.
@@ -153,8 +147,7 @@ def bootstrap_difference(
 
 
 def bootstrap_relative_difference(first: np.ndarray, second: np.ndarray, n_resamples: int = 2000, seed: int = 0) -> Difference:
-    """
-    Compute (mean of first - mean of second) / mean of second, with its 95% bootstrap interval.
+    """Compute (mean of first - mean of second) / mean of second, with its 95% bootstrap interval.
 
     The parameters are those of :func:`bootstrap_difference`; no value may be below 0.
 
@@ -173,8 +166,7 @@ def bootstrap_relative_difference(first: np.ndarray, second: np.ndarray, n_resam
 
 
 def resampled(samples: tuple[np.ndarray, ...], compute: Any, n_resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """
-    Draw runs with replacement, as many as there are, and compute a statistic of each draw.
+    """Draw runs with replacement, as many as there are, and compute a statistic of each draw.
 
     :param samples: each with one run a row, shape (n_runs, ...)
     :param compute: the statistic of the samples along an axis
@@ -227,16 +219,14 @@ def as_sample(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def cliffs_delta(first: np.ndarray, second: np.ndarray) -> float:
-    """
-    Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993): -1 to 1.
+    """Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993): -1 to 1.
     """
     first, second = as_sample("first", first), as_sample("second", second)
     return float((first[:, None] > second).mean() - (first[:, None] < second).mean())
 
 
 def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "welch", seed: int = 0) -> float:
-    """
-    Compute the two-sided p-value that two samples have the same mean, or the same distribution.
+    """Compute the two-sided p-value that two samples have the same mean, or the same distribution.
 
     :param first: one sample, shape (n,), inf is allowed; ``second``: the other
     :param test: ``"welch"``, Welch's t-test, ``"permutation"``, the permutation test of the difference of means, or
@@ -265,8 +255,7 @@ def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "we
 
 
 def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) -> float:
-    """
-    Compute the share of regroupings of all values whose means differ at least as much as those of the samples.
+    """Compute the share of regroupings of all values whose means differ at least as much as those of the samples.
 
     Random regroupings count the samples' own as one more (Phipson & Smyth, "Permutation p-values should never be zero", 2010).
     """
@@ -287,8 +276,7 @@ def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) ->
 
 
 def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
-    """
-    Correct p-values for their number by Holm's method ("A simple sequentially rejective multiple test procedure", 1979).
+    """Correct p-values for their number by Holm's method ("A simple sequentially rejective multiple test procedure", 1979).
 
     NaN stays NaN and does not count.
     """
@@ -299,8 +287,7 @@ def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
 
 
 def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
-    """
-    Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run.
+    """Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run.
     """
     if min(n_first, n_second) < 2:
         return 1.0

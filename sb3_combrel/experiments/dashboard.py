@@ -29,8 +29,7 @@ SECONDS_TO_DRAW = 20
 
 
 def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TABS)) -> list[Path]:
-    """
-    Start TensorBoard, take screenshots of it, and stop it.
+    """Start TensorBoard, take screenshots of it, and stop it.
 
     :param logs: folder with one folder a run
     :param output: folder for PNG files, one a tab of :data:`TABS`

@@ -102,8 +102,7 @@ def run_demo(
     fresh: bool = False,
     console: Console | None = None,
 ) -> None:
-    """
-    Learn the target task without transfer, with a random mapping, with TIMBREL and with COMBREL, and report the results.
+    """Learn the target task without transfer, with a random mapping, with TIMBREL and with COMBREL, and report the results.
 
     Runs that an earlier call has completed in the same folder are kept; ``fresh`` deletes them first, and nothing else.
 
@@ -188,8 +187,7 @@ def results_frame(results: Sequence[Result]) -> pd.DataFrame:
 
 
 def draw_learning_curves(steps: dict[str, np.ndarray], path: Path, title: str, cap: int) -> None:
-    """
-    Draw the steps of each episode, mean of the runs, with bands of 95% confidence, into a PNG file.
+    """Draw the steps of each episode, mean of the runs, with bands of 95% confidence, into a PNG file.
 
     :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
     :param cap: steps after which an episode was cut off

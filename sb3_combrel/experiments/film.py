@@ -41,8 +41,7 @@ def greedy_episode(model: BaseAlgorithm, env: Any, seed: int | None = None) -> I
 def film(
     model: BaseAlgorithm, env: Any, path: Path, seed: int | None = None, *, every: int = 4, most_steps: int = 400
 ) -> None:
-    """
-    Film one episode, driven without exploring.
+    """Film one episode, driven without exploring.
 
     :param env: an environment with ``render_mode="rgb_array"``; it is left open
     :param path: MP4 file to write
@@ -69,8 +68,7 @@ def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> No
 
 
 def learn(task: str, n_episodes: int | None = None, seed: int = 0, **kwargs: Any) -> FittedRMax:
-    """
-    Learn a task, "torso" or "arm", with the default settings of Fitted R-Max.
+    """Learn a task, "torso" or "arm", with the default settings of Fitted R-Max.
 
     :param n_episodes: how many episodes; None for as many as it takes
     :param kwargs: other arguments of FittedRMax
@@ -84,8 +82,7 @@ def learn(task: str, n_episodes: int | None = None, seed: int = 0, **kwargs: Any
 
 
 def film_strike(model: FittedRMax, env: Any, video: Path, picture: Path) -> int:
-    """
-    Film one episode, played without exploring, until the ball has rolled away; and picture its last moment.
+    """Film one episode, played without exploring, until the ball has rolled away; and picture its last moment.
 
     :param env: a ball-striking environment with ``render_mode="rgb_array"``; it is left open
     :param video: MP4 file to write
@@ -128,8 +125,7 @@ def icub(
     seed: int = 0,
     output: Path = Path("icub_output"),
 ) -> None:
-    """
-    Learn the iCub's ball-striking tasks and film what was learnt.
+    """Learn the iCub's ball-striking tasks and film what was learnt.
 
     :param task: which
     :param look: of the robot

@@ -22,8 +22,7 @@ _MARKED = re.compile(r"(<!-- table: (?P<path>[^,>]+), (?P<number>\d+) -->\n).*?(
 
 
 def main(folder: Path = Path()) -> None:
-    """
-    Copy what results there are, and fill the pages in.
+    """Copy what results there are, and fill the pages in.
 
     :param folder: the repository, with the results in it
     """
@@ -35,8 +34,7 @@ def main(folder: Path = Path()) -> None:
 
 
 def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
-    """
-    Copy the files of a folder that match; none if it does not exist.
+    """Copy the files of a folder that match; none if it does not exist.
 
     :param output: the folder
     :param docs: folder to copy to
@@ -51,8 +49,7 @@ def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
 
 
 def fill_in(page: Path) -> int:
-    """
-    Replace what stands between marks in a page by the tables of files.
+    """Replace what stands between marks in a page by the tables of files.
 
     :param page: a Markdown file; paths in it are relative to its folder
     :return: how many tables were filled in

@@ -1,5 +1,4 @@
-"""
-Execute the tutorials, and write what their cells print and draw into them.
+"""Execute the tutorials, and write what their cells print and draw into them.
 
 A tutorial is a notebook in jupytext's Markdown format: fences of ``python`` and ``bash`` are its cells. What a cell printed
 stands below it between two comments, so that it can be read without running anything; cells save their figures themselves.
@@ -48,8 +47,7 @@ def recorded_outputs(text: str) -> list[str | None]:
 
 
 def execute(file: Path) -> list[str]:
-    """
-    Execute all cells of a tutorial in its folder, in a Python of their own; the file is not changed.
+    """Execute all cells of a tutorial in its folder, in a Python of their own; the file is not changed.
 
     :return: what each cell printed, "" for nothing; what goes to the standard error (progress, warnings) is left out
     :raises nbclient.exceptions.CellExecutionError: if a cell fails; the message has the cell and the traceback
@@ -105,8 +103,7 @@ def with_outputs(text: str, outputs: Sequence[str]) -> str:
 
 
 def tutorials(files: tuple[Path, ...] = (), /) -> None:
-    """
-    Execute tutorials and renew the outputs and figures in them.
+    """Execute tutorials and renew the outputs and figures in them.
 
     :param files: tutorials; all of tutorials/ by default
     """

@@ -95,8 +95,7 @@ class AllActionMappings(ActionMappings):
 
 @dataclass(frozen=True)
 class BalancedActionMappings(ActionMappings):
-    """
-    The functions that use the source actions as equally as possible, in lexicographic order; nothing is stored.
+    """The functions that use the source actions as equally as possible, in lexicographic order; nothing is stored.
 
     For five target and three source actions these are the 90 that use them 2, 2 and 1 times (the paper, Section 5.1;
     all mappings of its Table 2 are of this kind).
@@ -170,8 +169,7 @@ def _balanced_completions(usage: tuple[int, ...], n_target: int) -> int:
 
 
 class ListedActionMappings(ActionMappings):
-    """
-    Action mappings given one by one.
+    """Action mappings given one by one.
 
     :param mappings: one mapping a row, shape (n, n_target_actions)
     :param n_source_actions: number of actions of the source task; None to take the largest one used plus 1

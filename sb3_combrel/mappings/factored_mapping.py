@@ -14,8 +14,7 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, Names, Tas
 
 @dataclass(frozen=True, repr=False)
 class FactoredMapping:
-    """
-    The target's variables divided among copies of the source, each moved by a source action of its own.
+    """The target's variables divided among copies of the source, each moved by a source action of its own.
 
     MountainCar4D is two cars of MountainCar2D: East is Right on (x, vx) and Neutral on (y, vy). Each copy is an
     :class:`InterTaskMapping`: its mapped variables are those of the copy, its actions what each target action does to it.

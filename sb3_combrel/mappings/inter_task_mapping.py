@@ -43,8 +43,7 @@ class MappingNames(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class InterTaskMapping:
-    """
-    A pair (X_S, X_A) of a state and an action mapping, from the target task to the source task (Section 2.2).
+    """A pair (X_S, X_A) of a state and an action mapping, from the target task to the source task (Section 2.2).
 
     All coordinates are unit coordinates (:class:`~sb3_combrel.common.scaling.StateScaling`), so the ranges of the two
     tasks may differ. A target variable that is mapped to None keeps the value of the current target state, and a
@@ -146,8 +145,7 @@ class InterTaskMapping:
         return self.state_index != UNMAPPED
 
     def target_to_source(self, target_units: ArrayLike, n_source_variables: int) -> Floats:
-        """
-        Express target states in the coordinates of the source task.
+        """Express target states in the coordinates of the source task.
 
         A source variable that several target variables map to is their mean; one that none maps to is NaN.
 
@@ -169,8 +167,7 @@ class InterTaskMapping:
         return source
 
     def source_to_target(self, source_units: ArrayLike, target_state: ArrayLike) -> Floats:
-        """
-        Express source states in the coordinates of the target task; start and outcome with the same ``target_state``.
+        """Express source states in the coordinates of the target task; start and outcome with the same ``target_state``.
 
         :param source_units: unit coordinates, shape (..., n_source_variables)
         :param target_state: unit coordinates of the current target state, which unmapped variables keep; shape
@@ -183,8 +180,7 @@ class InterTaskMapping:
         return np.where(self.mapped, np.where(self.state_sign < 0, 1.0 - source, source), current)
 
     def displacement_to_target(self, source_displacements: ArrayLike) -> Floats:
-        """
-        Express changes of the source state (s'_j - s_j of Eq. 2) as changes of the target state, 0 for unmapped variables.
+        """Express changes of the source state (s'_j - s_j of Eq. 2) as changes of the target state, 0 for unmapped variables.
 
         :param source_displacements: differences of unit coordinates, shape (..., n_source_variables)
         :raises ValueError: if the shape does not fit
@@ -203,8 +199,7 @@ class InterTaskMapping:
         return np.flatnonzero(np.array(self.action) == source_action).astype(np.int64)
 
     def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
-        """
-        Check the mapping against the spaces of the two tasks.
+        """Check the mapping against the spaces of the two tasks.
 
         :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
         """
@@ -215,8 +210,7 @@ class InterTaskMapping:
     def with_names(
         self, source_variables: Names, target_variables: Names, source_actions: Names, target_actions: Names
     ) -> InterTaskMapping:
-        """
-        The same mapping with the two tasks' names for ``repr``; entries that were given by name become their numbers.
+        """The same mapping with the two tasks' names for ``repr``; entries that were given by name become their numbers.
 
         :raises ValueError: if there are fewer names than the mapping uses, or it has a name that is none of these
         """

@@ -48,8 +48,7 @@ _FACTORED_SETS = ("factored", "signed_factored")
 
 
 class Candidates(NamedTuple):
-    """
-    The different ways in which the mappings of a set treat one target action; compliance distinguishes no others.
+    """The different ways in which the mappings of a set treat one target action; compliance distinguishes no others.
 
     :param state_index: row of ``MappingSet.state_mappings``, shape (n_candidates,)
     :param source_action: source action that the target action maps to, shape (n_candidates,)
@@ -60,8 +59,7 @@ class Candidates(NamedTuple):
 
 
 class MappingSet:
-    """
-    The set X of inter-task mappings (Section 3): all pairs of a state mapping and an action mapping, or some of them.
+    """The set X of inter-task mappings (Section 3): all pairs of a state mapping and an action mapping, or some of them.
 
     Only the two factors are stored. Without ``pairs``, mapping number i is the pair of state mapping
     ``i // n_action_mappings`` and action mapping ``i % n_action_mappings``; it is built when it is asked for.
@@ -132,8 +130,7 @@ class MappingSet:
 
     @classmethod
     def injective(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
-        """
-        Each source variable is used by exactly one target variable, the other target variables are unmapped.
+        """Each source variable is used by exactly one target variable, the other target variables are unmapped.
 
         If the source task has more variables than the target task, each target variable gets a source variable of its
         own instead. All action mappings: from 2 to 4 variables and 3 to 5 actions 12 x 243. Parameters: :meth:`from_name`.
@@ -142,8 +139,7 @@ class MappingSet:
 
     @classmethod
     def surjective(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
-        """
-        Every target variable is mapped and every source variable is used at least once (as many as there is room for).
+        """Every target variable is mapped and every source variable is used at least once (as many as there is room for).
 
         All action mappings: from 2 to 4 variables and 3 to 5 actions 14 x 243. The translated instances lie on diagonals of
         the target's state space. Parameters: :meth:`from_name`.
@@ -152,8 +148,7 @@ class MappingSet:
 
     @classmethod
     def all(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
-        """
-        Every source variable is used at least once (as many as there is room for), target variables may be unmapped.
+        """Every source variable is used at least once (as many as there is room for), target variables may be unmapped.
 
         It contains the injective and the surjective set. All action mappings: from 2 to 4 variables and 3 to 5 actions
         50 x 243. Parameters: :meth:`from_name`.
@@ -162,8 +157,7 @@ class MappingSet:
 
     @classmethod
     def balanced(cls, *sizes: int, signs: bool = False, **named_sizes: int) -> MappingSet:
-        """
-        The injective state mappings with those action mappings only that use the source actions as equally as possible.
+        """The injective state mappings with those action mappings only that use the source actions as equally as possible.
 
         From 2 to 4 variables and 3 to 5 actions: 12 x 90. Parameters: :meth:`from_name`.
         """
@@ -180,8 +174,7 @@ class MappingSet:
         *,
         signs: bool = False,
     ) -> MappingSet:
-        """
-        One of the sets by its name, as in a YAML file.
+        """One of the sets by its name, as in a YAML file.
 
         :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``
         :param n_source_variables: number of the source's state variables, and so on
@@ -201,8 +194,7 @@ class MappingSet:
 
     @classmethod
     def paper_mountain_car(cls) -> MappingSet:
-        """
-        The factors that the paper names for Mountain Car 2D -> 4D (footnote 6): 4! = 24 state, 90 action mappings.
+        """The factors that the paper names for Mountain Car 2D -> 4D (footnote 6): 4! = 24 state, 90 action mappings.
 
         Each state mapping is a permutation of (x, v, None, None) and leaves two target variables unmapped; they come in pairs
         of equal ones, so 12 differ, those of :meth:`injective`. The action mappings use the source actions 2, 2 and 1 times.
@@ -212,8 +204,7 @@ class MappingSet:
 
     @classmethod
     def paper_icub(cls) -> MappingSet:
-        """
-        The factors of the iCub experiment (Section 5.2), torso -> arm: 24 state mappings x 48 action mappings = 1152.
+        """The factors of the iCub experiment (Section 5.2), torso -> arm: 24 state mappings x 48 action mappings = 1152.
 
         The state mappings are those of :meth:`paper_mountain_car`, with two arm joints unmapped. The 48 are the 6 ways to give
         each source joint two of the four target joints times the 2^3 relative directions: "T1-" always maps to the "+" of its
@@ -224,8 +215,7 @@ class MappingSet:
 
     @classmethod
     def from_list(cls, mappings: Iterable[InterTaskMapping]) -> MappingSet:
-        """
-        Exactly the given mappings, in the given order; they need not be all pairs of their factors.
+        """Exactly the given mappings, in the given order; they need not be all pairs of their factors.
 
         :param mappings: mappings between the same two tasks
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
@@ -296,8 +286,7 @@ class MappingSet:
         return self.actions.source_actions_for(action) if self.pairs is None else np.unique(self._source_actions[:, action])
 
     def candidates(self, action: int) -> Candidates:
-        """
-        The different pairs of a state mapping and the source action that a target action maps to.
+        """The different pairs of a state mapping and the source action that a target action maps to.
 
         All mappings with the same pair translate the same source instances in the same way for this target action, so
         compliance (Eq. 5) need be computed for these pairs only. Of state mappings that are equal only the first is listed.
@@ -313,8 +302,7 @@ class MappingSet:
         return Candidates(different[:, 0].copy(), different[:, 1].copy())
 
     def count(self, state_index: int, action: int, source_action: int) -> int:
-        """
-        Number of mappings of the set with this state mapping (or an equal one) that map ``action`` to ``source_action``.
+        """Number of mappings of the set with this state mapping (or an equal one) that map ``action`` to ``source_action``.
 
         :param state_index: row of ``state_mappings``
         :raises ValueError: if there is no such target action
@@ -326,8 +314,7 @@ class MappingSet:
         return int(equal) * self.actions.count(action, source_action)
 
     def find(self, state_index: int, action: int, source_action: int) -> int:
-        """
-        The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.
+        """The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.
 
         :param state_index: row of ``state_mappings``
         :return: its number, to be used as ``mapping_set[number]``

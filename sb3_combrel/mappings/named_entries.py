@@ -37,8 +37,7 @@ def has_names(entries: Sequence[Any]) -> bool:
 def numbers(
     argument: str, entries: Sequence[Any], target_names: Sequence[str], source_names: Sequence[str], default: Any = None
 ) -> tuple[Any, ...]:
-    """
-    Replace names by the numbers that they stand for.
+    """Replace names by the numbers that they stand for.
 
     :param argument: "state" or "action", for messages
     :param entries: one for each target variable or action, or pairs of one of these and its counterpart

@@ -14,8 +14,7 @@ def resolve(
     mappings: str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[InterTaskMapping | Mapping[str, Any]],
     **sizes: Unpack[TaskSizes],
 ) -> MappingSet:
-    """
-    The set of mappings that a user means, checked against the two tasks.
+    """The set of mappings that a user means, checked against the two tasks.
 
     :param mappings: the name of a set (:meth:`MappingSet.from_name`, or "paper_mountain_car", "paper_icub"), a set, one
         mapping or a sequence of mappings. A mapping may be given as a dict of its arguments, as in a YAML file:
@@ -34,8 +33,7 @@ def resolve(
 
 
 def check_mappings(mappings: Any) -> None:
-    """
-    Check as much of what a user gives as can be checked before the tasks are known.
+    """Check as much of what a user gives as can be checked before the tasks are known.
 
     :param mappings: see :func:`resolve`, or a factored mapping or a dict of its copies
     :raises ValueError: for a set that does not exist, an empty list, or something else than mappings
@@ -45,8 +43,7 @@ def check_mappings(mappings: Any) -> None:
 
 
 def with_numbers(mappings: Any, names: Sequence[MappingNames]) -> Any:
-    """
-    Replace names of variables and actions by their numbers.
+    """Replace names of variables and actions by their numbers.
 
     :param mappings: see :func:`check_mappings`
     :param names: of each source and the target

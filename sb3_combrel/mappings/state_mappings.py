@@ -22,8 +22,7 @@ TWO_VARIABLES_ON_FOUR: Ints = np.array(list(permutations((0, 1, UNMAPPED, UNMAPP
 
 
 def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, allow_none: bool) -> Ints:
-    """
-    Every state mapping that uses as many different source variables as there is room for.
+    """Every state mapping that uses as many different source variables as there is room for.
 
     :param once: whether a source variable is used at most once
     :param allow_none: whether target variables may be left unmapped
@@ -46,8 +45,7 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
 
 
 def copies_of_source(n_source: int, n_target: int) -> Ints:
-    """
-    Every way to make a copy of the source, or of some of its variables, of different target variables.
+    """Every way to make a copy of the source, or of some of its variables, of different target variables.
 
     :return: source variable of each target variable, -1 for those that are not in the copy; one copy a row, those with more
         variables first, shape (n, n_target)
@@ -68,8 +66,7 @@ def copies_of_source(n_source: int, n_target: int) -> Ints:
 
 
 def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
-    """
-    Every state mapping with every choice of signs for its mapped variables.
+    """Every state mapping with every choice of signs for its mapped variables.
 
     :param state_mappings: shape (n, n_target), -1 for None
     :return: the mappings and their signs (+1 or -1), both of shape (m, n_target); each mapping first with +1 throughout

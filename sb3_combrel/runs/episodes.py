@@ -13,8 +13,7 @@ EVALUATION_SEED = 1_000_000
 
 
 class Episodes(NamedTuple):
-    """
-    Episodes that have ended, one entry each.
+    """Episodes that have ended, one entry each.
 
     :param steps: environment steps, int64, shape (n_episodes,)
     :param returns: undiscounted sums of rewards, shape (n_episodes,)
@@ -59,8 +58,7 @@ class EpisodeRecorder(BaseCallback):
 
 
 def play(model: Any, env: gym.Env, n_episodes: int, seed: int, keeps_state: bool) -> Episodes:
-    """
-    Play episodes without exploration.
+    """Play episodes without exploration.
 
     :param model: anything with the ``predict`` of Stable-Baselines3
     :param env: the environment, which has a time limit

@@ -36,8 +36,7 @@ _compiled: set[tuple[str, str]] = set()
 
 @dataclass(frozen=True)
 class Result:
-    """
-    What came of a run. All but ``seconds`` is the same wherever it is carried out.
+    """What came of a run. All but ``seconds`` is the same wherever it is carried out.
 
     :param name: of the run in files; ``group``, ``method`` and ``seed``: of its job
     :param steps: environment steps of each episode that has ended
@@ -66,8 +65,7 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """
-    A run of Fitted R-Max. Kinds of jobs add callbacks and measures, or learn by another algorithm.
+    """A run of Fitted R-Max. Kinds of jobs add callbacks and measures, or learn by another algorithm.
 
     :param group: what the run is compared within, such as a task or a pair of tasks
     :param method: in tables and figures
@@ -164,8 +162,7 @@ def file_name(group: str, method: str, seed: int) -> str:
 
 
 def make_env(task: Task, max_episode_steps: int | None = None, **kwargs: Any) -> Any:
-    """
-    Make an environment; those of this repository are registered if need be.
+    """Make an environment; those of this repository are registered if need be.
 
     :param max_episode_steps: steps after which an episode is cut off, unless a function makes it; None: the task's own
     :param kwargs: further arguments of ``gymnasium.make``
@@ -185,8 +182,7 @@ def make_env(task: Task, max_episode_steps: int | None = None, **kwargs: Any) ->
 
 @contextmanager
 def chosen_on_purpose() -> Iterator[None]:
-    """
-    Suppress the warnings of what an experiment has chosen, which would come once for every run.
+    """Suppress the warnings of what an experiment has chosen, which would come once for every run.
 
     These are a grid of many or few points, a source that misleads, and observations outside the bounds that a task gives.
     """
@@ -198,8 +194,7 @@ def chosen_on_purpose() -> Iterator[None]:
 
 
 def described(value: Any) -> Any:
-    """
-    Return a value as JSON can hold it.
+    """Return a value as JSON can hold it.
 
     Functions by name with what they are called with, transfer methods with their arguments, arrays and source instances by a
     digest, others as their ``repr`` or, where that names a place in memory, by their class.

@@ -1,5 +1,4 @@
-"""
-Whatever has seeds runs here: jobs that have no result yet are carried out, several at a time, on this machine or a cluster.
+"""Whatever has seeds runs here: jobs that have no result yet are carried out, several at a time, on this machine or a cluster.
 
 The workers write nothing. A result comes back to the caller, which writes it to a file of its own as it arrives, so that the
 machines of a cluster need no folder in common, and a call that is stopped is continued by the next.
@@ -56,8 +55,7 @@ class JobError(RuntimeError):
 
 @dataclass(frozen=True)
 class Backend:
-    """
-    Where jobs are carried out.
+    """Where jobs are carried out.
 
     :param name: "loky" for processes of this machine, "ray" or "dask" for a running cluster
     :param n_jobs: processes of this machine at a time; 1 for this process; None: one a core
@@ -69,8 +67,7 @@ class Backend:
     address: str | None = None
 
     def check(self) -> None:
-        """
-        Check that jobs can be carried out here, before anything is prepared.
+        """Check that jobs can be carried out here, before anything is prepared.
 
         :raises ValueError: if an argument is wrong
         :raises ModuleNotFoundError: if the backend is not installed; names the extra to install
@@ -169,8 +166,7 @@ def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None
 
 
 def prepare_folder(output: Path) -> None:
-    """
-    Prepare a folder for results; those that are there are kept.
+    """Prepare a folder for results; those that are there are kept.
 
     :raises ValueError: if it has files that are not results
     """

@@ -32,8 +32,7 @@ _MAX_TILES = 10_000_000
 
 
 class TileCoding:
-    """
-    Overlapping grids over the unit cube; each state lies in one tile of each grid (Sutton and Barto, Section 9.5.4).
+    """Overlapping grids over the unit cube; each state lies in one tile of each grid (Sutton and Barto, Section 9.5.4).
 
     :param n_variables: number of state variables
     :param n_tilings: number of grids, each shifted against the others
@@ -59,8 +58,7 @@ class TileCoding:
         self._first = np.arange(n_tilings) * (n_tiles + 1) ** n_variables
 
     def tiles(self, unit_state: NDArray[np.float64]) -> NDArray[np.int64]:
-        """
-        The tiles in which a state lies, as feature numbers, one for each grid, shape (n_tilings,).
+        """The tiles in which a state lies, as feature numbers, one for each grid, shape (n_tilings,).
 
         :param unit_state: unit coordinates, shape (n_variables,); what is outside the cube counts as its border
         """
@@ -69,8 +67,7 @@ class TileCoding:
 
 
 class QLearning:
-    """
-    Watkins's Q(lambda) on tile-coded states: one-step Q-learning with eligibility traces that a random action cuts.
+    """Watkins's Q(lambda) on tile-coded states: one-step Q-learning with eligibility traces that a random action cuts.
 
     Values begin at ``initial_value``; where rewards are negative, 0 is optimistic and makes the learner explore.
 
@@ -124,8 +121,7 @@ class QLearning:
         self._rng = np.random.default_rng(seed)
 
     def learn(self, total_timesteps: int, callback: Transition | None = None) -> QLearning:
-        """
-        Act and learn. Each call begins with a new episode; the last one may stay unfinished.
+        """Act and learn. Each call begins with a new episode; the last one may stay unfinished.
 
         :param total_timesteps: number of steps in the environment; a float such as 1e5 may be given
         :param callback: called with every transition
@@ -182,8 +178,7 @@ class QLearning:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.int64], Any]:
-        """
-        Actions in SB3's manner: greedy ones, or with ``deterministic=False`` a random one with probability ``epsilon``.
+        """Actions in SB3's manner: greedy ones, or with ``deterministic=False`` a random one with probability ``epsilon``.
 
         :param observation: raw units, shape (n_variables,) or (n_states, n_variables)
         :return: the action or actions, and ``state``, which is ignored like ``episode_start``

@@ -28,8 +28,7 @@ _SEEN: set[Path] = set()
 
 
 def check_source(source: Any) -> None:
-    """
-    Check that a source can be found, without reading or learning it.
+    """Check that a source can be found, without reading or learning it.
 
     :param source: what :func:`find_source` takes, or a list of such
     :raises FileNotFoundError: if there is neither a file nor a task of that name
@@ -43,8 +42,7 @@ def check_source(source: Any) -> None:
 
 
 def find_source(source: Any) -> SourceInstances:
-    """
-    Read source instances from a file, or learn a task for them.
+    """Read source instances from a file, or learn a task for them.
 
     What a recipe has made is kept in a file (see :func:`cache_file`) and read the next time; what is used, and from when, is
     printed. It is learned again if the environment's class or arguments have changed, and, once in a process, with
@@ -92,8 +90,7 @@ def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
 
 
 def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
-    """
-    Instances of a recipe's task, read from its file if they were learned before.
+    """Instances of a recipe's task, read from its file if they were learned before.
 
     Processes that start at the same time each learn the task, with the same seed and so with the same result.
     """
@@ -136,8 +133,7 @@ def _reason(file: Path) -> str:
 
 
 def cache_file(recipe: Mapping[str, Any]) -> Path:
-    """
-    Return the file for the instances of a recipe, in the folder SB3_COMBREL_CACHE (a variable), or ~/.cache/sb3_combrel.
+    """Return the file for the instances of a recipe, in the folder SB3_COMBREL_CACHE (a variable), or ~/.cache/sb3_combrel.
 
     :param recipe: see :func:`find_source`
     """
@@ -148,8 +144,7 @@ def cache_file(recipe: Mapping[str, Any]) -> Path:
 
 
 def fingerprint(env_id: str) -> str:
-    """
-    Return a text that changes with an environment: with its specification and the source files of its class.
+    """Return a text that changes with an environment: with its specification and the source files of its class.
 
     All base classes count, but for Gymnasium's own, and all modules of the same package that these use, such as one of the
     dynamics.

@@ -42,8 +42,7 @@ _ARRAYS = (*_ROW_ARRAYS, "low", "high")
 
 @dataclass(frozen=True, eq=False)
 class SourceInstances:
-    """
-    Instances <s, a, r, s'> of a source task (Section 3), in raw units, and the spaces that they come from.
+    """Instances <s, a, r, s'> of a source task (Section 3), in raw units, and the spaces that they come from.
 
     ::
 
@@ -119,8 +118,7 @@ class SourceInstances:
         deterministic: bool = False,
         bounds: Bounds | None = None,
     ) -> SourceInstances:
-        """
-        Let a behaviour act in the source task and record what happens, from a reset on, through as many episodes as needed.
+        """Let a behaviour act in the source task and record what happens, from a reset on, through as many episodes as needed.
 
         To cover more of the task than one behaviour visits, record more and take a :meth:`subset`, or record with
         :class:`~sb3_combrel.sources.source_recorder.SourceRecorder` while a model learns.
@@ -150,8 +148,7 @@ class SourceInstances:
         method: str = "random",
         **learner: Any,
     ) -> SourceInstances:
-        """
-        Learn the source task with Q-learning and keep a sample of all its experience, as in Section 5.1 of the paper.
+        """Learn the source task with Q-learning and keep a sample of all its experience, as in Section 5.1 of the paper.
 
         :param env: a small task, or its id, e.g. "combrel/MountainCar2D-v0"
         :param n_instances: number of instances to keep
@@ -178,8 +175,7 @@ class SourceInstances:
         method: str = "covering",
         **learner: Any,
     ) -> SourceInstances:
-        """
-        Learn the source task with Fitted R-Max and keep a choice of all its experience, as in Section 5.2 of the paper.
+        """Learn the source task with Fitted R-Max and keep a choice of all its experience, as in Section 5.2 of the paper.
 
         :param env: a task, or its id; ``n_instances``, ``seed``: see :meth:`from_q_learning`
         :param n_episodes: episodes of learning
@@ -201,8 +197,7 @@ class SourceInstances:
         *,
         bounds: Bounds | None = None,
     ) -> SourceInstances:
-        """
-        Take the transitions of a Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
+        """Take the transitions of a Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
 
         :param dataset: a dataset, or the id of one that has been downloaded
         :param n_instances: size of a random sample of them; None for all
@@ -215,8 +210,7 @@ class SourceInstances:
         return source if n_instances is None else source.subset(n_instances, seed=seed)
 
     def to_minari(self, dataset_id: str, **metadata: Any) -> MinariDataset:
-        """
-        Store the instances as a local Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
+        """Store the instances as a local Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
 
         Instances that follow one another become one Minari episode. Names and origin are kept in the metadata.
 
@@ -248,8 +242,7 @@ class SourceInstances:
         )
 
     def subset(self, n_instances: int, method: str = "random", seed: int | None = None) -> SourceInstances:
-        """
-        A choice of the instances, in their order. If any instance is terminal, so is at least one of the choice.
+        """A choice of the instances, in their order. If any instance is terminal, so is at least one of the choice.
 
         :param n_instances: number of instances to choose; all are taken if there are no more
         :param method: "random", or "covering" for instances of each action that lie as far apart as possible
@@ -270,8 +263,7 @@ class SourceInstances:
         return replace(self, **{name: getattr(self, name)[rows] for name in _ROW_ARRAYS}, origin=origin)
 
     def check_spaces(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        """
-        Check that the instances come from a task with these spaces.
+        """Check that the instances come from a task with these spaces.
 
         :raises ValueError: if the numbers of variables or actions differ, or if the bounds of the variables do
         """
@@ -291,8 +283,7 @@ class SourceInstances:
             )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """
-        Write a compressed npz file without pickled objects. The file appears complete or not at all.
+        """Write a compressed npz file without pickled objects. The file appears complete or not at all.
 
         :param path: path of the file; the suffix .npz is added if there is none
         :return: the path written to
@@ -303,8 +294,7 @@ class SourceInstances:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SourceInstances:
-        """
-        Read a file written by :meth:`save`.
+        """Read a file written by :meth:`save`.
 
         :param path: path of the file; the suffix .npz may be left out
         :raises FileNotFoundError: if there is no such file

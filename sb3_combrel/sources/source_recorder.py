@@ -14,8 +14,7 @@ from sb3_combrel.sources.transitions import TransitionLog, Transitions, count_ac
 
 
 class SourceRecorder(BaseCallback):
-    """
-    Callback that records every transition while an SB3 algorithm learns; read them from :meth:`source_instances`.
+    """Callback that records every transition while an SB3 algorithm learns; read them from :meth:`source_instances`.
 
     Under ``VecNormalize`` the original states and rewards are recorded.
 

@@ -30,8 +30,7 @@ def covering_rows(
     rng: np.random.Generator,
     periodic: NDArray[np.bool_] | None = None,
 ) -> Ints:
-    """
-    About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
+    """About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
 
     :param units: where the instances start, unit coordinates, shape (n, n_variables)
     :param actions: shape (n,); ``terminated``: bool, same shape

@@ -49,8 +49,7 @@ LEARNERS: dict[str, Callable[[str | gym.Env[Any, Any], int | None, int, dict[str
 
 
 class TransitionLog:
-    """
-    Transitions in the order in which they came; of too many, a uniform random sample.
+    """Transitions in the order in which they came; of too many, a uniform random sample.
 
     :param max_instances: how many to keep at most (reservoir sampling); None for all
     :param seed: seed of the sample
@@ -67,8 +66,7 @@ class TransitionLog:
         return len(self._rows)
 
     def add(self, state: NDArray[Any], action: int, reward: float, next_state: NDArray[Any], terminated: bool) -> None:
-        """
-        Add a transition, with its action from 0 on and states in raw units, shape (n_variables,), which are not copied.
+        """Add a transition, with its action from 0 on and states in raw units, shape (n_variables,), which are not copied.
 
         :raises ValueError: if a state or the reward is not finite
         """
@@ -87,8 +85,7 @@ class TransitionLog:
     def transitions(
         self, scaling: StateScaling, n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
     ) -> Transitions:
-        """
-        What is in the log; ``ValueError`` if that is nothing.
+        """What is in the log; ``ValueError`` if that is nothing.
 
         :param names: ``state_names``, ``action_names`` and ``periodic``, as far as known
         :param origin: where the transitions came from

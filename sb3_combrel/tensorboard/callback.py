@@ -35,8 +35,7 @@ MAX_POINTS = 500
 
 
 class DashboardCallback(BaseCallback):
-    """
-    Shows in TensorBoard what Fitted R-Max has learned and what was transferred; what is learned is the same without it.
+    """Shows in TensorBoard what Fitted R-Max has learned and what was transferred; what is learned is the same without it.
 
     ``FittedRMax.learn`` adds one where there is a TensorBoard log and none was given; its pictures come at the end, and before
     where they take less than a twentieth of the time. Without such a log it does nothing.

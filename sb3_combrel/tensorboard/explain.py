@@ -25,8 +25,7 @@ def explain(
     variables: Sequence[VariablePair] | None = None,
     at: ArrayLike | None = None,
 ) -> TransferReport:
-    """
-    Say what transfer did in a model that has learned.
+    """Say what transfer did in a model that has learned.
 
     Which mappings, by name; how sure they are, against the next best and against "no change"; where the target's own
     transitions contradicted the source; how many steps rested on it.

@@ -1,5 +1,4 @@
-"""
-Pictures for TensorBoard's images tab, as wide as its cards: RGB arrays, uint8, shape (height, width, 3).
+"""Pictures for TensorBoard's images tab, as wide as its cards: RGB arrays, uint8, shape (height, width, 3).
 
 Importing this imports matplotlib; no display is needed. ``dpi`` makes them larger for files.
 """

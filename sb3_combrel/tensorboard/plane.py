@@ -37,8 +37,7 @@ def check_matplotlib(otherwise: str) -> None:
 
 
 def planes_of(agent: FittedRMaxAgent, variables: Sequence[VariablePair] | None, at: ArrayLike | None) -> list[Plane]:
-    """
-    Find the planes over which pictures are drawn; for the arguments see :func:`~sb3_combrel.tensorboard.explain.explain`.
+    """Find the planes over which pictures are drawn; for the arguments see :func:`~sb3_combrel.tensorboard.explain.explain`.
 
     :raises ValueError: if they do not fit the task
     """
@@ -56,8 +55,7 @@ def plane_through(
     variables: tuple[int, int],
     at: ArrayLike | None = None,
 ) -> Plane:
-    """
-    Find the plane of two variables, twice the same for a line, through the grid points nearest to a state; without margin.
+    """Find the plane of two variables, twice the same for a line, through the grid points nearest to a state; without margin.
 
     :param at: raw units, shape (n_variables,); None for the middle of the state space
     """

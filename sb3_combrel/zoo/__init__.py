@@ -1,5 +1,4 @@
-"""
-RL-Zoo's commands with Fitted R-Max, TIMBREL and COMBREL (needs ``pip install "sb3-combrel[zoo]"``).
+"""RL-Zoo's commands with Fitted R-Max, TIMBREL and COMBREL (needs ``pip install "sb3-combrel[zoo]"``).
 
 ``python -m sb3_combrel.zoo train --algo combrel --env combrel/MountainCar4D-v0 --conf-file zoo_configs/combrel.yml``
 """

@@ -18,8 +18,7 @@ MAX_PAIRS = 2_000_000
 
 
 class ZooFittedRMax(FittedRMax):
-    """
-    :class:`~sb3_combrel.FittedRMax` with arguments that suit a study of RL-Zoo; ``FittedRMax.load`` loads what it saves.
+    """:class:`~sb3_combrel.FittedRMax` with arguments that suit a study of RL-Zoo; ``FittedRMax.load`` loads what it saves.
 
     ``resolution`` may also be "coarser" or "finer": than the one of ``None``, which suits the task and the breadth, by a
     factor of two a variable (if that takes less than about 1.5 GB).

@@ -39,8 +39,7 @@ CHECKS = {"all_plots": with_evaluations, "plot_train": check_window}
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """
-    Run one of RL-Zoo's commands; an error is reported in one sentence, with ``--verbose 2`` as a traceback.
+    """Run one of RL-Zoo's commands; an error is reported in one sentence, with ``--verbose 2`` as a traceback.
 
     :return: exit status: 0, or 1 if something was wrong, or 2 if there is no such command
     """

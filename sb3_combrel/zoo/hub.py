@@ -26,8 +26,7 @@ TAG = "sb3_combrel"
 
 @contextmanager
 def mended() -> Iterator[None]:
-    """
-    Let RL-Zoo's ``push_to_hub`` and ``load_from_hub`` work while it lasts; a ConnectionError if the hub cannot be reached.
+    """Let RL-Zoo's ``push_to_hub`` and ``load_from_hub`` work while it lasts; a ConnectionError if the hub cannot be reached.
 
     RL-Zoo 2.9 takes a function from huggingface_sb3 that version 3 has under another name, and expects exceptions of
     ``requests``, which huggingface_hub no longer uses. Its commands are scripts, which import both by name when they run.

@@ -15,8 +15,7 @@ OF_TRANSFER = "transfer_"
 
 
 def sample_fitted_rmax_params(trial: Trial, *_: Any) -> dict[str, Any]:
-    """
-    Draw arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`; the others are those of the configuration file.
+    """Draw arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`; the others are those of the configuration file.
 
     The grid is drawn relative to the one that suits task and breadth, as one that is right for two variables does not fit into
     memory for six. ``max_value``, ``gamma`` and ``bounds`` belong to the task.

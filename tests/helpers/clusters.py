@@ -20,8 +20,7 @@ SECONDS_TO_START = 120
 
 @contextmanager
 def ray_cluster(n_workers=2):
-    """
-    A head without CPUs, and worker nodes with one CPU each.
+    """A head without CPUs, and worker nodes with one CPU each.
 
     :return: address of the head
     """
@@ -43,8 +42,7 @@ def ray_cluster(n_workers=2):
 
 @contextmanager
 def dask_cluster(n_workers=2, n_threads=1):
-    """
-    A scheduler, and workers with one thread each.
+    """A scheduler, and workers with one thread each.
 
     :return: address of the scheduler
     """

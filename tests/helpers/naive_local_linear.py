@@ -50,8 +50,7 @@ def ridge_regression(weights, states, effects, ridge):
 
 
 class NaiveLocalLinear:
-    """
-    The model of a task, action by action.
+    """The model of a task, action by action.
 
     :param grid: (resolution by variable, margin[, periodic])
     :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``

@@ -55,8 +55,7 @@ BY_RELEVANCE = {
     [("TIMBREL", 3), ("none", 5), ("COMBREL", 5), *(pytest.param(name, 8, marks=pytest.mark.long) for name in BY_RELEVANCE)],
 )
 def test_two_halves_make_the_run_that_was_not_interrupted(name, n_episodes, tmp_path):
-    """
-    But for the planning that a call of ``learn`` begins with, which a small tolerance leaves nothing to do.
+    """But for the planning that a call of ``learn`` begins with, which a small tolerance leaves nothing to do.
 
     Relevance is measured by the transitions of its last renewal, of which there may have been none, not by all so far.
     """

@@ -29,8 +29,7 @@ some_mus = st.floats(0.02, 1.0)
 
 
 def compiled_tables(sample, sources, sets, bandwidths, min_evidence=GUARD, starts=None):
-    """
-    Compiled compliance, shape (n_transitions, n_state_mappings, n_source_actions).
+    """Compiled compliance, shape (n_transitions, n_state_mappings, n_source_actions).
 
     :param starts: start bandwidth of each state mapping, or None for that of ``bandwidths``
     """

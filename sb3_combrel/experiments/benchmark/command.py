@@ -39,8 +39,7 @@ def benchmark(
     backend: Backend = LOCAL,
     console: Console | None = None,
 ) -> list[Path]:
-    """
-    Carry out the runs of some methods on some pairs, unless they were carried out before, and report on them.
+    """Carry out the runs of some methods on some pairs, unless they were carried out before, and report on them.
 
     :param pairs: names of :data:`PAIRS`, files that define ``PAIR``, or "all" for all of the package
     :param methods: names of :data:`METHODS`, "package.module:Name" or "file.py:Name", or "all" for all of the package
@@ -103,8 +102,7 @@ def methods_of(names: Sequence[str]) -> list[Method]:
 def prepare_sources(
     pairs: Sequence[Pair], output: Path, console: Console
 ) -> tuple[dict[str, tuple[SourceInstances, ...]], dict[str, str]]:
-    """
-    Learn the source tasks of pairs, or load what was learned before.
+    """Learn the source tasks of pairs, or load what was learned before.
 
     :return: instances by the name of the pair, () where they could not be learned; and why not, by the name of the pair
     """

@@ -26,8 +26,7 @@ _N_POINTS = 100
 
 
 def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, MethodScores], path: Path) -> list[Path]:
-    """
-    Draw the learning curves of a pair, each method's in a panel beside no transfer's, and the performance of all methods.
+    """Draw the learning curves of a pair, each method's in a panel beside no transfer's, and the performance of all methods.
 
     Curves are interquartile means with 95% bootstrap bands. The marker of a method that differs from no transfer is full.
 

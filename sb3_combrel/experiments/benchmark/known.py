@@ -15,8 +15,7 @@ from sb3_combrel.runs.job import chosen_on_purpose
 
 
 class Errors(NamedTuple):
-    """
-    Mean squared errors of predicted effects on target transitions, over those of "no change".
+    """Mean squared errors of predicted effects on target transitions, over those of "no change".
 
     :param known: of the known mapping
     :param chosen: of the factored mapping of the pair's set that complies best with all the transitions
@@ -29,8 +28,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(pair: Pair, sources: tuple[SourceInstances, ...], transitions: SourceInstances) -> Errors:
-    """
-    Compare the known mapping of a pair with the one that COMBREL chooses.
+    """Compare the known mapping of a pair with the one that COMBREL chooses.
 
     :param sources: instances of its sources
     :param transitions: of its target, in their order

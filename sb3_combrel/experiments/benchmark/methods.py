@@ -43,8 +43,7 @@ class DoesNotFit(ValueError):
 
 @dataclass(frozen=True)
 class Method:
-    """
-    A method of transfer.
+    """A method of transfer.
 
     :param name: on the command line, in tables and in files
     :param description: in the report, with its paper
@@ -81,8 +80,7 @@ def run_as(method: Method, methods: Sequence[Method], pair: Pair) -> str:
 
 
 def the_one(sources: Sources, name: str) -> SourceInstances:
-    """
-    Return the instances of the only source, for the method of a name.
+    """Return the instances of the only source, for the method of a name.
 
     :raises DoesNotFit: if there are several
     """
@@ -216,8 +214,7 @@ _HOW_TO_NAME = 'a method of your own is "package.module:Name" or "path/to/file.p
 
 
 def method_of(text: str) -> Method:
-    """
-    Return the method of a name, or one that a third party defines.
+    """Return the method of a name, or one that a third party defines.
 
     :param text: one of :data:`METHODS`; or "package.module:Name" or "path/to/file.py:Name", where Name is a :class:`Method`, a
         transfer class that is called with the source, or a function of the source and the pair that returns a transfer object

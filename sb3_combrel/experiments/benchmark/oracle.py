@@ -15,8 +15,7 @@ from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
 class KnownCopies(TIMBREL):
-    """
-    TIMBREL with priors from several sources, each through a factored mapping of its own.
+    """TIMBREL with priors from several sources, each through a factored mapping of its own.
 
     :param source: a list of source instances
     :param mapping: one factored mapping for each source; no two have a target variable in common

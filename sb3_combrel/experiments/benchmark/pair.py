@@ -25,8 +25,7 @@ LEARNERS: dict[str, Callable[..., SourceInstances]] = {
 
 
 def recorded(name: str, task: Task, learner: str = "fitted_rmax", n_instances: int = 1000, **arguments: Any) -> Source:
-    """
-    Describe how a source is recorded: learned once for an output folder, with seed 0.
+    """Describe how a source is recorded: learned once for an output folder, with seed 0.
 
     :param name: of its file; sources of the same name must be recorded in the same way
     :param task: the environment, an id or a function that makes it
@@ -48,8 +47,7 @@ def _learn(task: Task, learner: str, n_instances: int, arguments: Mapping[str, A
 
 @dataclass(frozen=True)
 class Pair:
-    """
-    One or several source tasks and a target task. Exactly one of ``n_steps`` and ``n_episodes`` is given.
+    """One or several source tasks and a target task. Exactly one of ``n_steps`` and ``n_episodes`` is given.
 
     Performance is the mean return of an episode of learning: over the episodes if ``n_episodes`` is given, over environment
     steps (an episode counts as often as it has steps) if ``n_steps`` is.
@@ -145,8 +143,7 @@ class Pair:
 
 
 def check_name(name: object) -> None:
-    """
-    Check the name of a pair or a method, which is part of the names of files.
+    """Check the name of a pair or a method, which is part of the names of files.
 
     :raises ValueError: if it has other characters than letters, digits, "-", "_" and "."
     """

@@ -36,8 +36,7 @@ N_JOINTS = 4
 
 
 def moves_like_yaw(joint: int) -> InterTaskMapping:
-    """
-    Map one joint of the arm to the torso's yaw.
+    """Map one joint of the arm to the torso's yaw.
 
     :param joint: of the arm; commands to others leave it where it is, as commands to the torso's pitch leave the yaw
     """

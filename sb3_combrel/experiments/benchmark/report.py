@@ -49,8 +49,7 @@ def write_report(
     command: Sequence[str],
     console: Console,
 ) -> list[Path]:
-    """
-    Make a table (Markdown, CSV) and a picture (PNG, SVG) for each pair, an overview, a CSV of all runs, and the page.
+    """Make a table (Markdown, CSV) and a picture (PNG, SVG) for each pair, an overview, a CSV of all runs, and the page.
 
     :param methods: in the order of tables
     :param seeds: those that count

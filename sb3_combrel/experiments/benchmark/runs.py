@@ -18,8 +18,7 @@ from sb3_combrel.runs.job import Job, Result, TransferLike, chosen_on_purpose
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkRun(Job):
-    """
-    A pair's target that is learnt from nothing with one method and one seed.
+    """A pair's target that is learnt from nothing with one method and one seed.
 
     Its result has in ``more``: "known_share", in which part of the decisions, where something was transferred, the known
     mapping was chosen, None where nobody knows it or the method does not say what it chooses; "mapping_steps", target steps
@@ -53,8 +52,7 @@ class BenchmarkRun(Job):
         return [MappingRecorder()] if self.of_method.finds_mapping else []
 
     def carry_out(self) -> Result:
-        """
-        Learn, if the method fits the pair.
+        """Learn, if the method fits the pair.
 
         :raises RuntimeError: if no episode has ended
         """
@@ -79,8 +77,7 @@ class BenchmarkRun(Job):
 
 
 def has_mapping(transfer: Any) -> bool:
-    """
-    Whether a transfer method has chosen a mapping for any state and action.
+    """Whether a transfer method has chosen a mapping for any state and action.
 
     Where it does not name what it chooses for states of the sample, as methods of this package do, whether it has used one.
     """
@@ -104,8 +101,7 @@ class MappingRecorder(BaseCallback):
 
 
 def known_share(pair: Pair, transfer: Any) -> float | None:
-    """
-    Compute in which part of a method's decisions the known mapping was chosen.
+    """Compute in which part of a method's decisions the known mapping was chosen.
 
     A decision is a use of a candidate, as ``uses`` counts them: with instances a state and action of the agent for which
     instances were transferred, with a prior a transition of the target while a mapping was chosen.
@@ -134,8 +130,7 @@ def _mapping_steps(transfer: Any, result: Result, callbacks: list[BaseCallback])
 def jobs_of(
     pairs: Sequence[Pair], methods: Sequence[Method], seeds: Sequence[int], sources: Mapping[str, tuple[SourceInstances, ...]]
 ) -> list[BenchmarkRun]:
-    """
-    Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once.
+    """Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once.
 
     :param sources: instances of each pair's sources, by name; () where they could not be learned
     """

@@ -39,8 +39,7 @@ _AREAS = ("total_reward", "transfer_ratio")
 
 @dataclass(frozen=True)
 class Cell:
-    """
-    What came of a method in a pair.
+    """What came of a method in a pair.
 
     :param outcomes: of the runs that succeeded, by seed
     :param misfit: why the method does not fit the pair, or ""
@@ -55,8 +54,7 @@ class Cell:
 
 
 class MethodScores(NamedTuple):
-    """
-    A method against no transfer.
+    """A method against no transfer.
 
     :param performance: of each run with the method, shape (n_runs,)
     :param estimate: their interquartile mean, with its bootstrap interval
@@ -93,8 +91,7 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], 
 
 
 def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
-    """
-    Compute the performance of each run: the mean return of an episode, over episodes or over environment steps.
+    """Compute the performance of each run: the mean return of an episode, over episodes or over environment steps.
 
     Over steps, all runs of the pair are compared over as many as the shortest has in episodes that have ended.
 
@@ -176,8 +173,7 @@ def performance_of(scores: Mapping[str, MethodScores]) -> dict[str, np.ndarray]:
 
 
 def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, float]:
-    """
-    Rank the methods of a pair by the interquartile mean of their performance; 1 is the best, equal ones share their ranks.
+    """Rank the methods of a pair by the interquartile mean of their performance; 1 is the best, equal ones share their ranks.
 
     Methods whose runs are the same count as one.
     """
@@ -202,8 +198,7 @@ def mean_ranks(
     n_resamples: int = 2000,
     seed: int = 0,
 ) -> dict[str, MeanRank]:
-    """
-    Average the ranks of each method over pairs, with bootstrap intervals.
+    """Average the ranks of each method over pairs, with bootstrap intervals.
 
     In each draw the runs of every pair and method are drawn with replacement, and ranked anew. A method is ranked in the pairs
     where it has runs, among the methods that have. So that places in pairs with many and with few methods count alike, ranks

@@ -14,8 +14,7 @@ import cloudpickle
 
 
 def load_attribute(argument: str, text: str) -> tuple[Any, str]:
-    """
-    Return what a module or a file defines.
+    """Return what a module or a file defines.
 
     :param argument: name of the argument, for messages
     :param text: "package.module:Name" or "path/to/file.py:Name"

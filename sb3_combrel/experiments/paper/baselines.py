@@ -78,8 +78,7 @@ PREFILLINGS: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], int]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineJob(Job):
-    """
-    One algorithm that learns one task with one seed. The same job has the same result.
+    """One algorithm that learns one task with one seed. The same job has the same result.
 
     ``method`` is one of :data:`ALGORITHMS` and ``env`` a task of :data:`HYPERPARAMETERS`. ``n_steps`` count the steps of the
     prefilling; exploration ends and the learning rate falls relative to them. The result's episodes are those of the
@@ -131,8 +130,7 @@ class BaselineJob(Job):
 def baseline_jobs(
     domain: Domain, setting: str, source: SourceInstances, n_runs: int | None, n_episodes: int
 ) -> list[BaselineJob]:
-    """
-    Make the jobs of all baselines.
+    """Make the jobs of all baselines.
 
     :param setting: name of the setting, whose time limit holds
     :param source: what is transferred to fill the replay buffer
@@ -185,8 +183,7 @@ def prefill(job: BaselineJob) -> tuple[Episodes, Transitions]:
 
 
 def translate(transfer: Transfer, visited: Transitions) -> Transitions:
-    """
-    Translate for each state visited, with each action, the one instance that weighs most there.
+    """Translate for each state visited, with each action, the one instance that weighs most there.
 
     :param transfer: bound to the target, and with what it has observed of it
     :param visited: transitions of the target, raw units; only the states count
@@ -226,8 +223,7 @@ def evaluation_steps(n_steps: int) -> list[int]:
 
 
 class GreedyEvaluator(BaseCallback):
-    """
-    Plays episodes without exploration after some numbers of steps, each time from the same starts: ``evaluations``.
+    """Plays episodes without exploration after some numbers of steps, each time from the same starts: ``evaluations``.
 
     :param at: numbers of steps
     :param env: the environment to play in, with a time limit
@@ -249,8 +245,7 @@ class GreedyEvaluator(BaseCallback):
 
 
 def always_reached_from(evaluations: Sequence[Sequence[float]]) -> float:
-    """
-    Return the steps from which on every episode of every evaluation ended in a terminal state; inf if the last did not.
+    """Return the steps from which on every episode of every evaluation ended in a terminal state; inf if the last did not.
 
     A single evaluation proves little: on the arm one command, repeated for ever, may hit the ball in the end.
     """

@@ -15,8 +15,7 @@ PAPER, EXPLORE, BEST = SETTINGS = ("paper", "explore", "best")
 
 @dataclass(frozen=True)
 class Setting:
-    """
-    How the methods are set in one domain.
+    """How the methods are set in one domain.
 
     :param learner: arguments of :class:`~sb3_combrel.FittedRMax`
     :param max_episode_steps: steps after which an episode is cut off
@@ -41,8 +40,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Domain:
-    """
-    A source task and a target task.
+    """A source task and a target task.
 
     :param name: in file names
     :param title: in figures

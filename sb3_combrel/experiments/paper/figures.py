@@ -41,8 +41,7 @@ _BELOW: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.0, -0.15)}
 
 
 def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
-    """
-    Draw learning curves, one panel beside the other: mean over the runs of the moving average, 95% bootstrap bands.
+    """Draw learning curves, one panel beside the other: mean over the runs of the moving average, 95% bootstrap bands.
 
     :param panels: for each panel's title the steps of each method's runs, shape (n_runs, n_episodes)
     :param path: file to write, without its suffix
@@ -65,8 +64,7 @@ def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, 
 
 
 def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
-    """
-    Draw the environment steps until the median of the last episodes is at most a threshold; median over the runs.
+    """Draw the environment steps until the median of the last episodes is at most a threshold; median over the runs.
 
     A method whose median run never gets there has no point; the band is the bootstrap's 95% interval of the median.
     Parameters: see :func:`draw_curves`.
@@ -98,8 +96,7 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
 def draw_selection(
     panels: Mapping[str, tuple[np.ndarray, np.ndarray, Sequence[str]]], *labels: tuple[str, str], title: str, path: Path
 ) -> list[Path]:
-    """
-    Draw which source action is selected over planes of the state space (Figure 4).
+    """Draw which source action is selected over planes of the state space (Figure 4).
 
     :param panels: for each title the coordinates of points along both variables, shape (n, 2), the place of each point's
         source action in the names, -1 for none, shape (n,), and the names
@@ -118,8 +115,7 @@ def draw_selection(
 
 
 def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) -> list[Path]:
-    """
-    Draw the steps of all episodes against the breadth, mean of the runs with 95% bootstrap intervals.
+    """Draw the steps of all episodes against the breadth, mean of the runs with 95% bootstrap intervals.
 
     :param steps: by method at a breadth the steps of each run's episodes, shape (n_runs, n_episodes)
     """
@@ -139,8 +135,7 @@ def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) 
 
 
 def draw_baselines(results: Mapping[str, Sequence[Result]], methods: Sequence[str], title: str, path: Path) -> list[Path]:
-    """
-    Draw returns against environment steps, on a logarithmic axis.
+    """Draw returns against environment steps, on a logarithmic axis.
 
     Of the baselines the greedy policy, mean of the runs with the range of these; of the methods the episodes of learning,
     exploration included, mean of the runs with 95% bootstrap bands.

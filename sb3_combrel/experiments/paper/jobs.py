@@ -26,8 +26,7 @@ DIAGNOSED_EPISODES = 25
 
 @dataclass(frozen=True, kw_only=True)
 class PaperJob(Job):
-    """
-    A target task that is learnt by one method. In ``more`` its result has
+    """A target task that is learnt by one method. In ``more`` its result has
 
     - ``uses``: how often instances of each candidate were used, the most used first: [target action, source action, state
       mapping, action mapping or "", times]
@@ -124,8 +123,7 @@ def selections_at_sample(transfer: Any) -> dict[str, list[str]]:
 def jobs_of(
     domain: Domain, setting: str, methods: Sequence[str], sources: m.Sources, n_runs: int, n_episodes: int
 ) -> list[PaperJob]:
-    """
-    Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete.
+    """Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete.
 
     :param setting: name of the setting
     :param methods: names of methods that exist there

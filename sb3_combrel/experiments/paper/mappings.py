@@ -19,8 +19,7 @@ _CHUNK = 500
 def most_frequent_mapping(
     uses: Iterable[Sequence[Any]], source_names: Sequence[Sequence[str]], target_names: Sequence[Sequence[str]]
 ) -> InterTaskMapping:
-    """
-    Find the state mapping used most, with the source action to which each target action was mapped most often with it.
+    """Find the state mapping used most, with the source action to which each target action was mapped most often with it.
 
     :param uses: of all runs, at least one: target action, source action, state mapping as text (``target<-source, ...``),
         action mapping, number of times
@@ -49,8 +48,7 @@ def most_frequent_mapping(
 
 
 def best_mappings(source: SourceInstances, target: SourceInstances, mappings: MappingSet) -> list[InterTaskMapping]:
-    """
-    Find for each target action the mapping of a set through which the source predicts the target's effects best.
+    """Find for each target action the mapping of a set through which the source predicts the target's effects best.
 
     A control that no learner could have: it needs the target's transitions beforehand.
 

@@ -56,8 +56,7 @@ N_TARGET_TRANSITIONS = 4000
 
 @dataclass(frozen=True)
 class Sources:
-    """
-    What is needed to make the transfer methods of a domain.
+    """What is needed to make the transfer methods of a domain.
 
     :param own: instances of the domain's source task
     :param unrelated: instances of the other domain's
@@ -103,8 +102,7 @@ def learner_of(method: str, domain: Domain, setting: Setting) -> Mapping[str, An
 
 
 def transfer_of(method: str, domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer | None:
-    """
-    Make the transfer method of a method, not bound to a task; None for no transfer.
+    """Make the transfer method of a method, not bound to a task; None for no transfer.
 
     :param method: one that exists in the domain with the setting
     :param domain: the domain

@@ -25,8 +25,7 @@ EAST = "East"
 def write_report(
     targets: Sequence[Target], setting: str, results: Sequence[Result], output: Path, console: Console
 ) -> list[Path]:
-    """
-    Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs in the folder to one CSV file a domain.
+    """Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs in the folder to one CSV file a domain.
 
     :param results: of all runs that the figures and tables need
     :param console: where to show the tables

@@ -33,8 +33,7 @@ def reproduce(
     backend: Backend = LOCAL,
     console: Console | None = None,
 ) -> list[Path]:
-    """
-    Carry out the runs that a figure or table needs, unless they were carried out before, and make it.
+    """Carry out the runs that a figure or table needs, unless they were carried out before, and make it.
 
     :param target: name of a figure or table, or "all"
     :param setting: "paper", "explore" or "best"

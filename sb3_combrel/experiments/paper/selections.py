@@ -20,8 +20,7 @@ ACTION, SOURCE_ACTION, STATES, MAPPING, ALL = "target action", "source action", 
 
 
 def action_mapping_table(results: Sequence[Result], target_actions: Sequence[str]) -> Table:
-    """
-    Make a table of the action mappings used most, in percent of each target action's uses (the paper's Table 2).
+    """Make a table of the action mappings used most, in percent of each target action's uses (the paper's Table 2).
 
     :param results: of runs in which whole mappings were candidates
     """
@@ -70,8 +69,7 @@ def _shares(counts: pd.DataFrame) -> list[tuple[str, ...]]:
 
 
 def selections_of(results: Sequence[Result], variables: Sequence[str]) -> pd.DataFrame:
-    """
-    Collect the selections of runs that have recorded them: state, raw units, target action, and mapping, as text.
+    """Collect the selections of runs that have recorded them: state, raw units, target action, and mapping, as text.
 
     The mapping is the source action where none is whole.
     """
@@ -84,8 +82,7 @@ def selections_of(results: Sequence[Result], variables: Sequence[str]) -> pd.Dat
 
 
 def thin(selections: pd.DataFrame, n: int) -> pd.DataFrame:
-    """
-    Return one of ``n`` selections of each action.
+    """Return one of ``n`` selections of each action.
 
     In most steps there is one for every action, so one of ``n`` of them all, in their order, could always be of the same.
     """
@@ -96,8 +93,7 @@ def thin(selections: pd.DataFrame, n: int) -> pd.DataFrame:
 
 
 def dependence_table(selections: pd.DataFrame) -> Table:
-    """
-    Test whether the action mapping selected depends on the state (Kruskal & Wallis) and on the target action (chi-square).
+    """Test whether the action mapping selected depends on the state (Kruskal & Wallis) and on the target action (chi-square).
 
     The effect is epsilon squared of the former and Cramer's V of the latter, both from 0, no relation, to 1. Successive steps
     have successive states, so that p-values of all selections are too low; the last columns have one selection in

@@ -1,5 +1,4 @@
-"""
-Tables of what each method takes, uses and gains, of running times (Table 5), of the diagnosis and the baselines.
+"""Tables of what each method takes, uses and gains, of running times (Table 5), of the diagnosis and the baselines.
 
 They are made of results of one domain, or by domain where the table has them all.
 """
@@ -57,8 +56,7 @@ def _median_text(needed: np.ndarray) -> str:
 
 
 def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
-    """
-    Make a table of Taylor & Stone's measures of transfer of each method, of runs with no transfer among them.
+    """Make a table of Taylor & Stone's measures of transfer of each method, of runs with no transfer among them.
 
     Each cell has the effect against no transfer and, in brackets, its p-value by Holm's method over the column.
     """

@@ -18,8 +18,7 @@ CONTROLS = (m.TIMBREL_RANDOM, m.ONE_RANDOM, m.ORACLE, m.UNRELATED, m.NO_TRANSFER
 
 @dataclass(frozen=True)
 class Target:
-    """
-    A figure or table of the paper.
+    """A figure or table of the paper.
 
     :param name: on the command line
     :param title: what it shows

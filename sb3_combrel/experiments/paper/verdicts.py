@@ -19,8 +19,7 @@ PAPERS, CONTROL = "paper", "control"
 
 
 class Claim(NamedTuple):
-    """
-    That one method needs fewer environment steps than another in a domain.
+    """That one method needs fewer environment steps than another in a domain.
 
     :param kind: whose claim it is: "paper": of its Table 6; "control": what must hold besides for the method to be the reason
     """
@@ -64,8 +63,7 @@ CLAIMS: Sequence[Claim] = (
 
 
 class Verdict(NamedTuple):
-    """
-    What the runs say of a claim.
+    """What the runs say of a claim.
 
     :param saved: environment steps of all episodes that the better method saves, as a fraction of the other's; means
     :param low: lower bound of its 95% bootstrap interval; ``high``: upper bound
@@ -95,8 +93,7 @@ class Verdict(NamedTuple):
 
 
 def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verdict]:
-    """
-    Judge all claims of a kind whose methods have been run.
+    """Judge all claims of a kind whose methods have been run.
 
     The steps of all of a run's episodes, the area under its learning curve, are compared. A claim held if the better method
     takes fewer, with a corrected p-value below ``ALPHA``; the opposite if it takes more, with such a p-value.

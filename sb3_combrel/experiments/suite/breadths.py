@@ -87,8 +87,7 @@ def breadths(
     breadths: tuple[float, ...] = BREADTHS,
     workers: int | None = None,
 ) -> None:
-    """
-    Learn both tasks in every setting, and write ``summary.csv`` and ``tables.md``.
+    """Learn both tasks in every setting, and write ``summary.csv`` and ``tables.md``.
 
     :param output: folder for all results; a later call goes on from there
     :param seeds: runs of each setting, with the seeds from 0 on

@@ -32,8 +32,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]*")
 
 
 def variant_of(text: str) -> Variant:
-    """
-    Read a variant from the command line.
+    """Read a variant from the command line.
 
     :param text: ``default``; ``name:key=value,key=value``; or a JSON object ``{"name": ..., key: value, ...}``. Keys are
         arguments of :class:`~sb3_combrel.FittedRMax`, and ``transfer``; values are JSON, or text if they are not.
@@ -81,8 +80,7 @@ def run_suite(
     test: str = "welch",
     console: Console | None = None,
 ) -> None:
-    """
-    Learn each task with each variant and seed, and write ``runs.csv``, ``episodes.csv`` and ``tables.md``.
+    """Learn each task with each variant and seed, and write ``runs.csv``, ``episodes.csv`` and ``tables.md``.
 
     What is complete is not done again; all runs in the folder are in the CSV files, the tables are of these arguments' runs.
 
@@ -137,8 +135,7 @@ def suite(
     test: str = "welch",
     output: Path = Path("suite_output"),
 ) -> None:
-    """
-    Compare settings of Fitted R-Max and transfer methods over tasks.
+    """Compare settings of Fitted R-Max and transfer methods over tasks.
 
     :param tasks: names of tasks, or all
     :param variants: default, name:key=value,key=value, or JSON with a name

@@ -19,8 +19,7 @@ TOLERATED_LOSS = 0.05
 
 
 class Measure(NamedTuple):
-    """
-    A number that describes the learning of a task.
+    """A number that describes the learning of a task.
 
     :param name: its column in tables
     :param of: from the episodes of learning to the number; NaN if there were too few, inf if a limit was never reached
@@ -52,8 +51,7 @@ def mean_return_in(first: int, last: int) -> Measure:
 
 
 def steps_until_always(limit: int) -> Measure:
-    """
-    Measure after how many steps of learning every further episode has at most ``limit`` steps; inf if that is never so.
+    """Measure after how many steps of learning every further episode has at most ``limit`` steps; inf if that is never so.
 
     At least :data:`SHORTEST_TAIL` episodes must be left: a single short one at the end would prove nothing.
     """
@@ -77,8 +75,7 @@ def settled_after(steps: np.ndarray, limit: int) -> float:
 
 
 def failures(episodes: Episodes, failure_return: float | None) -> np.ndarray:
-    """
-    Tell which episodes have failed: those whose return is at most ``failure_return``; None: those that a time limit ended.
+    """Tell which episodes have failed: those whose return is at most ``failure_return``; None: those that a time limit ended.
     """
     return ~episodes.terminated if failure_return is None else episodes.returns <= failure_return
 
@@ -93,8 +90,7 @@ def summary_of_learning(episodes: Episodes, failure_return: float | None) -> dic
 
 
 def summary_of_evaluation(episodes: Episodes, failure_return: float | None, last10_return: float) -> dict[str, float]:
-    """
-    Return what is recorded of evaluation episodes, at least one.
+    """Return what is recorded of evaluation episodes, at least one.
 
     ``as_good`` is 1 if the mean return is at most 5% below that of the last episodes of learning and no episode failed.
     """

@@ -25,8 +25,7 @@ COMMON = {UNTESTED: False, "last10_return": True, "last10_failed": False} | {
 
 
 class Cell(NamedTuple):
-    """
-    One column of the runs of one task and variant.
+    """One column of the runs of one task and variant.
 
     :param values: one for each seed; NaN and inf where a run has no value or never reached a limit
     :param higher_is_better: whether more is better

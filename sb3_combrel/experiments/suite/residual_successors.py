@@ -35,8 +35,7 @@ LAST_EXPONENT = 3.0
 
 
 class MeanSuccessor(Model):
-    """
-    Weighted linear regression on the nearest instances, computed anew at each transition; the mean is the only successor.
+    """Weighted linear regression on the nearest instances, computed anew at each transition; the mean is the only successor.
 
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """

@@ -30,8 +30,7 @@ WITH_STATE, WITHOUT_STATE = "greedy", "stateless"
 
 @dataclass(frozen=True)
 class Variant:
-    """
-    One way to set the learner.
+    """One way to set the learner.
 
     :param name: in tables and file names
     :param learner: arguments of :class:`~sb3_combrel.FittedRMax`; they come before the task's own
@@ -49,8 +48,7 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteRun(Job):
-    """
-    A task learnt with one variant and one seed.
+    """A task learnt with one variant and one seed.
 
     :param task: the task
     :param variant: the variant

@@ -28,8 +28,7 @@ from sb3_combrel.wrappers import AngleObservation
 
 
 class NoisyActions(gym.ActionWrapper):
-    """
-    Replaces an action, now and then, by one drawn uniformly from all actions, with the environment's own generator.
+    """Replaces an action, now and then, by one drawn uniformly from all actions, with the environment's own generator.
 
     :param env: an environment with Discrete actions
     :param probability: of a replacement, in [0, 1]
@@ -60,8 +59,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Task:
-    """
-    A task to learn, and how learning it is measured. Exactly one of ``n_steps`` and ``n_episodes`` is given.
+    """A task to learn, and how learning it is measured. Exactly one of ``n_steps`` and ``n_episodes`` is given.
 
     :param name: in tables and on the command line
     :param make: makes the environment; its seed is that of the run
@@ -90,8 +88,7 @@ class Task:
 
 
 def check_budget(name: str, n_steps: int | None, n_episodes: int | None) -> None:
-    """
-    :raises ValueError: unless exactly one of the numbers is given, at least 1
+    """:raises ValueError: unless exactly one of the numbers is given, at least 1
     """
     if (n_steps is None) == (n_episodes is None):
         raise ValueError(f"{name}: either n_steps or n_episodes must be given, got {n_steps!r} and {n_episodes!r}")

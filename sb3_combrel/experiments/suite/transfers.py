@@ -1,5 +1,4 @@
-"""
-The transfer methods of the suite, by name, and the source from which each transfers.
+"""The transfer methods of the suite, by name, and the source from which each transfers.
 
 ``COMBREL@...`` is COMBREL from a source that misleads: the task's own one changed, see
 :mod:`~sb3_combrel.experiments.tasks.misleading_sources`, or with ``COMBREL@other-domain`` one of another domain.
@@ -57,8 +56,7 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
 
 
 def source_for(name: str, task: Task) -> Source:
-    """
-    Return the source task from which a transfer method transfers to a task: its own; ``COMBREL@other-domain``: another's.
+    """Return the source task from which a transfer method transfers to a task: its own; ``COMBREL@other-domain``: another's.
 
     :raises ValueError: if the task has no source task, or none of another domain is known
     """
@@ -75,8 +73,7 @@ def source_for(name: str, task: Task) -> Source:
 
 
 def check_transfer(name: str, task: Task) -> None:
-    """
-    Check that a task can be learnt with a transfer method.
+    """Check that a task can be learnt with a transfer method.
 
     :raises ValueError: if the name is unknown, the task has no such source task, or the mapping that is asked for is not known
     """

@@ -40,8 +40,7 @@ LONG_LEARNER: dict[str, Any] = {**LEARNER, "bounds": tuple([side[i] for i in ORD
 
 
 def make_cart_pole(half_length: float | None = None, order: Sequence[int] | None = None) -> gym.Env:
-    """
-    Make CartPole-v1, with another pole and its variables in another order if asked for.
+    """Make CartPole-v1, with another pole and its variables in another order if asked for.
 
     :param half_length: half the length of the pole, in metres; None for CartPole-v1's, 0.5
     :param order: for each variable of the observation the index of CartPole-v1's; None for CartPole-v1's own order
@@ -57,8 +56,7 @@ def make_cart_pole(half_length: float | None = None, order: Sequence[int] | None
 
 
 def permuted(env: gym.Env, order: Sequence[int]) -> gym.Env:
-    """
-    Put the variables of an environment's observations, and their bounds, in another order.
+    """Put the variables of an environment's observations, and their bounds, in another order.
 
     :param order: for each variable of the new observation the index of the old one
     :raises ValueError: if ``order`` is no permutation of the variables

@@ -24,8 +24,7 @@ COUPLING = 0.3
 
 
 class CartWithPendulumEnv(gym.Env[np.ndarray, np.int64]):
-    """
-    A cart on a track of two metres that must be near its right end, and a pendulum with a motor that must be up.
+    """A cart on a track of two metres that must be near its right end, and a pendulum with a motor that must be up.
 
     ``parts="both"``: the cart carries the pendulum, and an episode terminates when the cart is at its goal while the pendulum
     is up; ``"cart"`` and ``"pendulum"`` are one of them alone. The reward is -1 a step. Observations, of the parts in this

@@ -14,8 +14,7 @@ from sb3_combrel.experiments.tasks.cart_pole import permuted
 
 
 class RenamedActions(gym.ActionWrapper):
-    """
-    Gives the actions of an environment other numbers.
+    """Gives the actions of an environment other numbers.
 
     :param env: an environment with Discrete actions that are counted from 0
     :param order: for each new action the old one
@@ -35,8 +34,7 @@ class RenamedActions(gym.ActionWrapper):
 
 
 def mirrored(env: gym.Env, variables: Sequence[bool]) -> gym.Env:
-    """
-    Mirror variables of an environment's observations in their ranges: what was lowest is highest.
+    """Mirror variables of an environment's observations in their ranges: what was lowest is highest.
 
     :param variables: whether each variable is mirrored
     :raises ValueError: if their number is another, or one that is mirrored has no finite bounds
@@ -60,8 +58,7 @@ def mirrored(env: gym.Env, variables: Sequence[bool]) -> gym.Env:
 
 
 def disguised(env: gym.Env, order: Sequence[int], signs: Sequence[int], actions: Sequence[int]) -> gym.Env:
-    """
-    Make an environment that is another one, renamed; :func:`disguise` is the mapping back.
+    """Make an environment that is another one, renamed; :func:`disguise` is the mapping back.
 
     :param env: an environment with a Box of shape (n_variables,) and Discrete actions
     :param order: for each new variable the index of the old one

@@ -18,8 +18,7 @@ NO_TRANSFER, RANDOM = "no transfer", "random mapping"
 
 
 def intuitive_mapping() -> list[InterTaskMapping]:
-    """
-    Return the mapping that a person would choose, one for each action of the target.
+    """Return the mapping that a person would choose, one for each action of the target.
 
     With Neutral, West and East the variables of x are mapped, with South and North those of y; the others are left unmapped.
     """
@@ -30,8 +29,7 @@ def intuitive_mapping() -> list[InterTaskMapping]:
 
 
 def factored_mapping(n_axes: int) -> FactoredMapping:
-    """
-    Return the mapping that a person would choose with ``use="prior"``: for each axis a car of the source.
+    """Return the mapping that a person would choose with ``use="prior"``: for each axis a car of the source.
 
     :param n_axes: 2 or 3, of the target
     """

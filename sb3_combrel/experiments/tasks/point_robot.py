@@ -33,8 +33,7 @@ class Box(NamedTuple):
 
 
 def slab(axis: int, low: float, high: float, gap: Sequence[tuple[float, float]]) -> list[Box]:
-    """
-    Make a wall across the unit box from ``low`` to ``high`` along an axis, with a gap.
+    """Make a wall across the unit box from ``low`` to ``high`` along an axis, with a gap.
 
     :param gap: (lower, upper) end of the gap along each of the other axes, in their order
     :return: boxes that together are the wall; a wall ends outside the unit box, so that its faces there are no way past it
@@ -85,8 +84,7 @@ def move(position: np.ndarray, displacement: np.ndarray, walls: Sequence[Box]) -
 
 
 class PointRobotEnv(gym.Env[np.ndarray, np.int64]):
-    """
-    A point that moves in the unit square or cube, around walls, to a goal in the corner opposite to its start.
+    """A point that moves in the unit square or cube, around walls, to a goal in the corner opposite to its start.
 
     Two walls leave it a Z-shaped way. The observation is its position. Action 2i moves it down axis i by :data:`STEP`,
     action 2i + 1 up; walls and the boundary stop it. The reward is -1 a step; the episode terminates in the goal's box.

@@ -24,8 +24,7 @@ _OF_PRIOR = ("source", "mappings", "max_transitions", "transfer_terminals", "use
 
 @dataclass(repr=False, eq=False)
 class COMBREL(MappingTransfer):
-    """
-    COmpliance-aware transfer for Model-Based REinforcement Learning: finds by itself how two tasks correspond.
+    """COmpliance-aware transfer for Model-Based REinforcement Learning: finds by itself how two tasks correspond.
 
     Paper: Fachantidis, Partalas, Taylor & Vlahavas, "Transfer learning with probabilistic mapping selection" (Algorithm 1).
     Each mapping makes a virtual source task. For a state and an action, the mapping with the highest mean compliance with the
@@ -115,8 +114,7 @@ class COMBREL(MappingTransfer):
 
     @classmethod
     def paper(cls, source: SourceLike, mappings: MappingsLike = "injective", **arguments: Any) -> COMBREL:
-        """
-        COMBREL as the paper has it: instances of the mapping that complies best with the transitions of the first episode.
+        """COMBREL as the paper has it: instances of the mapping that complies best with the transitions of the first episode.
 
         :param arguments: others of the class, which come before the paper's
         """
@@ -163,8 +161,7 @@ class COMBREL(MappingTransfer):
         return self._compliance_selector
 
     def chosen_compliance(self, pairs: np.ndarray) -> np.ndarray:
-        """
-        Return the chosen mapping's mean compliance with the nearest transitions (line 19 of Algorithm 1), NaN where none is
+        """Return the chosen mapping's mean compliance with the nearest transitions (line 19 of Algorithm 1), NaN where none is
         chosen.
 
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)

@@ -43,8 +43,7 @@ class Playing:
 
 @dataclass(repr=False, eq=False)
 class MappingExperts(Transfer):
-    """
-    Every mapping gives a policy, and what acts in an episode, one of these or the agent, is chosen by the returns so far.
+    """Every mapping gives a policy, and what acts in an episode, one of these or the agent, is chosen by the returns so far.
 
     Paper: Talvitie & Singh, "An experts algorithm for transfer learning" (IJCAI 2007). An expert is a mapping: a target state
     is seen as one of the source, whose greedy action decides among the target actions that map to it, at random if there are

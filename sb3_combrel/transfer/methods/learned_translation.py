@@ -65,8 +65,7 @@ class Standard(NamedTuple):
 
 @dataclass(repr=False, eq=False)
 class LearnedTranslation(Transfer):
-    """
-    Learns a mapping from random samples of both tasks, once; then all source data are instances in target coordinates.
+    """Learns a mapping from random samples of both tasks, once; then all source data are instances in target coordinates.
 
     The first ``n_random_steps`` transitions of the target, with random actions, are its sample; until then nothing is
     transferred. The source's is drawn from its instances. Then a subclass translates all of these, with their rewards and
@@ -100,8 +99,7 @@ class LearnedTranslation(Transfer):
 
     @abstractmethod
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        """
-        Learn a mapping from samples of both tasks; return all the source's ``instances``, in order, in target coordinates.
+        """Learn a mapping from samples of both tasks; return all the source's ``instances``, in order, in target coordinates.
 
         They are brought into the target's box afterwards.
         """

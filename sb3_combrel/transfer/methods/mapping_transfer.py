@@ -46,8 +46,7 @@ MAX_ACTION_MAPPINGS = 100_000
 
 @dataclass(repr=False, eq=False)
 class MappingTransfer(Transfer):
-    """
-    Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
+    """Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
 
     :param source: source instances, a path to them, or a list of several; or the id of an environment, which is then learned
         by Q-learning (30,000 steps, 1000 instances) when first needed, and kept in a file; or a recipe, ``{"env":
@@ -242,8 +241,7 @@ class MappingTransfer(Transfer):
         return self._source_use.candidates.describe(candidate)
 
     def describe_prior(self) -> str:
-        """
-        Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
+        """Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
 
         Target variables come first, then the source's where these have other names; a ValueError as of :attr:`source_prior`.
         """
@@ -292,8 +290,7 @@ class MappingTransfer(Transfer):
         return self._source_use.statistics()
 
     def report(self) -> TransferReport:
-        """
-        Say what was transferred: which mappings, how sure, what the target contradicted, how many steps rested on it.
+        """Say what was transferred: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
         :return: a report to print, with all its figures as fields
         :raises ValueError: before the first step of learning; NotBoundError, which is one, if no algorithm uses this object

@@ -28,8 +28,7 @@ DEFAULT_RANDOM_STEPS = 100
 
 @dataclass(repr=False, eq=False)
 class MASTER(MappingTransfer):
-    """
-    Modeling Approximate State Transitions by Exploiting Regression: finds a mapping by random actions, then transfers.
+    """Modeling Approximate State Transitions by Exploiting Regression: finds a mapping by random actions, then transfers.
 
     Paper: Taylor, Kuhlmann & Stone, "Autonomous transfer for reinforcement learning" (AAMAS 2008). The first
     ``n_random_steps`` actions in the target are drawn uniformly. The one mapping, of states and actions together, through
@@ -134,8 +133,7 @@ def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
 
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
-    """
-    Find the mapping with the least error, the first of equals: its error, state mapping, and each target action's source
+    """Find the mapping with the least error, the first of equals: its error, state mapping, and each target action's source
     action.
 
     :param errors: shape (n_state_mappings, n_target_actions, n_source_actions)

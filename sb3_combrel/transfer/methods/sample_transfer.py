@@ -135,8 +135,7 @@ class SampleTransfer(MappingTransfer):
         instances.translator = self._make_translator(candidates, self.task, instances.translator.rules.breadth)
 
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
-        """
-        Return the compliance, 0 to 1, of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
+        """Return the compliance, 0 to 1, of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
 
         :param mapping: from the target to the source numbered ``source``
         :raises ValueError: if the set has no such state mapping
@@ -219,8 +218,7 @@ class TaskComplianceSelector(PooledSelector):
 
 
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """
-    Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
+    """Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
 
     A task's, Lambda_X of Eq. 6, is the sum of its transitions' compliances, divided by the number of all transitions.
 
@@ -244,8 +242,7 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
 
 
 def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """
-    Return for each candidate the compliance of all virtual source tasks that have it, added up, shape (n_candidates,).
+    """Return for each candidate the compliance of all virtual source tasks that have it, added up, shape (n_candidates,).
 
     :param sums: see :func:`mean_compliances`; the state mappings of all sources one below the other, their actions numbered on
     """
@@ -268,8 +265,7 @@ def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transition
 def draw_instances(
     candidates: Candidates, compliances: np.ndarray, relevances: np.ndarray, n: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """
-    Draw translated instances for each target action, without replacement.
+    """Draw translated instances for each target action, without replacement.
 
     A candidate in proportion to its compliance, and of it an instance in proportion to its relevance, of those that are left:
     the n largest of log-probabilities with Gumbel noise, which is the same.

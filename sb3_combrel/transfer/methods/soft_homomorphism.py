@@ -29,8 +29,7 @@ MASS, MAX_TERMS = 0.98, 12
 
 @dataclass(repr=False, eq=False)
 class SoftHomomorphism(Transfer):
-    """
-    The source's model, seen through a stochastic mapping of states that is fitted to the target, is the prior of its model.
+    """The source's model, seen through a stochastic mapping of states that is fitted to the target, is the prior of its model.
 
     Paper: Sorg & Singh, "Transfer via soft homomorphisms" (AAMAS 2009). A soft homomorphism maps a target state to a
     distribution over source states, such that the expected model of the source is that of the target.
@@ -216,8 +215,7 @@ class SoftHomomorphism(Transfer):
         return FIRST_RENEWAL if self._n_fits else self._n_observed
 
     def mixture(self) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the stochastic mapping.
+        """Return the stochastic mapping.
 
         :return: probability that each source variable reads each target variable, [:, 0] as it is or [:, 1] mirrored, shape
             (n_copies, 2, n_source_variables, n_target_variables); of source actions, shape (n_copies, n_target_actions,

@@ -25,8 +25,7 @@ Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Readings(NamedTuple):
-    """
-    The deterministic mappings of target to source states that a stochastic mapping is a mixture of.
+    """The deterministic mappings of target to source states that a stochastic mapping is a mixture of.
 
     In each, every source variable reads a target variable of its own, as it is or mirrored, in unit coordinates. Where the
     source has more variables than the target, the others read nothing, and stand at their mean in the source's instances.
@@ -59,8 +58,7 @@ def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
 
 
 def to_source(states: np.ndarray, readings: Readings, mapping: np.ndarray | int, mean: np.ndarray) -> np.ndarray:
-    """
-    Return target states as mappings have them in the source, unit coordinates, shape (n, n_source_variables).
+    """Return target states as mappings have them in the source, unit coordinates, shape (n, n_source_variables).
 
     :param mapping: the number of each state's mapping, shape (n,), or of that of all
     :param mean: of the source's instances, for variables that read nothing
@@ -104,8 +102,7 @@ class FitData(NamedTuple):
 
 
 def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData) -> th.Tensor:
-    """
-    Compute the error of mixtures, to be minimised, shape (n_starts,); differentiable.
+    """Compute the error of mixtures, to be minimised, shape (n_starts,); differentiable.
 
     Of a transition, the sum over variables of sqrt(1 + (error / scale)^2) - 1, so that a few large effects do not decide
     alone. Added is the negative logarithm of the logits' normal prior. Logits have one axis more, the starts, in front.
@@ -167,8 +164,7 @@ def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int,
 
 
 class MixturePredictions:
-    """
-    Predicts pairs of the target by the mean over a mixture.
+    """Predicts pairs of the target by the mean over a mixture.
 
     The effect is the copies' sum; the reward, their mean; an end, the product; the weight of the source's data, the least.
 

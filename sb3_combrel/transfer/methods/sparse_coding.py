@@ -65,8 +65,7 @@ def fit_regression(source: np.ndarray, target: np.ndarray, seed: int) -> Gaussia
 
 @dataclass(repr=False, eq=False)
 class SparseCodingMapping(LearnedTranslation):
-    """
-    Pairs random transitions of both tasks by their sparse codes, and transfers all source data by regression on the pairs.
+    """Pairs random transitions of both tasks by their sparse codes, and transfers all source data by regression on the pairs.
 
     Paper: Ammar, Tuyls, Taylor, Driessens & Weiss, "Reinforcement learning transfer via sparse coding" (AAMAS 2012). Source
     triplets (state, action, next state) are coded over a dictionary with as many atoms as a target triplet has columns; a

@@ -19,8 +19,7 @@ N_RECONSTRUCTIONS = 20
 
 @dataclass(repr=False, eq=False)
 class ThreeWayRBM(LearnedTranslation):
-    """
-    Trains a three-way restricted Boltzmann machine on random transitions of both tasks; it turns source into target data.
+    """Trains a three-way restricted Boltzmann machine on random transitions of both tasks; it turns source into target data.
 
     Paper: Ammar, Mocanu, Taylor, Driessens, Tuyls & Weiss, "Automatically mapped transfer between reinforcement learning tasks
     via three-way restricted Boltzmann machines" (ECML 2013). One layer of units holds a source triplet (state, action, next
@@ -77,8 +76,7 @@ class ThreeWayRBM(LearnedTranslation):
 
 
 class Machine(NamedTuple):
-    """
-    Parameters of a machine with source and target units that are real numbers and hidden units that are 0 or 1.
+    """Parameters of a machine with source and target units that are real numbers and hidden units that are 0 or 1.
 
     The weight of source unit i, hidden unit j and target unit k: sum over factors of ``source[i] * hidden[j] * target[k]``.
     """

@@ -22,8 +22,7 @@ from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 @dataclass(repr=False, eq=False)
 class TIMBREL(MappingTransfer):
-    """
-    Where the target has too few instances, source instances translated by a given mapping are added to the model's.
+    """Where the target has too few instances, source instances translated by a given mapping are added to the model's.
 
     Paper: Taylor, Jong & Stone, "Transferring instances for model-based reinforcement learning" (ECML 2008). The nearest
     translated instances come first, until they and the target's own reach the threshold that makes a state-action pair known;
