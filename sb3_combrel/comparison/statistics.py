@@ -75,8 +75,7 @@ def mean_of_runs(samples: np.ndarray) -> Estimate:
 
 
 def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
-    """Compute what transfer saves of the steps of each run, by Welch's t-test: runs are independent, their variances differ.
-    """
+    """Compute what transfer saves of the steps of each run, by Welch's t-test: runs are independent, their variances differ."""
     without, with_transfer = (np.asarray(steps, dtype=np.float64) for steps in (without, with_transfer))
     steps = float(without.mean() - with_transfer.mean())
     share = steps / float(without.mean())
@@ -219,8 +218,7 @@ def as_sample(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def cliffs_delta(first: np.ndarray, second: np.ndarray) -> float:
-    """Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993): -1 to 1.
-    """
+    """Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993): -1 to 1."""
     first, second = as_sample("first", first), as_sample("second", second)
     return float((first[:, None] > second).mean() - (first[:, None] < second).mean())
 
@@ -287,8 +285,7 @@ def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
 
 
 def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
-    """Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run.
-    """
+    """Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run."""
     if min(n_first, n_second) < 2:
         return 1.0
     # The two extreme groupings are equally far apart if the groups are equally large.

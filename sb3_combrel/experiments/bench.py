@@ -88,8 +88,7 @@ def import_seconds() -> float:
 
 
 def first_use_seconds() -> tuple[float, float]:
-    """Measure the seconds until first steps and prediction in a fresh process, nothing compiled: without transfer, then with.
-    """
+    """Measure the seconds until first steps and prediction in a fresh process, nothing compiled: without transfer, then with."""
     with tempfile.TemporaryDirectory() as empty:
         without, transferring = _printed(_FIRST_USE, NUMBA_CACHE_DIR=empty)
     return float(without), float(transferring)

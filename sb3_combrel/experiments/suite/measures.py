@@ -75,8 +75,7 @@ def settled_after(steps: np.ndarray, limit: int) -> float:
 
 
 def failures(episodes: Episodes, failure_return: float | None) -> np.ndarray:
-    """Tell which episodes have failed: those whose return is at most ``failure_return``; None: those that a time limit ended.
-    """
+    """Tell which episodes have failed: those whose return is at most ``failure_return``; None: those that a time limit ended."""
     return ~episodes.terminated if failure_return is None else episodes.returns <= failure_return
 
 

@@ -88,8 +88,7 @@ class Task:
 
 
 def check_budget(name: str, n_steps: int | None, n_episodes: int | None) -> None:
-    """:raises ValueError: unless exactly one of the numbers is given, at least 1
-    """
+    """:raises ValueError: unless exactly one of the numbers is given, at least 1"""
     if (n_steps is None) == (n_episodes is None):
         raise ValueError(f"{name}: either n_steps or n_episodes must be given, got {n_steps!r} and {n_episodes!r}")
     check_count("n_steps", n_steps, none_allowed=True)
