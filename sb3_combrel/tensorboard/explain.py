@@ -28,7 +28,11 @@ def explain(
     """Say what transfer did in a model that has learned.
 
     Which mappings, by name; how sure they are, against the next best and against "no change"; where the target's own
-    transitions contradicted the source; how many steps rested on it.
+    transitions contradicted the source; how many steps rested on it::
+
+        report = sb3_combrel.explain("car.zip", output="explained")
+        print(report)
+        print(report.mappings[0].target_action, report.mappings[0].compliance)
 
     :param model: the model, or the path of its file
     :param output: a folder for the report, ``report.txt``, the pictures of the dashboard as PNG (V and policy over two state

@@ -1,8 +1,9 @@
 """The adapter for dm_control environments."""
 
+import importlib
+
 import numpy as np
 import pytest
-from dm_control import suite
 from gymnasium.error import ResetNeeded
 from helpers.environments import CAR_4D, replay
 from stable_baselines3.common.env_checker import check_env
@@ -58,4 +59,4 @@ def test_unknown_reset_options_and_continuous_actions_are_errors():
     with pytest.raises(ValueError, match="options of reset must be empty"):
         adapted().reset(options={"start": "fixed"})
     with pytest.raises(ValueError, match="discrete actions"):
-        DmControlEnv(suite.load("cartpole", "balance"))
+        DmControlEnv(importlib.import_module("dm_control.suite").load("cartpole", "balance"))
