@@ -130,12 +130,7 @@ def evaluate(results: Mapping[str, Sequence[Result]], baseline: str, threshold: 
     n_steps = min(int(each.n_steps.min()) for each in curves.values())
     measures = {
         method: compare_learning(
-            each,
-            curves[baseline],
-            threshold=threshold,
-            **counts,
-            window=min(WINDOW, shortest),
-            n_steps=n_steps,
+            each, curves[baseline], threshold=threshold, **counts, window=min(WINDOW, shortest), n_steps=n_steps
         )
         for method, each in curves.items()
         if method != baseline

@@ -29,12 +29,7 @@ SECONDS_TO_DRAW = 20
 
 
 def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TABS)) -> list[Path]:
-    """Start TensorBoard, take screenshots of it, and stop it.
-
-    :param logs: folder with one folder a run
-    :param output: folder for PNG files, one a tab of :data:`TABS`
-    :raises FileNotFoundError: if there is no Chromium
-    """
+    """Start TensorBoard on a folder of runs, take a PNG of each tab of :data:`TABS`, and stop it."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         raise FileNotFoundError("no Chromium is installed (Debian and Ubuntu: apt-get install chromium)")

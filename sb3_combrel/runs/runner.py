@@ -166,10 +166,7 @@ def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None
 
 
 def prepare_folder(output: Path) -> None:
-    """Prepare a folder for results; those that are there are kept.
-
-    :raises ValueError: if it has files that are not results
-    """
+    """Prepare a folder for results; those that are there are kept, other files are a ValueError."""
     if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
         raise ValueError(f"{output} has files that are not results of this command; choose another --output")
     (output / FOLDER).mkdir(parents=True, exist_ok=True)

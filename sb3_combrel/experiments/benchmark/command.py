@@ -102,7 +102,7 @@ def methods_of(names: Sequence[str]) -> list[Method]:
 def prepare_sources(
     pairs: Sequence[Pair], output: Path, console: Console
 ) -> tuple[dict[str, tuple[SourceInstances, ...]], dict[str, str]]:
-    """Learn the source tasks of pairs, or load what was learned before.
+    """Learn or load the sources of pairs: instances, () where they could not be learned, and why not, by the name of the pair.
 
     :return: instances by the name of the pair, () where they could not be learned; and why not, by the name of the pair
     """

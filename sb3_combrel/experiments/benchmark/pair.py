@@ -143,9 +143,6 @@ class Pair:
 
 
 def check_name(name: object) -> None:
-    """Check the name of a pair or a method, which is part of the names of files.
-
-    :raises ValueError: if it has other characters than letters, digits, "-", "_" and "."
-    """
+    """Raise ValueError if the name of a pair or method, part of file names, has other than letters, digits, "-", "_", "."."""
     if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
         raise ValueError(f'name must be of letters, digits, "-", "_" and ".", got {name!r}')
