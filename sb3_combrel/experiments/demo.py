@@ -233,10 +233,8 @@ def _best(runs: Sequence[DemoRun], console: Console) -> DemoRun:
     with console.status("Trying the trained cars ..."):
         steps = [_drive(run) for run in runs]
     best = int(np.argmin(steps))
-    console.print(
-        f"Driven without exploring, the trained {runs[0].method} cars need {', '.join(map(str, steps))} steps; "
-        f"the video shows the one with seed {runs[best].seed}."
-    )
+    needed = f"the trained {runs[0].method} cars need {', '.join(map(str, steps))} steps"
+    console.print(f"Driven without exploring, {needed}; the video shows the one with seed {runs[best].seed}.")
     return runs[best]
 
 

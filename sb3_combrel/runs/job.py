@@ -190,7 +190,7 @@ def chosen_on_purpose() -> Iterator[None]:
 
 
 def described(value: Any) -> Any:
-    """Return as JSON: functions by name and arguments, transfers by arguments, arrays and sources by digest, others by repr."""
+    """Return as JSON: functions by name and arguments, transfers by arguments, arrays by digest, others by repr."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, functools.partial):

@@ -23,7 +23,12 @@ class Errors(NamedTuple):
 
 
 def errors_of(pair: Pair, sources: tuple[SourceInstances, ...], transitions: SourceInstances) -> Errors:
-    """Compare the known mapping of a pair with the one that COMBREL chooses; ValueError if nobody knows a mapping."""
+    """Compare the known mapping of a pair with the one that COMBREL chooses.
+
+    :param sources: instances of its sources
+    :param transitions: of its target, in their order
+    :raises ValueError: if nobody knows a mapping
+    """
     given: Sources = sources[0] if len(sources) == 1 else list(sources)
     try:
         oracle = METHODS["oracle"].make(given, pair)

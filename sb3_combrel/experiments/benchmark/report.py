@@ -78,19 +78,11 @@ def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Met
             continue
         recorded = ([each.more[key] for each in cell.outcomes] for key in ("known_share", "mapping_steps"))
         shares, steps = ([value for value in values if value is not None] for values in recorded)
-        row = (
-            name,
-            str(len(cell.outcomes)),
-            estimate_text(found.estimate),
-            p_text(found.p_value),
-            f"{places[name]:g}",
-            *(_measure_text(pair, found, measure) for measure in MEASURES),
-            f"{np.mean(shares):.0%}" if shares else _EMPTY,
-            f"{np.mean(steps):,.0f}" if steps else _EMPTY,
-            f"{np.mean([each.seconds for each in cell.outcomes]):.1f}",
-            note_of(name, cell),
-        )
-        rows.append(row)
+        performance = estimate_text(found.estimate), p_text(found.p_value), f"{places[name]:g}"
+        measures = (_measure_text(pair, found, measure) for measure in MEASURES)
+        of_mapping = f"{np.mean(shares):.0%}" if shares else _EMPTY, f"{np.mean(steps):,.0f}" if steps else _EMPTY
+        seconds = f"{np.mean([each.seconds for each in cell.outcomes]):.1f}"
+        rows.append((name, str(len(cell.outcomes)), *performance, *measures, *of_mapping, seconds, note_of(name, cell)))
     return Table(f"{pair.name}, {pair.budget}", _HEADER, rows)
 
 

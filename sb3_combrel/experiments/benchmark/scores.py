@@ -66,12 +66,9 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], 
         name = run_as(method, methods, pair)
         of_method = [each for each in own if each.method == name]
         misfits = [each.more["misfit"] for each in of_method if each.more.get("misfit")]
-        cells[method.name] = Cell(
-            tuple(each for each in of_method if each.steps),
-            misfits[0] if misfits else "",
-            {each.seed: each.error for each in of_method if each.error},
-            name,
-        )
+        errors = {each.seed: each.error for each in of_method if each.error}
+        succeeded = tuple(each for each in of_method if each.steps)
+        cells[method.name] = Cell(succeeded, misfits[0] if misfits else "", errors, name)
     return cells
 
 
@@ -109,23 +106,17 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
     found = {}
     for name, its_own in of_runs.items():
         tested = cells[name].run_as if cells[name].run_as in measures else name
-        found[name] = MethodScores(
-            its_own,
-            interquartile(its_own),
-            corrected.get(tested, np.nan),
-            without is not None and bool(its_own.mean() > without.mean()),
-            measures.get(tested),
-            {measure: of_measures[measure].get(tested, np.nan) for measure in MEASURES},
-        )
+        better = without is not None and bool(its_own.mean() > without.mean())
+        p_values = {measure: of_measures[measure].get(tested, np.nan) for measure in MEASURES}
+        tests = corrected.get(tested, np.nan), better, measures.get(tested), p_values
+        found[name] = MethodScores(its_own, interquartile(its_own), *tests)
     return found
 
 
 def interquartile(performance: np.ndarray) -> Estimate:
     """Compute the interquartile mean of runs with its 95% bootstrap interval, NaN with fewer than :data:`FEWEST_RUNS`."""
     found = bootstrap_band(performance, "iqm")
-    if len(performance) >= FEWEST_RUNS:
-        return found
-    return Estimate(found.mean, np.array(np.nan), np.array(np.nan))
+    return found if len(performance) >= FEWEST_RUNS else Estimate(found.mean, np.array(np.nan), np.array(np.nan))
 
 
 def measure_name(pair: Pair, measure: str) -> str:

@@ -43,9 +43,8 @@ def state_mapping_table(results: Sequence[Result]) -> Table:
 
 def _counts(results: Sequence[Result], kind: str, target_actions: Sequence[str]) -> pd.DataFrame:
     """Uses of each mapping, the most used first, by target action and of all actions."""
-    uses = pd.DataFrame(
-        [use for result in results for use in result.more["uses"]], columns=[ACTION, SOURCE_ACTION, STATES, MAPPING, "n"]
-    )
+    rows = [use for result in results for use in result.more["uses"]]
+    uses = pd.DataFrame(rows, columns=[ACTION, SOURCE_ACTION, STATES, MAPPING, "n"])
     # An action mapping as the first letters of its source actions.
     uses[MAPPING] = uses[MAPPING].map(lambda names: "".join(name[:1] for name in names.split(", ")))
     counts = uses.pivot_table("n", kind, ACTION, "sum", fill_value=0).astype(int)

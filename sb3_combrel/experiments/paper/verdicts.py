@@ -107,16 +107,10 @@ def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verd
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
     """Make a table of verdicts."""
     header = ("claim", "domain", "steps saved", "95% interval", "Cliff's delta", "p", "p (Holm)", "p, threshold", "verdict")
-    rows = [
-        (
-            each.claim.text,
-            DOMAINS[each.claim.domain].title,
-            share_text(each.saved),
-            interval_text(each.low, each.high),
-            f"{without_minus_zero(each.delta, 2):+.2f}",
-            *map(p_text, (each.p_value, each.corrected, each.p_threshold)),
-            each.verdict,
-        )
-        for each in verdicts
-    ]
+    rows = []
+    for each in verdicts:
+        claim = each.claim.text, DOMAINS[each.claim.domain].title
+        saved = share_text(each.saved), interval_text(each.low, each.high), f"{without_minus_zero(each.delta, 2):+.2f}"
+        p_values = map(p_text, (each.p_value, each.corrected, each.p_threshold))
+        rows.append((*claim, *saved, *p_values, each.verdict))
     return Table(title, header, rows)
