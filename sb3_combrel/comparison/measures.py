@@ -46,7 +46,7 @@ def asymptotic_return(curves: LearningCurves, n_last: int = N_LAST) -> np.ndarra
 
 
 def total_reward(curves: LearningCurves, n_episodes: int | None = None) -> np.ndarray:
-    """Compute the reward that each run collects, shape (n_runs,): the area under returns, every episode of width 1.
+    """Compute the reward that each run collects, in units of return, (n_runs,): the area with every episode of width 1.
 
     :param n_episodes: count so many episodes; None: as many as the shortest run has
     :raises ValueError: if a run has fewer episodes
@@ -77,6 +77,8 @@ def total_reward_by_steps(curves: LearningCurves, n_steps: int | None = None) ->
 def time_to_threshold(curves: LearningCurves, threshold: float, window: int = WINDOW) -> np.ndarray:
     """Count each run's steps, (n_runs,), until the median return of its last ``window`` episodes is at least ``threshold``.
 
+    A run that never reaches it is right-censored: its time is inf. So runs should last equally long, or well beyond it.
+
     :raises ValueError: if the threshold is not finite, or the window has no episode
     """
     check_finite("threshold", threshold)
@@ -91,7 +93,7 @@ def counts_within(n_episodes: int) -> dict[str, int]:
 
 
 def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
-    """Count the episodes until the median of the last ``window`` steps (NaN after a run) is at most ``threshold``, or inf."""
+    """Count episodes until the median steps of the last ``window`` (NaN after a run) are at most ``threshold``, or inf."""
     if steps.shape[1] < window:
         return np.full(len(steps), np.inf)
     medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, window, axis=1), axis=-1)

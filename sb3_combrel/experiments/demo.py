@@ -106,6 +106,8 @@ def run_demo(
 
     Runs that an earlier call has completed in the same folder are kept; ``fresh`` deletes them first, and nothing else.
 
+    :param model_breadth: breadth of the learner's kernel; None for the learner's own
+    :param workers: processes at a time; None for one a core
     :raises ValueError: if a number is below 1, or the folder has results of other settings or other files
     """
     check_count("seeds", n_seeds)
