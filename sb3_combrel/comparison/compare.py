@@ -96,10 +96,8 @@ def compare(
     check_all_succeeded(results)
     for result in results:
         if not result.steps:
-            raise ValueError(
-                f"steps={steps} is too few: no episode ended in the run of {result.method}, seed {result.seed}; take more, or "
-                "a time limit"
-            )
+            where = f"the run of {result.method}, seed {result.seed}"
+            raise ValueError(f"steps={steps} is too few: no episode ended in {where}; take more, or a time limit")
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(methods)}
     return evaluate(by_method, baseline, threshold)
 
@@ -120,9 +118,8 @@ def check_methods(methods: Any, baseline: Any) -> str:
     if not isinstance(methods, Mapping) or not all(isinstance(name, str) for name in methods):
         raise ValueError(f"methods must be a dict from names to transfer methods, got {methods!r}")
     if len(methods) < 2:
-        raise ValueError(
-            f'methods must have at least two, such as {{"none": None, "COMBREL": COMBREL(source)}}, got {methods!r}'
-        )
+        example = '{"none": None, "COMBREL": COMBREL(source)}'
+        raise ValueError(f"methods must have at least two, such as {example}, got {methods!r}")
     for name, transfer in methods.items():
         if not (transfer is None or isinstance(transfer, Transfer | dict | str)):
             raise ValueError(f"methods must be transfer methods or None for no transfer, got {transfer!r} for {name!r}")
@@ -167,8 +164,6 @@ def task_of(env: Any) -> Task:
             raise ValueError(f"env must be the id of an environment or a function that makes one; there is no {env!r}")
         return spec
     if not callable(env):
-        raise ValueError(
-            f"env must be the id of an environment or a function that makes one, as each run has its own, got {env!r}; "
-            "for example env=lambda: MyEnv()"
-        )
+        wanted = "env must be the id of an environment or a function that makes one, as each run has its own"
+        raise ValueError(f"{wanted}, got {env!r}; for example env=lambda: MyEnv()")
     return env  # type: ignore[no-any-return]

@@ -101,22 +101,14 @@ def episodes_of_all(name: str, n: int | None, curves: LearningCurves) -> int:
 
 
 def returns_over_steps(curves: LearningCurves, at: np.ndarray) -> np.ndarray:
-    """Return, for each run, the return of the episode that was under way after so many environment steps.
-
-    :param at: environment steps, each fewer than the shortest run has, shape (n_points,)
-    :return: shape (n_runs, n_points)
-    """
+    """Return the return of the episode under way after ``at`` steps, fewer than the shortest run has: (n_runs, n_points)."""
     ends = np.cumsum(np.nan_to_num(curves.steps), axis=1)
     rows = zip(curves.returns, ends, curves.n_episodes, strict=True)
     return np.array([returns[np.searchsorted(end[:n], at, side="right")] for returns, end, n in rows])
 
 
 def moving_average(samples: np.ndarray, window: int) -> np.ndarray:
-    """Compute the mean of ``window`` successive episodes, or of all where there are fewer.
-
-    :param samples: one run a row, shape (n_runs, n_episodes)
-    :return: shape (n_runs, n_episodes - window + 1)
-    """
+    """Compute the mean of ``window`` successive episodes, or of all if fewer: shape (n_runs, n_episodes - window + 1)."""
     window = min(window, samples.shape[1])
     return np.lib.stride_tricks.sliding_window_view(samples.astype(np.float64), window, axis=1).mean(axis=-1)
 

@@ -27,10 +27,8 @@ N_FIRST, N_LAST, WINDOW = 5, 10, 5
 
 
 def initial_return(curves: LearningCurves, n_first: int = N_FIRST) -> np.ndarray:
-    """Compute the mean return of the first episodes of each run: with transfer minus without it is the jumpstart.
+    """Compute the mean return of each run's first ``n_first`` episodes, (n_runs,): jumpstart is with minus without transfer.
 
-    :param n_first: number of episodes; the fewer, the less of learning is in it, and the more of chance
-    :return: shape (n_runs,)
     :raises ValueError: if a run has fewer episodes
     """
     n_first = episodes_of_all("n_first", n_first, curves)
@@ -38,10 +36,8 @@ def initial_return(curves: LearningCurves, n_first: int = N_FIRST) -> np.ndarray
 
 
 def asymptotic_return(curves: LearningCurves, n_last: int = N_LAST) -> np.ndarray:
-    """Compute the mean return of the last episodes of each run, each run's own: the asymptote if learning has ended by then.
+    """Compute the mean return of each run's own last ``n_last`` episodes, (n_runs,): the asymptote if learning has ended.
 
-    :param n_last: number of episodes
-    :return: shape (n_runs,)
     :raises ValueError: if a run has fewer episodes
     """
     n_last = episodes_of_all("n_last", n_last, curves)
@@ -50,10 +46,9 @@ def asymptotic_return(curves: LearningCurves, n_last: int = N_LAST) -> np.ndarra
 
 
 def total_reward(curves: LearningCurves, n_episodes: int | None = None) -> np.ndarray:
-    """Compute the reward that each run collects, the area under its returns with every episode of width 1.
+    """Compute the reward that each run collects, in units of return, (n_runs,): the area with every episode of width 1.
 
     :param n_episodes: count so many episodes; None: as many as the shortest run has
-    :return: in units of return, shape (n_runs,)
     :raises ValueError: if a run has fewer episodes
     """
     n_episodes = episodes_of_all("n_episodes", n_episodes, curves)
@@ -80,15 +75,10 @@ def total_reward_by_steps(curves: LearningCurves, n_steps: int | None = None) ->
 
 
 def time_to_threshold(curves: LearningCurves, threshold: float, window: int = WINDOW) -> np.ndarray:
-    """
-    Count the environment steps of each run until the median return of its last ``window`` episodes is at least ``threshold``.
+    """Count each run's steps, (n_runs,), until the median return of its last ``window`` episodes is at least ``threshold``.
 
-    A run that never reaches it is right-censored: its time is inf, and says no more than that it needs longer than the run
-    lasted. So runs should last equally long, or all until well after the threshold.
+    A run that never reaches it is right-censored: its time is inf. So runs should last equally long, or well beyond it.
 
-    :param threshold: a return
-    :param window: number of episodes
-    :return: shape (n_runs,)
     :raises ValueError: if the threshold is not finite, or the window has no episode
     """
     check_finite("threshold", threshold)
@@ -103,10 +93,7 @@ def counts_within(n_episodes: int) -> dict[str, int]:
 
 
 def episodes_to_reach(steps: np.ndarray, threshold: float, window: int) -> np.ndarray:
-    """Count the episodes of each run until the median of its last ``window`` episodes is at most ``threshold``; inf if never.
-
-    :param steps: steps of each episode, or NaN after the last of a run, shape (n_runs, n_episodes)
-    """
+    """Count episodes until the median steps of the last ``window`` (NaN after a run) are at most ``threshold``, or inf."""
     if steps.shape[1] < window:
         return np.full(len(steps), np.inf)
     medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, window, axis=1), axis=-1)

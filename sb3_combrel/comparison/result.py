@@ -91,10 +91,8 @@ class CompareResult:
         figures = f"its mean return over {self.n_steps:,} steps is {with_it:.4g}, that of {self.baseline} {without:.4g}"
         smallest = smallest_p_value(len(measure.with_transfer), len(measure.without), len(self.measures))
         if not smallest < ALPHA:
-            return (
-                f"{method}: too few runs to tell ({figures}); so many runs cannot show a difference, "
-                f"take at least {fewest_runs(len(self.measures))} seeds, better 10."
-            )
+            advice = f"take at least {fewest_runs(len(self.measures))} seeds, better 10."
+            return f"{method}: too few runs to tell ({figures}); so many runs cannot show a difference, {advice}"
         tested = f"{figures} (p = {p_value:.2g})"
         if p_value >= ALPHA:
             return f"{method}: it is not shown that transfer helps or harms: {tested}."
@@ -130,12 +128,7 @@ def evaluate(results: Mapping[str, Sequence[Result]], baseline: str, threshold: 
     n_steps = min(int(each.n_steps.min()) for each in curves.values())
     measures = {
         method: compare_learning(
-            each,
-            curves[baseline],
-            threshold=threshold,
-            **counts,
-            window=min(WINDOW, shortest),
-            n_steps=n_steps,
+            each, curves[baseline], threshold=threshold, **counts, window=min(WINDOW, shortest), n_steps=n_steps
         )
         for method, each in curves.items()
         if method != baseline

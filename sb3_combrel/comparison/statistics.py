@@ -37,31 +37,21 @@ class Estimate(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """What one sample of runs has more than another.
+    """What one sample of runs has more than another."""
 
-    :param value: the difference
-    :param low: lower bound of its 95% interval, NaN where there is none; ``high``: upper bound
-    """
-
-    value: float
-    low: float
+    value: float  # the difference
+    low: float  # lower bound of its 95% interval, NaN where there is none; ``high``: upper bound
     high: float
 
 
 class Saving(NamedTuple):
-    """Steps that a method saves over another.
+    """Steps that a method saves over another."""
 
-    :param steps: difference of the means
-    :param low: lower bound of its 95% confidence interval, NaN with fewer than two runs of each; ``high``: upper bound
-    :param share: the difference as a fraction of the other's mean
-    :param p_value: of Welch's t-test that both need equally many steps
-    """
-
-    steps: float
-    low: float
+    steps: float  # difference of the means
+    low: float  # lower bound of its 95% confidence interval, NaN with fewer than two runs of each; ``high``: upper bound
     high: float
-    share: float
-    p_value: float
+    share: float  # the difference as a fraction of the other's mean
+    p_value: float  # of Welch's t-test that both need equally many steps
 
 
 def mean_of_runs(samples: np.ndarray) -> Estimate:
@@ -75,7 +65,7 @@ def mean_of_runs(samples: np.ndarray) -> Estimate:
 
 
 def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
-    """Compute what transfer saves of the steps of each run, by Welch's t-test: runs are independent, their variances differ."""
+    """Compute what transfer saves of the steps of each run, by Welch's t-test: independent runs, different variances."""
     without, with_transfer = (np.asarray(steps, dtype=np.float64) for steps in (without, with_transfer))
     steps = float(without.mean() - with_transfer.mean())
     share = steps / float(without.mean())
@@ -87,9 +77,7 @@ def saving(without: np.ndarray, with_transfer: np.ndarray) -> Saving:
 
 
 def interquartile_mean(samples: np.ndarray, axis: int = 0) -> np.ndarray:
-    """
-    Compute the mean without the lowest and the highest quarter of the runs, each rounded down; ``axis`` is that of the runs.
-    """
+    """Compute the mean, along the runs' ``axis``, without the lowest and highest quarter of the runs, each rounded down."""
     return stats.trim_mean(np.asarray(samples, dtype=np.float64), 0.25, axis=axis)
 
 
@@ -105,7 +93,6 @@ def bootstrap_band(samples: np.ndarray, statistic: str = "mean", n_resamples: in
 
     :param samples: one run a row, shape (n_runs, n_points) or (n_runs,); inf is allowed
     :param statistic: ``"mean"``, ``"median"`` or ``"iqm"``, the interquartile mean
-    :param n_resamples: number of draws; ``seed``: of them
     :return: the statistic, in the field ``mean``, and the band, each of shape (n_points,) or (); the band is NaN with a single
         run and where the statistic is not finite
     :raises ValueError: if samples have another shape, are empty or have NaN, the statistic is unknown, or draws are too few
@@ -134,8 +121,6 @@ def bootstrap_difference(
     interval may still end at -inf or inf: the runs do not bound the difference on that side.
 
     :param first: one value for each run, shape (n_first,); ``second``: those of the other method, shape (n_second,)
-    :param statistic: ``"mean"``, ``"median"`` or ``"iqm"``
-    :param n_resamples: number of draws from each sample; ``seed``: of them
     :return: first minus second; the interval is NaN with a single run of either, or where the difference is not finite
     :raises ValueError: if a sample has another shape, is empty or has NaN, the statistic is unknown, or draws are too few
     """
@@ -146,11 +131,8 @@ def bootstrap_difference(
 
 
 def bootstrap_relative_difference(first: np.ndarray, second: np.ndarray, n_resamples: int = 2000, seed: int = 0) -> Difference:
-    """Compute (mean of first - mean of second) / mean of second, with its 95% bootstrap interval.
+    """Compute (mean of first - mean of second) / mean of second, none below 0, with its 95% bootstrap interval or NaN.
 
-    The parameters are those of :func:`bootstrap_difference`; no value may be below 0.
-
-    :return: the interval is NaN with a single run of either and where the mean of second is 0
     :raises ValueError: if a sample has another shape, is empty, has NaN or a value below 0, or there are too few draws
     """
     for name, sample in (("first", first), ("second", second)):
@@ -165,12 +147,7 @@ def bootstrap_relative_difference(first: np.ndarray, second: np.ndarray, n_resam
 
 
 def resampled(samples: tuple[np.ndarray, ...], compute: Any, n_resamples: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw runs with replacement, as many as there are, and compute a statistic of each draw.
-
-    :param samples: each with one run a row, shape (n_runs, ...)
-    :param compute: the statistic of the samples along an axis
-    :return: shape (..., n_resamples); of a single run its own statistic
-    """
+    """Draw runs with replacement, samples of shape (n_runs, ...), and compute a statistic of each draw: (..., n_resamples)."""
     if min(map(len, samples)) < 2:
         return np.repeat(np.asarray(compute(*samples, axis=0))[..., None], n_resamples, axis=-1)
     with warnings.catch_warnings():
@@ -218,7 +195,7 @@ def as_sample(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def cliffs_delta(first: np.ndarray, second: np.ndarray) -> float:
-    """Compute how much more often a run of the first sample is above one of the second than below it (Cliff, 1993): -1 to 1."""
+    """Compute how much more often a run of the first sample is above one of the second than below (Cliff, 1993): -1 to 1."""
     first, second = as_sample("first", first), as_sample("second", second)
     return float((first[:, None] > second).mean() - (first[:, None] < second).mean())
 
@@ -229,7 +206,6 @@ def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "we
     :param first: one sample, shape (n,), inf is allowed; ``second``: the other
     :param test: ``"welch"``, Welch's t-test, ``"permutation"``, the permutation test of the difference of means, or
         ``"mann-whitney"``, which is also used where a value is infinite and means do not exist
-    :param seed: of the permutation test, where there are more than :data:`N_PERMUTATIONS` regroupings
     :return: NaN with fewer than two values in one sample, or a NaN in them; 1 if all values are equal
     :raises ValueError: if the test is unknown
     """
@@ -253,10 +229,7 @@ def p_value_of_difference(first: np.ndarray, second: np.ndarray, test: str = "we
 
 
 def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) -> float:
-    """Compute the share of regroupings of all values whose means differ at least as much as those of the samples.
-
-    Random regroupings count the samples' own as one more (Phipson & Smyth, "Permutation p-values should never be zero", 2010).
-    """
+    """Compute the share of regroupings, the own one too (Phipson & Smyth 2010), whose means differ as much or more."""
     together = np.concatenate([first, second])
     mean = together.mean()
     largest = np.abs(together - mean).sum()
@@ -274,10 +247,7 @@ def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) ->
 
 
 def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
-    """Correct p-values for their number by Holm's method ("A simple sequentially rejective multiple test procedure", 1979).
-
-    NaN stays NaN and does not count.
-    """
+    """Correct p-values for their number by Holm's method (1979); NaN stays NaN and does not count."""
     tested = sorted((name for name, p in p_values.items() if not np.isnan(p)), key=lambda name: p_values[name])
     factors = range(len(tested), 0, -1)
     corrected = np.maximum.accumulate([factor * p_values[name] for factor, name in zip(factors, tested, strict=True)])
@@ -285,7 +255,7 @@ def holm(p_values: Mapping[Name, float]) -> dict[Name, float]:
 
 
 def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
-    """Compute the smallest p-value that a permutation test of so many runs can have, after Holm's correction; 1 for one run."""
+    """Compute the smallest p-value of a permutation test of so many runs, after Holm's correction; 1 for one run."""
     if min(n_first, n_second) < 2:
         return 1.0
     # The two extreme groupings are equally far apart if the groups are equally large.
@@ -294,7 +264,5 @@ def smallest_p_value(n_first: int, n_second: int, n_methods: int) -> float:
 
 
 def fewest_runs(n_methods: int) -> int:
-    """
-    Compute how many runs of each method a permutation test needs for a p-value below :data:`ALPHA`, after Holm's correction.
-    """
+    """Compute how many runs of each method a permutation test needs for a p-value below :data:`ALPHA`, after Holm."""
     return next(n for n in itertools.count(2) if smallest_p_value(n, n, n_methods) < ALPHA)

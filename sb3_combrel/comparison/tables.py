@@ -36,7 +36,7 @@ class Table(NamedTuple):
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], n_names: int = 1) -> str:
-    """Return a table in GitHub's Markdown; the first ``n_names`` columns hold names, the others numbers, aligned at the right."""
+    """Return a table in GitHub's Markdown; the first ``n_names`` columns hold names, the others numbers, at the right."""
     lines = [header, ["---"] * n_names + ["---:"] * (len(header) - n_names), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 

@@ -88,7 +88,7 @@ def import_seconds() -> float:
 
 
 def first_use_seconds() -> tuple[float, float]:
-    """Measure the seconds until first steps and prediction in a fresh process, nothing compiled: without transfer, then with."""
+    """Measure the seconds until first steps and prediction in a fresh process, nothing compiled; without, with transfer."""
     with tempfile.TemporaryDirectory() as empty:
         without, transferring = _printed(_FIRST_USE, NUMBA_CACHE_DIR=empty)
     return float(without), float(transferring)
@@ -128,10 +128,7 @@ def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, flo
 
 
 def compare(n_pairs: int, fraction: float) -> None:
-    """Print what COMBREL adds to the mean time of a step with each kernel, in pairs of runs with the same seed.
-
-    Both runs of a pair are carried out at the same time, so that other load slows both.
-    """
+    """Print what COMBREL adds to the mean time of a step with each kernel, in pairs of runs at the same time and seed."""
     for number, case in enumerate(CASES):
         if not case.transfers:
             continue

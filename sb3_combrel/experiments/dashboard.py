@@ -29,12 +29,7 @@ SECONDS_TO_DRAW = 20
 
 
 def take_screenshots(logs: Path, output: Path, tabs: tuple[str, ...] = tuple(TABS)) -> list[Path]:
-    """Start TensorBoard, take screenshots of it, and stop it.
-
-    :param logs: folder with one folder a run
-    :param output: folder for PNG files, one a tab of :data:`TABS`
-    :raises FileNotFoundError: if there is no Chromium
-    """
+    """Start TensorBoard on a folder of runs, take a PNG of each tab of :data:`TABS`, and stop it."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         raise FileNotFoundError("no Chromium is installed (Debian and Ubuntu: apt-get install chromium)")
@@ -75,9 +70,9 @@ def _wait_for(url: str, server: subprocess.Popen[bytes]) -> None:
 
 def _photograph(browser: str, address: str, path: Path, size: tuple[int, int]) -> Path:
     command = [browser, "--headless", "--disable-gpu", "--hide-scrollbars", f"--window-size={size[0]},{size[1]}"]
-    command.append("--force-device-scale-factor=1.5")
     # Chromium's sandbox does not work for root, as in a container.
-    command += ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
+    as_root = hasattr(os, "geteuid") and os.geteuid() == 0
+    command += ["--force-device-scale-factor=1.5", *(["--no-sandbox"] if as_root else [])]
     with tempfile.TemporaryDirectory() as profile:
         command += [f"--user-data-dir={profile}", f"--virtual-time-budget={1000 * SECONDS_TO_DRAW}", f"--screenshot={path}"]
         subprocess.run([*command, address], check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, timeout=300)

@@ -126,18 +126,9 @@ def run_demo(
     prepare_folder(output)
     source = load_or_learn(output / SOURCE, mountain_car.learn_source, console)
     learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
+    task: dict[str, Any] = {"env": mountain_car.TARGET_ID, "n_episodes": n_episodes, "max_episode_steps": max_episode_steps}
     runs = [
-        DemoRun(
-            group="",
-            method=method,
-            seed=seed,
-            env=mountain_car.TARGET_ID,
-            n_episodes=n_episodes,
-            max_episode_steps=max_episode_steps,
-            learner=learner,
-            transfer=transfer,
-            folder=output,
-        )
+        DemoRun(group="", method=method, seed=seed, learner=learner, transfer=transfer, folder=output, **task)
         for seed in range(n_seeds)
         for method, transfer in mountain_car.methods(source).items()
     ]
@@ -170,28 +161,16 @@ def _report(results: Sequence[Result], cap: int, output: Path, console: Console)
 
 def results_frame(results: Sequence[Result]) -> pd.DataFrame:
     """Return a row for each episode of each run."""
-    frames = [
-        pd.DataFrame(
-            {
-                "method": result.method,
-                "seed": result.seed,
-                "episode": range(1, len(result.steps) + 1),
-                "steps": result.steps,
-                "reached_goal": np.array(result.terminated, dtype=int),
-                "seconds": [f"{seconds:.2f}" for seconds in result.more["wall_seconds"]],
-            }
-        )
-        for result in results
-    ]
+    frames = []
+    for result in results:
+        columns = {"method": result.method, "seed": result.seed, "episode": range(1, len(result.steps) + 1)}
+        reached, seconds = np.array(result.terminated, dtype=int), [f"{each:.2f}" for each in result.more["wall_seconds"]]
+        frames.append(pd.DataFrame({**columns, "steps": result.steps, "reached_goal": reached, "seconds": seconds}))
     return pd.concat(frames)
 
 
 def draw_learning_curves(steps: dict[str, np.ndarray], path: Path, title: str, cap: int) -> None:
-    """Draw the steps of each episode, mean of the runs, with bands of 95% confidence, into a PNG file.
-
-    :param steps: for each method the steps of each run's episodes, shape (n_runs, n_episodes)
-    :param cap: steps after which an episode was cut off
-    """
+    """Draw each method's steps, shape (n_runs, n_episodes), as means with bands of 95% confidence, into a PNG file."""
     figure = figure_of(7.0, 4.2)
     axes = figure.add_subplot()
     highest = 0.0
@@ -214,9 +193,7 @@ def draw_learning_curves(steps: dict[str, np.ndarray], path: Path, title: str, c
 
 
 def episodes_table(steps: dict[str, np.ndarray]) -> Table:
-    """
-    Make a table of the steps of each episode and of all, mean of the runs and half the width of its 95% confidence interval.
-    """
+    """Make a table of the steps of each episode and of all: mean of the runs, half of its 95% confidence interval."""
     n_runs, n_episodes = next(iter(steps.values())).shape
     columns = [
         [_mean_and_half(samples[:, episode]) for episode in range(n_episodes)] + [_mean_and_half(samples.sum(axis=1))]
@@ -258,10 +235,8 @@ def _best(runs: Sequence[DemoRun], console: Console) -> DemoRun:
     with console.status("Trying the trained cars ..."):
         steps = [_drive(run) for run in runs]
     best = int(np.argmin(steps))
-    console.print(
-        f"Driven without exploring, the trained {runs[0].method} cars need {', '.join(map(str, steps))} steps; "
-        f"the video shows the one with seed {runs[best].seed}."
-    )
+    needed = f"the trained {runs[0].method} cars need {', '.join(map(str, steps))} steps"
+    console.print(f"Driven without exploring, {needed}; the video shows the one with seed {runs[best].seed}.")
     return runs[best]
 
 
@@ -290,16 +265,10 @@ def load_car(path: Path) -> FittedRMax:
 
 
 def _epilogue(output: Path, n_seeds: int, console: Console) -> None:
-    what = {
-        FIGURE: "steps to goal, episode by episode",
-        TABLES: "the tables above",
-        RESULTS: "every episode of every run",
-        VIDEO: "the trained car",
-        MODEL: "the trained model: FittedRMax.load",
-        SOURCE: "the source instances: SourceInstances.load",
-        FOLDER: "result and model of each run",
-        TENSORBOARD: "logs of each run",
-    }
+    what = {FIGURE: "steps to goal, episode by episode", TABLES: "the tables above", RESULTS: "every episode of every run"}
+    what |= {VIDEO: "the trained car", MODEL: "the trained model: FittedRMax.load"}
+    what |= {SOURCE: "the source instances: SourceInstances.load", FOLDER: "result and model of each run"}
+    what |= {TENSORBOARD: "logs of each run"}
     console.print(f"\nEverything is in {output.resolve()}:", highlight=False, soft_wrap=True)
     for name, meaning in what.items():
         if (output / name).exists():

@@ -41,14 +41,7 @@ def greedy_episode(model: BaseAlgorithm, env: Any, seed: int | None = None) -> I
 def film(
     model: BaseAlgorithm, env: Any, path: Path, seed: int | None = None, *, every: int = 4, most_steps: int = 400
 ) -> None:
-    """Film one episode, driven without exploring.
-
-    :param env: an environment with ``render_mode="rgb_array"``; it is left open
-    :param path: MP4 file to write
-    :param every: steps between two frames, as software rendering is slow
-    :param most_steps: steps after which the film ends if the episode does not
-    :raises combrel_envs.RenderingError: if OpenGL is missing
-    """
+    """Film one episode of an "rgb_array" environment, a frame ``every`` so many steps, driven without exploring."""
     frames = []
     for step, over in greedy_episode(model, env, seed):
         if over or step % every == 1:
@@ -68,11 +61,7 @@ def write_video(frames: list[Any], path: Path, fps: int = FRAMES_A_SECOND) -> No
 
 
 def learn(task: str, n_episodes: int | None = None, seed: int = 0, **kwargs: Any) -> FittedRMax:
-    """Learn a task, "torso" or "arm", with the default settings of Fitted R-Max.
-
-    :param n_episodes: how many episodes; None for as many as it takes
-    :param kwargs: other arguments of FittedRMax
-    """
+    """Learn a task, "torso" or "arm", with Fitted R-Max's default settings; as many episodes as it takes if None."""
     import combrel_envs  # noqa: F401 - registers the tasks
 
     model = FittedRMax(TASK_IDS[task], **({"max_value": MAX_VALUE, "seed": seed} | kwargs))
@@ -82,14 +71,7 @@ def learn(task: str, n_episodes: int | None = None, seed: int = 0, **kwargs: Any
 
 
 def film_strike(model: FittedRMax, env: Any, video: Path, picture: Path) -> int:
-    """Film one episode, played without exploring, until the ball has rolled away; and picture its last moment.
-
-    :param env: a ball-striking environment with ``render_mode="rgb_array"``; it is left open
-    :param video: MP4 file to write
-    :param picture: PNG file to write: the robot at the end of the episode, hitting the ball if it does
-    :return: number of commands of the episode
-    :raises combrel_envs.RenderingError: if OpenGL is missing
-    """
+    """Film an episode, played without exploring, until the ball has rolled away; picture its end; return its length."""
     from PIL import Image
 
     frames = [env.render() for _ in greedy_episode(model, env)]

@@ -34,13 +34,7 @@ def main(folder: Path = Path()) -> None:
 
 
 def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
-    """Copy the files of a folder that match; none if it does not exist.
-
-    :param output: the folder
-    :param docs: folder to copy to
-    :param patterns: of their names
-    :return: the copies
-    """
+    """Copy the files of a folder that match patterns, none if it does not exist; return the copies."""
     made = []
     for file in sorted(file for pattern in patterns for file in output.glob(pattern)):
         docs.mkdir(parents=True, exist_ok=True)
@@ -49,12 +43,7 @@ def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
 
 
 def fill_in(page: Path) -> int:
-    """Replace what stands between marks in a page by the tables of files.
-
-    :param page: a Markdown file; paths in it are relative to its folder
-    :return: how many tables were filled in
-    :raises ValueError: if a file has no such table
-    """
+    """Replace what stands between marks in a page by the tables of files, paths relative to it; return how many."""
 
     def table_of(match: re.Match[str]) -> str:
         tables = tables_in((page.parent / match["path"]).read_text())

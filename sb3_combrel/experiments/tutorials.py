@@ -47,12 +47,7 @@ def recorded_outputs(text: str) -> list[str | None]:
 
 
 def execute(file: Path) -> list[str]:
-    """Execute all cells of a tutorial in its folder, in a Python of their own; the file is not changed.
-
-    :return: what each cell printed, "" for nothing; what goes to the standard error (progress, warnings) is left out
-    :raises nbclient.exceptions.CellExecutionError: if a cell fails; the message has the cell and the traceback
-    :raises ValueError: if jupytext finds other cells in the file than this module does
-    """
+    """Execute all cells of a tutorial in its folder and a Python of its own; return what each printed on standard output."""
     import jupytext
     from nbclient import NotebookClient
 

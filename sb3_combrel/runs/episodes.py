@@ -13,16 +13,11 @@ EVALUATION_SEED = 1_000_000
 
 
 class Episodes(NamedTuple):
-    """Episodes that have ended, one entry each.
+    """Episodes that have ended, one entry each."""
 
-    :param steps: environment steps, int64, shape (n_episodes,)
-    :param returns: undiscounted sums of rewards, shape (n_episodes,)
-    :param terminated: bool, whether a terminal state ended it; False for a time limit, shape (n_episodes,)
-    """
-
-    steps: np.ndarray
-    returns: np.ndarray
-    terminated: np.ndarray
+    steps: np.ndarray  # environment steps, int64, shape (n_episodes,)
+    returns: np.ndarray  # undiscounted sums of rewards, shape (n_episodes,)
+    terminated: np.ndarray  # bool, whether a terminal state ended it; False for a time limit, shape (n_episodes,)
 
     @classmethod
     def from_rows(cls, rows: list[tuple[int, float, bool]]) -> Episodes:
@@ -58,13 +53,7 @@ class EpisodeRecorder(BaseCallback):
 
 
 def play(model: Any, env: gym.Env, n_episodes: int, seed: int, keeps_state: bool) -> Episodes:
-    """Play episodes without exploration.
-
-    :param model: anything with the ``predict`` of Stable-Baselines3
-    :param env: the environment, which has a time limit
-    :param seed: seed of the environment, at the first reset
-    :param keeps_state: whether the state that ``predict`` returns is handed to its next call
-    """
+    """Play episodes without exploration; with ``keeps_state``, ``predict`` gets the state that it returned before."""
     rows, state = [], None
     for episode in range(n_episodes):
         observation, _ = env.reset(seed=seed if episode == 0 else None)

@@ -165,7 +165,6 @@ def make_env(task: Task, max_episode_steps: int | None = None, **kwargs: Any) ->
     """Make an environment; those of this repository are registered if need be.
 
     :param max_episode_steps: steps after which an episode is cut off, unless a function makes it; None: the task's own
-    :param kwargs: further arguments of ``gymnasium.make``
     :raises ValueError: if the function makes something else
     """
     if not isinstance(task, str | EnvSpec):
@@ -182,10 +181,7 @@ def make_env(task: Task, max_episode_steps: int | None = None, **kwargs: Any) ->
 
 @contextmanager
 def chosen_on_purpose() -> Iterator[None]:
-    """Suppress the warnings of what an experiment has chosen, which would come once for every run.
-
-    These are a grid of many or few points, a source that misleads, and observations outside the bounds that a task gives.
-    """
+    """Suppress warnings of what an experiment has chosen: few or many grid points, misleading sources, narrow bounds."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="resolution=.* (is coarse|means)")
         warnings.filterwarnings("ignore", message="what was transferred from")
@@ -194,11 +190,7 @@ def chosen_on_purpose() -> Iterator[None]:
 
 
 def described(value: Any) -> Any:
-    """Return a value as JSON can hold it.
-
-    Functions by name with what they are called with, transfer methods with their arguments, arrays and source instances by a
-    digest, others as their ``repr`` or, where that names a place in memory, by their class.
-    """
+    """Return as JSON: functions by name and arguments, transfers by arguments, arrays by digest, others by repr."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, functools.partial):

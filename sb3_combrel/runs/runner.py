@@ -99,16 +99,13 @@ class Backend:
             port = None
         # Not "ray://": connections of Ray's client server often hang.
         if parts.scheme not in ("", *(("tcp", "tls") if self.name == "dask" else ())) or not parts.hostname or port is None:
-            raise ValueError(
-                f"address of {self.name} must be a host and a port of a running cluster, got {self.address!r}. "
-                f"{_HOW_TO_START[self.name]}"
-            )
+            wanted = f"address of {self.name} must be a host and a port of a running cluster"
+            raise ValueError(f"{wanted}, got {self.address!r}. {_HOW_TO_START[self.name]}")
         try:
             socket.create_connection((parts.hostname, port), timeout=SECONDS_TO_REACH).close()
         except OSError as error:
-            raise ConnectionError(
-                f"no {self.name} cluster answers at {self.address} ({error}). {_HOW_TO_START[self.name]}"
-            ) from error
+            message = f"no {self.name} cluster answers at {self.address} ({error}). {_HOW_TO_START[self.name]}"
+            raise ConnectionError(message) from error
 
 
 LOCAL = Backend()
@@ -166,10 +163,7 @@ def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None
 
 
 def prepare_folder(output: Path) -> None:
-    """Prepare a folder for results; those that are there are kept.
-
-    :raises ValueError: if it has files that are not results
-    """
+    """Prepare a folder for results; those that are there are kept, other files are a ValueError."""
     if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
         raise ValueError(f"{output} has files that are not results of this command; choose another --output")
     (output / FOLDER).mkdir(parents=True, exist_ok=True)
@@ -294,20 +288,19 @@ def _parallel(backend: Backend) -> Iterator[Callable[[list[bytes]], Iterator[byt
 @contextmanager
 def _progress(jobs: Sequence[Job], missing: Sequence[Job], console: Console) -> Iterator[Callable[[Job, Result], None]]:
     """Bars of progress, one a method or, of several groups, one a group; in a log file a line for each run."""
-    times = TimeElapsedColumn(), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description:<26}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     groups = {job.group for job in jobs}
 
     def bar_of(job: Job) -> str:
         return job.group if len(groups) > 1 else job.method
 
-    with Progress(
-        TextColumn("{task.description:<26}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *times,
-        console=console,
-        disable=not console.is_terminal,
-    ) as progress:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         n_runs, n_missing = Counter(map(bar_of, jobs)), Counter(map(bar_of, missing))
         bars = {name: progress.add_task(name, total=n, completed=n - n_missing[name]) for name, n in n_runs.items()}
 

@@ -87,10 +87,8 @@ def pairs_of(names: Sequence[str]) -> list[Pair]:
                 raise ValueError(f"pairs: PAIR of {name} must be a Pair, got {pair!r}")
             found.append(replace(pair, digest=digest))
         else:
-            raise ValueError(
-                f"pairs must be of {', '.join(PAIRS)}, or all; a pair of your own is the path of a file that ends in .py and "
-                f"defines PAIR; got {name!r}"
-            )
+            own = "a pair of your own is the path of a file that ends in .py and defines PAIR"
+            raise ValueError(f"pairs must be of {', '.join(PAIRS)}, or all; {own}; got {name!r}")
     return found
 
 
@@ -102,10 +100,7 @@ def methods_of(names: Sequence[str]) -> list[Method]:
 def prepare_sources(
     pairs: Sequence[Pair], output: Path, console: Console
 ) -> tuple[dict[str, tuple[SourceInstances, ...]], dict[str, str]]:
-    """Learn the source tasks of pairs, or load what was learned before.
-
-    :return: instances by the name of the pair, () where they could not be learned; and why not, by the name of the pair
-    """
+    """Learn or load the sources of pairs: instances, () where they could not be learned, and why not, by the pair's name."""
     found: dict[str, tuple[SourceInstances, ...]] = {}
     failed = {}
     for pair in pairs:
@@ -134,7 +129,5 @@ def _check_sources(pairs: Sequence[Pair]) -> None:
         for source in pair.sources:
             how = described(source.learn)
             if seen.setdefault(source.name, how) != how:
-                raise ValueError(
-                    f"{pair.name}: another pair has a source of the name {source.name!r} that is recorded in another way; "
-                    "rename one"
-                )
+                other = f"another pair has a source of the name {source.name!r} that is recorded in another way"
+                raise ValueError(f"{pair.name}: {other}; rename one")

@@ -26,13 +26,7 @@ _N_POINTS = 100
 
 
 def draw_pair(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, MethodScores], path: Path) -> list[Path]:
-    """Draw the learning curves of a pair, each method's in a panel beside no transfer's, and the performance of all methods.
-
-    Curves are interquartile means with 95% bootstrap bands. The marker of a method that differs from no transfer is full.
-
-    :param path: file to write, without its suffix
-    :return: the PNG and the SVG file
-    """
+    """Draw each method's learning curve beside no transfer's (IQM, 95% band), and performances; full: differs from none."""
     # Methods whose runs are the same are drawn once.
     names = [name for name in compared if cells[name].run_as == name or cells[name].run_as not in compared]
     drawn = [name for name in names if name != NONE] or names

@@ -15,16 +15,11 @@ from sb3_combrel.runs.job import chosen_on_purpose
 
 
 class Errors(NamedTuple):
-    """Mean squared errors of predicted effects on target transitions, over those of "no change".
+    """Mean squared errors of predicted effects on target transitions, over those of "no change"."""
 
-    :param known: of the known mapping
-    :param chosen: of the factored mapping of the pair's set that complies best with all the transitions
-    :param description: that mapping in words
-    """
-
-    known: float
-    chosen: float
-    description: str
+    known: float  # of the known mapping
+    chosen: float  # of the factored mapping of the pair's set that complies best with all the transitions
+    description: str  # that mapping in words
 
 
 def errors_of(pair: Pair, sources: tuple[SourceInstances, ...], transitions: SourceInstances) -> Errors:

@@ -80,10 +80,7 @@ def run_as(method: Method, methods: Sequence[Method], pair: Pair) -> str:
 
 
 def the_one(sources: Sources, name: str) -> SourceInstances:
-    """Return the instances of the only source, for the method of a name.
-
-    :raises DoesNotFit: if there are several
-    """
+    """Return the instances of the only source, for the method of a name; raises DoesNotFit if there are several."""
     if isinstance(sources, SourceInstances):
         return sources
     raise DoesNotFit(f"{name} takes one source, and the pair has {len(sources)}")
@@ -106,6 +103,10 @@ def _timbrel(sources: Sources, pair: Pair) -> Transfer:
 def _learned(method: Callable[[SourceInstances], Transfer]) -> Make:
     """Make a method that learns its mapping from samples of one source and of the target."""
     return lambda sources, pair: method(the_one(sources, method.__name__))
+
+
+def _soft_homomorphism(sources: Sources, pair: Pair) -> Transfer:
+    return SoftHomomorphism(the_one(sources, "SoftHomomorphism"), mirrored=pair.mappings.startswith("signed_"))
 
 
 def _same_as_factored(pair: Pair) -> str | None:
@@ -191,9 +192,7 @@ _METHODS: Sequence[Method] = (
     _finding(
         "soft-homomorphism",
         f"The source as a prior through a mixture of mappings that is fitted to the target ({_SORG}).",
-        lambda sources, pair: SoftHomomorphism(
-            the_one(sources, "SoftHomomorphism"), mirrored=pair.mappings.startswith("signed_")
-        ),
+        _soft_homomorphism,
     ),
     _finding(
         "sparse-coding",
@@ -218,7 +217,6 @@ def method_of(text: str) -> Method:
 
     :param text: one of :data:`METHODS`; or "package.module:Name" or "path/to/file.py:Name", where Name is a :class:`Method`, a
         transfer class that is called with the source, or a function of the source and the pair that returns a transfer object
-    :raises ValueError: if there is no such method
     """
     if text in METHODS:
         return METHODS[text]

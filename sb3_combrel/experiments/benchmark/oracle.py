@@ -15,12 +15,7 @@ from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
 class KnownCopies(TIMBREL):
-    """TIMBREL with priors from several sources, each through a factored mapping of its own.
-
-    :param source: a list of source instances
-    :param mapping: one factored mapping for each source; no two have a target variable in common
-    :raises ValueError: when learning starts, if a mapping does not fit
-    """
+    """TIMBREL with priors from several sources, each through a factored mapping; no two have a target variable in common."""
 
     def __init__(self, source: SourceLike, mapping: Sequence[FactoredMapping]):
         super().__init__(source, FactoredMapping(tuple(copy for each in mapping for copy in each.copies)), use="prior")

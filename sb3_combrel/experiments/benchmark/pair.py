@@ -92,10 +92,8 @@ class Pair:
         check_budget(self.name, self.n_steps, self.n_episodes)
         if self.threshold is not None:
             check_finite("threshold", self.threshold)
-        self._check(
-            bool(self.sources) and all(isinstance(source, Source) for source in self.sources),
-            f"sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}",
-        )
+        are_sources = bool(self.sources) and all(isinstance(source, Source) for source in self.sources)
+        self._check(are_sources, f"sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}")
         n, numbers = len(self.sources), self.sources_by_action
         if isinstance(self.known, Sequence) and all(isinstance(each, FactoredMapping) for each in self.known):
             right = f"known must have one factored mapping for each of the {n} sources"
@@ -136,16 +134,11 @@ class Pair:
     def settings(self) -> dict[str, Any]:
         """What the results depend on, in words that JSON can hold."""
         values = {name: value for name, value in vars(self).items() if name not in ("description", "sources", "threshold")}
-        return {
-            **{name: described(value) for name, value in values.items()},
-            "sources": {source.name: described(source.learn) for source in self.sources},
-        }
+        sources = {source.name: described(source.learn) for source in self.sources}
+        return {**{name: described(value) for name, value in values.items()}, "sources": sources}
 
 
 def check_name(name: object) -> None:
-    """Check the name of a pair or a method, which is part of the names of files.
-
-    :raises ValueError: if it has other characters than letters, digits, "-", "_" and "."
-    """
+    """Raise ValueError if the name of a pair or method, part of file names, has other than letters, digits, "-", "_", "."."""
     if not (isinstance(name, str) and re.fullmatch(r"[\w.-]+", name)):
         raise ValueError(f'name must be of letters, digits, "-", "_" and ".", got {name!r}')

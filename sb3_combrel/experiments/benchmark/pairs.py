@@ -36,10 +36,7 @@ N_JOINTS = 4
 
 
 def moves_like_yaw(joint: int) -> InterTaskMapping:
-    """Map one joint of the arm to the torso's yaw.
-
-    :param joint: of the arm; commands to others leave it where it is, as commands to the torso's pitch leave the yaw
-    """
+    """Map one joint of the arm to the torso's yaw; commands to others leave it where it is, as the pitch's leave the yaw."""
     state = [YAW if k == joint else None for k in range(N_JOINTS)]
     action = [2 * YAW + a % 2 if a // 2 == joint else 2 * PITCH for a in range(2 * N_JOINTS)]
     return InterTaskMapping(tuple(state), tuple(action))

@@ -49,13 +49,7 @@ def write_report(
     command: Sequence[str],
     console: Console,
 ) -> list[Path]:
-    """Make a table (Markdown, CSV) and a picture (PNG, SVG) for each pair, an overview, a CSV of all runs, and the page.
-
-    :param methods: in the order of tables
-    :param seeds: those that count
-    :param command: the command that made the results, for the page
-    :return: the files
-    """
+    """Make table and picture of each pair, an overview, a CSV of all runs, and the page with the command; return the files."""
     cells = {pair.name: cells_of(pair, methods, outcomes, seeds) for pair in pairs}
     compared = {pair.name: compare(pair, cells[pair.name]) for pair in pairs}
     made, sections = [], []
@@ -82,31 +76,18 @@ def pair_table(pair: Pair, cells: Mapping[str, Cell], compared: Mapping[str, Met
         if found is None:
             rows.append((name, *[""] * (len(_HEADER) - 2), note_of(name, cell)))
             continue
-        shares, steps = (
-            [each.more[name] for each in cell.outcomes if each.more[name] is not None]
-            for name in ("known_share", "mapping_steps")
-        )
-        row = (
-            name,
-            str(len(cell.outcomes)),
-            estimate_text(found.estimate),
-            p_text(found.p_value),
-            f"{places[name]:g}",
-            *(_measure_text(pair, found, measure) for measure in MEASURES),
-            f"{np.mean(shares):.0%}" if shares else _EMPTY,
-            f"{np.mean(steps):,.0f}" if steps else _EMPTY,
-            f"{np.mean([each.seconds for each in cell.outcomes]):.1f}",
-            note_of(name, cell),
-        )
-        rows.append(row)
+        recorded = ([each.more[key] for each in cell.outcomes] for key in ("known_share", "mapping_steps"))
+        shares, steps = ([value for value in values if value is not None] for values in recorded)
+        performance = estimate_text(found.estimate), p_text(found.p_value), f"{places[name]:g}"
+        measures = (_measure_text(pair, found, measure) for measure in MEASURES)
+        of_mapping = f"{np.mean(shares):.0%}" if shares else _EMPTY, f"{np.mean(steps):,.0f}" if steps else _EMPTY
+        seconds = f"{np.mean([each.seconds for each in cell.outcomes]):.1f}"
+        rows.append((name, str(len(cell.outcomes)), *performance, *measures, *of_mapping, seconds, note_of(name, cell)))
     return Table(f"{pair.name}, {pair.budget}", _HEADER, rows)
 
 
 def note_of(name: str, cell: Cell) -> str:
-    """
-    What the table says of a method besides numbers: why it does not fit, which runs failed, whose runs they are, and whether
-    they differ at all: where nothing is drawn at random, all seeds are the same run, and intervals and tests say less.
-    """
+    """Say why a method does not fit, which runs failed, whose they are, and whether they differ (else tests say less)."""
     notes = []
     if cell.misfit:
         notes.append(f"does not fit: {cell.misfit}")
@@ -150,9 +131,7 @@ def _measure_text(pair: Pair, found: MethodScores, measure: str) -> str:
 
 
 def rank_table(methods: Sequence[Method], cells: Cells, compared: Scores) -> Table:
-    """
-    Make the table of mean ranks: and in how many pairs a method is better and worse than no transfer, by the corrected tests.
-    """
+    """Make the table of mean ranks, and of how many pairs a method is better and worse in than no transfer, corrected."""
     found = mean_ranks({pair: performance_of(scores) for pair, scores in compared.items()}, cells)
     rows = []
     for name in sorted(found, key=lambda each: found[each].rank):
@@ -168,18 +147,15 @@ def rank_table(methods: Sequence[Method], cells: Cells, compared: Scores) -> Tab
 
 
 def performance_table(pairs: Sequence[Pair], methods: Sequence[Method], cells: Cells, compared: Scores) -> Table:
-    """
-    Make the table of performance: interquartile means, and ranks in brackets; a row for each method, a column for each pair.
-    """
+    """Make the table of interquartile mean performances, ranks in brackets; a row for each method, a column for each pair."""
     places = {name: ranks(performance_of(scores), cells[name]) for name, scores in compared.items()}
     rows = []
     for method in methods:
         row = [method.name]
         for pair in pairs:
             found = compared[pair.name].get(method.name)
-            failed = cells[pair.name][method.name].errors
             if found is None:
-                row.append("failed" if failed else "")
+                row.append("failed" if cells[pair.name][method.name].errors else "")
             else:
                 mark = "*" if found.p_value < ALPHA else ""
                 row.append(f"{number_text(float(found.estimate.mean))}{mark} ({places[pair.name][method.name]:g})")
@@ -199,11 +175,10 @@ def _page(
     methods: Sequence[Method], seeds: Sequence[int], overview: Sequence[Table], sections: Sequence[str], command: Sequence[str]
 ) -> str:
     """The results as Markdown, with the command."""
-    few = len(seeds) < FEWEST_RUNS
     parts = [
         "# The benchmark, pair by pair",
         f"Made by `{shlex.join(command)}`, seeds {seeds[0]} to {seeds[-1]}.",
-        *([f"**{few_runs(len(seeds))}**"] if few else []),
+        *([f"**{few_runs(len(seeds))}**"] if len(seeds) < FEWEST_RUNS else []),
         *(table.as_markdown() for table in overview),
         Table("The methods", ("method", "what it is"), [(each.name, each.description) for each in methods]).as_markdown(),
         *sections,
@@ -213,27 +188,16 @@ def _page(
 
 def few_runs(n_seeds: int) -> str:
     """What is said where there are too few seeds for an interval."""
-    return (
-        f"seeds={n_seeds} is too few for intervals and tests, which need at least {FEWEST_RUNS} runs of each method: tables "
-        "have means alone"
-    )
+    needed = f"which need at least {FEWEST_RUNS} runs of each method"
+    return f"seeds={n_seeds} is too few for intervals and tests, {needed}: tables have means alone"
 
 
 def _write_runs(results: Sequence[Result], path: Path) -> Path:
     """Write one line for each run, as far as it got."""
-    rows = [
-        {
-            "pair": each.group,
-            "method": each.method,
-            "seed": each.seed,
-            "n_steps": each.n_steps,
-            "known_share": each.more.get("known_share"),
-            "mapping_steps": each.more.get("mapping_steps"),
-            "misfit": each.more.get("misfit"),
-            "error": each.error,
-            "steps_of_episodes": " ".join(map(str, each.steps)),
-            "returns_of_episodes": " ".join(f"{total:.10g}" for total in each.returns),
-        }
-        for each in sorted(results, key=lambda one: (one.group, one.method, one.seed))
-    ]
+    rows = []
+    for each in sorted(results, key=lambda one: (one.group, one.method, one.seed)):
+        run = {"pair": each.group, "method": each.method, "seed": each.seed, "n_steps": each.n_steps}
+        more = {key: each.more.get(key) for key in ("known_share", "mapping_steps", "misfit")}
+        steps, returns = " ".join(map(str, each.steps)), " ".join(f"{total:.10g}" for total in each.returns)
+        rows.append({**run, **more, "error": each.error, "steps_of_episodes": steps, "returns_of_episodes": returns})
     return write_csv(pd.DataFrame(rows, dtype=object), path)

@@ -23,10 +23,6 @@ class BenchmarkRun(Job):
     Its result has in ``more``: "known_share", in which part of the decisions, where something was transferred, the known
     mapping was chosen, None where nobody knows it or the method does not say what it chooses; "mapping_steps", target steps
     until the method had a mapping, None for one that has it from the start; "misfit", why the method does not fit the pair.
-
-    :param pair: the pair
-    :param of_method: the method
-    :param sources: instances of the pair's sources
     """
 
     pair: Pair
@@ -52,10 +48,7 @@ class BenchmarkRun(Job):
         return [MappingRecorder()] if self.of_method.finds_mapping else []
 
     def carry_out(self) -> Result:
-        """Learn, if the method fits the pair.
-
-        :raises RuntimeError: if no episode has ended
-        """
+        """Learn, if the method fits the pair; raises RuntimeError if no episode has ended."""
         with chosen_on_purpose():
             # If the learner alone cannot be made, it is not the method that does not fit.
             with closing(self.make_env()) as env:
@@ -77,10 +70,7 @@ class BenchmarkRun(Job):
 
 
 def has_mapping(transfer: Any) -> bool:
-    """Whether a transfer method has chosen a mapping for any state and action.
-
-    Where it does not name what it chooses for states of the sample, as methods of this package do, whether it has used one.
-    """
+    """Whether a transfer method has chosen a mapping for any state and action, or used one if it names no choices."""
     if getattr(transfer, "makes_choices", False):
         return bool((transfer.choices() >= 0).any())
     return bool(transfer.uses())
@@ -105,8 +95,6 @@ def known_share(pair: Pair, transfer: Any) -> float | None:
 
     A decision is a use of a candidate, as ``uses`` counts them: with instances a state and action of the agent for which
     instances were transferred, with a prior a transition of the target while a mapping was chosen.
-
-    :return: None if nobody knows the mapping, nothing was decided, or the method has no ``uses`` and ``mapped_variables``
     """
     if pair.known_by_action is None or not (hasattr(transfer, "uses") and hasattr(transfer, "mapped_variables")):
         return None
@@ -130,26 +118,15 @@ def _mapping_steps(transfer: Any, result: Result, callbacks: list[BaseCallback])
 def jobs_of(
     pairs: Sequence[Pair], methods: Sequence[Method], seeds: Sequence[int], sources: Mapping[str, tuple[SourceInstances, ...]]
 ) -> list[BenchmarkRun]:
-    """Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once.
-
-    :param sources: instances of each pair's sources, by name; () where they could not be learned
-    """
+    """Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once."""
     by_name = {method.name: method for method in methods}
     jobs: dict[str, BenchmarkRun] = {}
     for seed in seeds:
         for pair in pairs:
             for method in methods:
-                job = BenchmarkRun(
-                    group=pair.name,
-                    method=run_as(method, methods, pair),
-                    seed=seed,
-                    env=pair.target,
-                    n_steps=pair.n_steps,
-                    n_episodes=pair.n_episodes,
-                    learner=pair.learner,
-                    pair=pair,
-                    of_method=by_name[run_as(method, methods, pair)],
-                    sources=sources[pair.name],
-                )
+                name = run_as(method, methods, pair)
+                task: dict[str, Any] = {"env": pair.target, "n_steps": pair.n_steps, "n_episodes": pair.n_episodes}
+                own: dict[str, Any] = {"pair": pair, "of_method": by_name[name], "sources": sources[pair.name]}
+                job = BenchmarkRun(group=pair.name, method=name, seed=seed, learner=pair.learner, **task, **own)
                 jobs.setdefault(job.name, job)
     return list(jobs.values())

@@ -39,38 +39,23 @@ _AREAS = ("total_reward", "transfer_ratio")
 
 @dataclass(frozen=True)
 class Cell:
-    """What came of a method in a pair.
+    """What came of a method in a pair."""
 
-    :param outcomes: of the runs that succeeded, by seed
-    :param misfit: why the method does not fit the pair, or ""
-    :param errors: of the runs that failed, by seed
-    :param run_as: name of the method whose runs these are
-    """
-
-    outcomes: tuple[Result, ...]
-    misfit: str = ""
-    errors: Mapping[int, str] = field(default_factory=dict)
-    run_as: str = ""
+    outcomes: tuple[Result, ...]  # of the runs that succeeded, by seed
+    misfit: str = ""  # why the method does not fit the pair, or ""
+    errors: Mapping[int, str] = field(default_factory=dict)  # of the runs that failed, by seed
+    run_as: str = ""  # name of the method whose runs these are
 
 
 class MethodScores(NamedTuple):
-    """A method against no transfer.
+    """A method against no transfer."""
 
-    :param performance: of each run with the method, shape (n_runs,)
-    :param estimate: their interquartile mean, with its bootstrap interval
-    :param p_value: of the permutation test that both perform alike in the mean, by Holm's method over the pair's methods; NaN
-        for no transfer itself, and with too few runs
-    :param better: whether its mean performance is higher
-    :param measures: Taylor & Stone's, or None for no transfer itself and where it has no runs
-    :param p_values: of each of :data:`MEASURES`, by Holm's method over the pair's methods
-    """
-
-    performance: np.ndarray
-    estimate: Estimate
-    p_value: float
-    better: bool
-    measures: TransferMeasures | None
-    p_values: Mapping[str, float]
+    performance: np.ndarray  # of each run with the method, shape (n_runs,)
+    estimate: Estimate  # their interquartile mean, with its bootstrap interval
+    p_value: float  # of the permutation test of equal means, by Holm over the methods; NaN for no transfer, or too few runs
+    better: bool  # whether its mean performance is higher
+    measures: TransferMeasures | None  # Taylor & Stone's, or None for no transfer itself and where it has no runs
+    p_values: Mapping[str, float]  # of each of :data:`MEASURES`, by Holm's method over the pair's methods
 
 
 def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], seeds: Sequence[int]) -> dict[str, Cell]:
@@ -81,22 +66,14 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], 
         name = run_as(method, methods, pair)
         of_method = [each for each in own if each.method == name]
         misfits = [each.more["misfit"] for each in of_method if each.more.get("misfit")]
-        cells[method.name] = Cell(
-            tuple(each for each in of_method if each.steps),
-            misfits[0] if misfits else "",
-            {each.seed: each.error for each in of_method if each.error},
-            name,
-        )
+        errors = {each.seed: each.error for each in of_method if each.error}
+        succeeded = tuple(each for each in of_method if each.steps)
+        cells[method.name] = Cell(succeeded, misfits[0] if misfits else "", errors, name)
     return cells
 
 
 def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
-    """Compute the performance of each run: the mean return of an episode, over episodes or over environment steps.
-
-    Over steps, all runs of the pair are compared over as many as the shortest has in episodes that have ended.
-
-    :return: for each method with runs, shape (n_runs,)
-    """
+    """Compute each run's mean return of an episode, or over environment steps, as many as the pair's shortest run has."""
     curves = {name: curves_of(cell.outcomes) for name, cell in cells.items() if cell.outcomes}
     if pair.n_steps is None:
         return {name: total_reward(each, pair.n_episodes) / float(pair.n_episodes or 1) for name, each in curves.items()}
@@ -129,23 +106,17 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
     found = {}
     for name, its_own in of_runs.items():
         tested = cells[name].run_as if cells[name].run_as in measures else name
-        found[name] = MethodScores(
-            its_own,
-            interquartile(its_own),
-            corrected.get(tested, np.nan),
-            without is not None and bool(its_own.mean() > without.mean()),
-            measures.get(tested),
-            {measure: of_measures[measure].get(tested, np.nan) for measure in MEASURES},
-        )
+        better = without is not None and bool(its_own.mean() > without.mean())
+        p_values = {measure: of_measures[measure].get(tested, np.nan) for measure in MEASURES}
+        tests = corrected.get(tested, np.nan), better, measures.get(tested), p_values
+        found[name] = MethodScores(its_own, interquartile(its_own), *tests)
     return found
 
 
 def interquartile(performance: np.ndarray) -> Estimate:
     """Compute the interquartile mean of runs with its 95% bootstrap interval, NaN with fewer than :data:`FEWEST_RUNS`."""
     found = bootstrap_band(performance, "iqm")
-    if len(performance) >= FEWEST_RUNS:
-        return found
-    return Estimate(found.mean, np.array(np.nan), np.array(np.nan))
+    return found if len(performance) >= FEWEST_RUNS else Estimate(found.mean, np.array(np.nan), np.array(np.nan))
 
 
 def measure_name(pair: Pair, measure: str) -> str:
@@ -173,10 +144,7 @@ def performance_of(scores: Mapping[str, MethodScores]) -> dict[str, np.ndarray]:
 
 
 def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, float]:
-    """Rank the methods of a pair by the interquartile mean of their performance; 1 is the best, equal ones share their ranks.
-
-    Methods whose runs are the same count as one.
-    """
+    """Rank a pair's methods by interquartile mean performance, 1 the best; equal ones share ranks, same runs are one."""
     distinct = _distinct(performance, cells)
     means = np.array([float(interquartile_mean(each)) for each in distinct.values()])
     found = dict(zip(distinct, stats.rankdata(-means).tolist(), strict=True))
@@ -204,8 +172,6 @@ def mean_ranks(
     where it has runs, among the methods that have. So that places in pairs with many and with few methods count alike, ranks
     are stretched to the number of methods of the pair that has most: the best has 1, the last that number. Methods whose runs
     are the same count as one.
-
-    :param performance: of the runs, shape (n_runs,), by pair and method; ``cells``: likewise
     """
     rng = np.random.default_rng(seed)
     distinct = {pair: _distinct(of_methods, cells[pair]) for pair, of_methods in performance.items()}

@@ -14,13 +14,7 @@ import cloudpickle
 
 
 def load_attribute(argument: str, text: str) -> tuple[Any, str]:
-    """Return what a module or a file defines.
-
-    :param argument: name of the argument, for messages
-    :param text: "package.module:Name" or "path/to/file.py:Name"
-    :return: the object, and a digest of the file that defines it
-    :raises ValueError: if it does not exist or cannot be imported
-    """
+    """Return what "module:Name" or "file.py:Name" defines, and the file's digest; ValueError if that fails."""
     place, _, name = text.rpartition(":")
     module, digest = _load(argument, place)
     if not hasattr(module, name):

@@ -34,19 +34,9 @@ ALGORITHMS = (PLAIN, QUANTILE, *OF_SOURCE)
 
 #: Figures of zoo_configs/dqn.yml and zoo_configs/qrdqn.yml, which an installed package does not have; a test compares them.
 #: The learning rate is the first one, it falls linearly to 0.
-_CAR: dict[str, Any] = {
-    "learning_rate": 0.002,
-    "batch_size": 128,
-    "buffer_size": 100_000,
-    "learning_starts": 1000,
-    "gamma": 0.99,
-    "n_steps": 5,
-    "target_update_interval": 600,
-    "train_freq": 16,
-    "gradient_steps": 8,
-    "exploration_fraction": 0.3,
-    "exploration_final_eps": 0.05,
-}
+_CAR: dict[str, Any] = {"learning_rate": 0.002, "batch_size": 128, "buffer_size": 100_000, "learning_starts": 1000}
+_CAR |= {"gamma": 0.99, "n_steps": 5, "target_update_interval": 600, "train_freq": 16, "gradient_steps": 8}
+_CAR |= {"exploration_fraction": 0.3, "exploration_final_eps": 0.05}
 HYPERPARAMETERS: dict[str, dict[str, Any]] = {
     mountain_car.TARGET_ID: _CAR,
     icub_arm.TARGET_ID: {**_CAR, "learning_rate": 0.001, "buffer_size": 50_000},
@@ -84,9 +74,6 @@ class BaselineJob(Job):
     prefilling; exploration ends and the learning rate falls relative to them. The result's episodes are those of the
     prefilling first. In ``more`` it has ``evaluations`` of the greedy policy: [steps, mean return of
     :data:`EVALUATION_EPISODES` episodes, fraction of these that ended in a terminal state].
-
-    :param source: instances of the source task, for the algorithms of :data:`OF_SOURCE`; None for the others
-    :raises ValueError: if the algorithm is unknown, or its source missing or given in vain
     """
 
     source: SourceInstances | None = None
@@ -112,10 +99,8 @@ class BaselineJob(Job):
         before, prefilled = prefill(self) if self.source is not None else (Episodes.from_rows([]), None)
         n_before = int(before.steps.sum())
         if n_before >= self.n_steps:
-            raise ValueError(
-                f"n_steps must be more than the {n_before} steps that were made to fill the replay buffer of "
-                f"{self.method!r}, got {self.n_steps}"
-            )
+            made = f"the {n_before} steps that were made to fill the replay buffer of {self.method!r}"
+            raise ValueError(f"n_steps must be more than {made}, got {self.n_steps}")
         with closing(self.make_env()) as env, closing(self.make_env()) as evaluation_env:
             model = make_model(self, env)
             if prefilled is not None:
@@ -130,24 +115,12 @@ class BaselineJob(Job):
 def baseline_jobs(
     domain: Domain, setting: str, source: SourceInstances, n_runs: int | None, n_episodes: int
 ) -> list[BaselineJob]:
-    """Make the jobs of all baselines.
-
-    :param setting: name of the setting, whose time limit holds
-    :param source: what is transferred to fill the replay buffer
-    :param n_runs: seeds of each; at most :data:`MAX_RUNS`
-    :param n_episodes: episodes of the other methods; where they are fewer than by default, so are the steps of the baselines
-    """
+    """Make the jobs of all baselines; with fewer episodes than by default they have fewer steps too."""
     total = round(TOTAL_TIMESTEPS[domain.name] * min(1.0, n_episodes / domain.n_episodes))
+    task: dict[str, Any] = {"group": domain.name, "env": domain.target_id, "n_steps": max(total, FEWEST_TIMESTEPS)}
+    task["max_episode_steps"] = domain.settings[setting].max_episode_steps
     return [
-        BaselineJob(
-            group=domain.name,
-            method=algorithm,
-            seed=seed,
-            env=domain.target_id,
-            n_steps=max(total, FEWEST_TIMESTEPS),
-            max_episode_steps=domain.settings[setting].max_episode_steps,
-            source=source if algorithm in OF_SOURCE else None,
-        )
+        BaselineJob(method=algorithm, seed=seed, source=source if algorithm in OF_SOURCE else None, **task)
         for seed in range(domain.first_seed, domain.first_seed + min(n_runs or MAX_RUNS, MAX_RUNS))
         for algorithm in ALGORITHMS
     ]
@@ -183,12 +156,7 @@ def prefill(job: BaselineJob) -> tuple[Episodes, Transitions]:
 
 
 def translate(transfer: Transfer, visited: Transitions) -> Transitions:
-    """Translate for each state visited, with each action, the one instance that weighs most there.
-
-    :param transfer: bound to the target, and with what it has observed of it
-    :param visited: transitions of the target, raw units; only the states count
-    :return: translated transitions, raw units, within the bounds of the states; none where nothing is transferred
-    """
+    """Translate for each state visited and each action the instance that weighs most there; within bounds, raw units."""
     assert transfer.task is not None
     scaling, units = transfer.task.scaling, transfer.task.scaling.to_unit(visited.states)
     found: list[tuple[np.ndarray, ...]] = []
@@ -223,13 +191,7 @@ def evaluation_steps(n_steps: int) -> list[int]:
 
 
 class GreedyEvaluator(BaseCallback):
-    """Plays episodes without exploration after some numbers of steps, each time from the same starts: ``evaluations``.
-
-    :param at: numbers of steps
-    :param env: the environment to play in, with a time limit
-    :param seed: its seed
-    :param n_before: steps that were made before this learning, and count
-    """
+    """Plays episodes without exploration after some numbers of steps, each time from the same starts: ``evaluations``."""
 
     def __init__(self, at: Sequence[int], env: gym.Env, seed: int, n_before: int = 0):
         super().__init__()
@@ -245,9 +207,6 @@ class GreedyEvaluator(BaseCallback):
 
 
 def always_reached_from(evaluations: Sequence[Sequence[float]]) -> float:
-    """Return the steps from which on every episode of every evaluation ended in a terminal state; inf if the last did not.
-
-    A single evaluation proves little: on the arm one command, repeated for ever, may hit the ball in the end.
-    """
+    """Return the steps from which on all evaluated episodes ended in a terminal state; inf if the last did not."""
     good = itertools.takewhile(lambda evaluation: evaluation[2] == 1.0, reversed(evaluations))
     return min((steps for steps, *_ in good), default=np.inf)

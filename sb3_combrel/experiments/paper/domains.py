@@ -15,22 +15,14 @@ PAPER, EXPLORE, BEST = SETTINGS = ("paper", "explore", "best")
 
 @dataclass(frozen=True)
 class Setting:
-    """How the methods are set in one domain.
+    """How the methods are set in one domain."""
 
-    :param learner: arguments of :class:`~sb3_combrel.FittedRMax`
-    :param max_episode_steps: steps after which an episode is cut off
-    :param mappings: the set that COMBREL chooses from, and from which random mappings are drawn
-    :param combrel: arguments of :class:`~sb3_combrel.COMBREL` besides the set
-    :param timbrel: arguments of :class:`~sb3_combrel.TIMBREL` besides the mapping
-    :param paper: whether COMBREL is that of ``COMBREL.paper``
-    """
-
-    learner: Mapping[str, Any]
-    max_episode_steps: int
-    mappings: str
-    combrel: Mapping[str, Any] = field(default_factory=dict)
-    timbrel: Mapping[str, Any] = field(default_factory=dict)
-    paper: bool = False
+    learner: Mapping[str, Any]  # arguments of :class:`~sb3_combrel.FittedRMax`
+    max_episode_steps: int  # steps after which an episode is cut off
+    mappings: str  # the set that COMBREL chooses from, and from which random mappings are drawn
+    combrel: Mapping[str, Any] = field(default_factory=dict)  # arguments of :class:`~sb3_combrel.COMBREL` besides the set
+    timbrel: Mapping[str, Any] = field(default_factory=dict)  # arguments of :class:`~sb3_combrel.TIMBREL` besides the mapping
+    paper: bool = False  # whether COMBREL is that of ``COMBREL.paper``
 
     @property
     def use(self) -> str:
@@ -40,32 +32,19 @@ class Setting:
 
 @dataclass(frozen=True)
 class Domain:
-    """A source task and a target task.
+    """A source task and a target task."""
 
-    :param name: in file names
-    :param title: in figures
-    :param target_id: id of the target task
-    :param learn_source: learns the source and returns its instances; a function of the seed
-    :param n_runs: runs of each method, by default
-    :param n_episodes: episodes of each run, by default
-    :param first_seed: seed of the first run; no setting was chosen with this seed or those after it
-    :param thresholds: steps of an episode; the training needed to get there is reported for each
-    :param goal_reward: what the last step of an episode that reaches the goal earns besides the cost of a step, 1
-    :param unit: what a step is called
-    :param settings: by name
-    """
-
-    name: str
-    title: str
-    target_id: str
-    learn_source: Callable[[int], SourceInstances]
-    n_runs: int
-    n_episodes: int
-    first_seed: int
-    thresholds: tuple[int, ...]
-    goal_reward: float
-    unit: str
-    settings: Mapping[str, Setting]
+    name: str  # in file names
+    title: str  # in figures
+    target_id: str  # id of the target task
+    learn_source: Callable[[int], SourceInstances]  # learns the source and returns its instances; a function of the seed
+    n_runs: int  # runs of each method, by default
+    n_episodes: int  # episodes of each run, by default
+    first_seed: int  # seed of the first run; no setting was chosen with this seed or those after it
+    thresholds: tuple[int, ...]  # steps of an episode; the training needed to get there is reported for each
+    goal_reward: float  # what the last step of an episode that reaches the goal earns besides the cost of a step, 1
+    unit: str  # what a step is called
+    settings: Mapping[str, Setting]  # by name
 
     def target_names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the names of the target's state variables and actions."""

@@ -22,31 +22,16 @@ from sb3_combrel.runs.job import Result
 WINDOW = 5
 _GREY, _BLUE, _VERMILLION, _GREEN, _PURPLE, _SKY, _ORANGE = COLOURS
 #: Colour and line of each method, the same in all figures; controls have no solid line.
-STYLES = {
-    m.NO_TRANSFER: (_GREY, "-"),
-    m.TIMBREL_INTUITIVE: (_BLUE, "-"),
-    m.COMBREL_PLAIN: (_VERMILLION, "-"),
-    m.COMBREL_RELEVANCE: (_ORANGE, "-"),
-    m.TIMBREL_RELEVANCE: (_SKY, "-"),
-    m.COMBREL_WHOLE: (_GREEN, "-"),
-    m.TIMBREL_RANDOM: (_PURPLE, "-"),
-    m.ONE_RANDOM: (_PURPLE, "--"),
-    m.TIMBREL_FREQUENT: (_BLUE, "-"),
-    m.ORACLE: (_GREEN, "--"),
-    m.UNRELATED: ("black", ":"),
-    m.NO_TRANSFER_BEST: (_GREY, "--"),
-    **dict(zip(ALGORITHMS, ((_SKY, "-"), (_ORANGE, "-"), (_PURPLE, "-"), (_PURPLE, "--")), strict=True)),
-}
+STYLES = {m.NO_TRANSFER: (_GREY, "-"), m.TIMBREL_INTUITIVE: (_BLUE, "-"), m.COMBREL_PLAIN: (_VERMILLION, "-")}
+STYLES |= {m.COMBREL_RELEVANCE: (_ORANGE, "-"), m.TIMBREL_RELEVANCE: (_SKY, "-"), m.COMBREL_WHOLE: (_GREEN, "-")}
+STYLES |= {m.TIMBREL_RANDOM: (_PURPLE, "-"), m.ONE_RANDOM: (_PURPLE, "--"), m.TIMBREL_FREQUENT: (_BLUE, "-")}
+STYLES |= {m.ORACLE: (_GREEN, "--"), m.UNRELATED: ("black", ":"), m.NO_TRANSFER_BEST: (_GREY, "--")}
+STYLES |= dict(zip(ALGORITHMS, ((_SKY, "-"), (_ORANGE, "-"), (_PURPLE, "-"), (_PURPLE, "--")), strict=True))
 _BELOW: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.0, -0.15)}
 
 
 def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
-    """Draw learning curves, one panel beside the other: mean over the runs of the moving average, 95% bootstrap bands.
-
-    :param panels: for each panel's title the steps of each method's runs, shape (n_runs, n_episodes)
-    :param path: file to write, without its suffix
-    :return: the PNG and the SVG file
-    """
+    """Draw learning curves: by panel and method means over runs, shape (n_runs, n_episodes), of moving averages, 95% bands."""
     figure, all_axes = panels_of(len(panels), title)
     for axes, (name, steps) in zip(all_axes, panels.items(), strict=True):
         for method, samples in steps.items():
@@ -64,11 +49,7 @@ def draw_curves(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, 
 
 
 def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, title: str, path: Path) -> list[Path]:
-    """Draw the environment steps until the median of the last episodes is at most a threshold; median over the runs.
-
-    A method whose median run never gets there has no point; the band is the bootstrap's 95% interval of the median.
-    Parameters: see :func:`draw_curves`.
-    """
+    """Draw the median steps until the last episodes' median reaches a threshold, with 95% bands; no point if never."""
     figure, all_axes = panels_of(len(panels), title)
     places = np.arange(len(domain.thresholds))
     anything = False
@@ -96,12 +77,7 @@ def draw_times(panels: Mapping[str, Mapping[str, np.ndarray]], domain: Domain, t
 def draw_selection(
     panels: Mapping[str, tuple[np.ndarray, np.ndarray, Sequence[str]]], *labels: tuple[str, str], title: str, path: Path
 ) -> list[Path]:
-    """Draw which source action is selected over planes of the state space (Figure 4).
-
-    :param panels: for each title the coordinates of points along both variables, shape (n, 2), the place of each point's
-        source action in the names, -1 for none, shape (n,), and the names
-    :param labels: of each panel the names of the two variables
-    """
+    """Draw by title (points, shape (n, 2), place of source action in the names or -1, names) in two variables: Figure 4."""
     figure, all_axes = panels_of(len(panels), title, sharey=False)
     for axes, (name, (points, action, names)), (below, beside) in zip(all_axes, panels.items(), labels, strict=True):
         for k, (label, marker) in enumerate(zip(("nothing", *names), (".", "<", "o", ">", "^", "v"), strict=False), start=-1):
@@ -115,10 +91,7 @@ def draw_selection(
 
 
 def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) -> list[Path]:
-    """Draw the steps of all episodes against the breadth, mean of the runs with 95% bootstrap intervals.
-
-    :param steps: by method at a breadth the steps of each run's episodes, shape (n_runs, n_episodes)
-    """
+    """Draw the steps of all episodes against the breadth, mean of the runs with 95% bootstrap intervals."""
     figure, (axes,) = panels_of(1, f"{domain.title}: what transfer can save depends on the learner's kernel")
     for method, colour in zip(DIAGNOSED, COLOURS, strict=False):
         # Shape (n_runs, n_breadths).
@@ -135,14 +108,7 @@ def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) 
 
 
 def draw_baselines(results: Mapping[str, Sequence[Result]], methods: Sequence[str], title: str, path: Path) -> list[Path]:
-    """Draw returns against environment steps, on a logarithmic axis.
-
-    Of the baselines the greedy policy, mean of the runs with the range of these; of the methods the episodes of learning,
-    exploration included, mean of the runs with 95% bootstrap bands.
-
-    :param results: by domain, of baselines and methods
-    :param methods: names of the methods to draw
-    """
+    """Draw returns against steps, log axis: greedy baselines, mean and range; methods while learning, mean and 95% bands."""
     figure, all_axes = panels_of(len(results), title, sharey=False)
     for axes, (domain, of_domain) in zip(all_axes, results.items(), strict=True):
         for name in (*methods, *ALGORITHMS):

@@ -33,9 +33,6 @@ class PaperJob(Job):
     - ``selections``, if they are recorded: each such use with the state, raw units: [number in ``uses``, *state]
     - ``at_sample``, likewise: source action selected in the end for each state of the finite sample, by target action
     - ``first_episode_seconds``: processor time of the first episode
-
-    :param setting: name of the setting
-    :param records_selections: whether each selection of a mapping is recorded
     """
 
     setting: str
@@ -123,28 +120,16 @@ def selections_at_sample(transfer: Any) -> dict[str, list[str]]:
 def jobs_of(
     domain: Domain, setting: str, methods: Sequence[str], sources: m.Sources, n_runs: int, n_episodes: int
 ) -> list[PaperJob]:
-    """Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete.
-
-    :param setting: name of the setting
-    :param methods: names of methods that exist there
-    :param sources: what they transfer
-    :param n_runs: seeds of each method
-    """
+    """Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete."""
     chosen = domain.settings[setting]
+    task: dict[str, Any] = {"group": domain.name, "env": domain.target_id, "n_episodes": n_episodes, "setting": setting}
+    task["max_episode_steps"] = chosen.max_episode_steps
 
     def job_of(name: str, seed: int) -> PaperJob:
-        return PaperJob(
-            group=domain.name,
-            method=name,
-            seed=seed,
-            env=domain.target_id,
-            n_episodes=n_episodes,
-            max_episode_steps=chosen.max_episode_steps,
-            learner=m.learner_of(name, domain, chosen),
-            transfer=m.transfer_of(name, domain, chosen, sources, seed),
-            setting=setting,
-            records_selections=name in (m.COMBREL_PLAIN, m.COMBREL_WHOLE) and chosen.use == "instances",
-        )
+        records = name in (m.COMBREL_PLAIN, m.COMBREL_WHOLE) and chosen.use == "instances"
+        learner, transfer = m.learner_of(name, domain, chosen), m.transfer_of(name, domain, chosen, sources, seed)
+        own: dict[str, Any] = {"method": name, "seed": seed, "learner": learner, "transfer": transfer}
+        return PaperJob(**task, **own, records_selections=records)
 
     return [job_of(name, seed) for seed in range(domain.first_seed, domain.first_seed + n_runs) for name in methods]
 

@@ -19,13 +19,7 @@ _CHUNK = 500
 def most_frequent_mapping(
     uses: Iterable[Sequence[Any]], source_names: Sequence[Sequence[str]], target_names: Sequence[Sequence[str]]
 ) -> InterTaskMapping:
-    """Find the state mapping used most, with the source action to which each target action was mapped most often with it.
-
-    :param uses: of all runs, at least one: target action, source action, state mapping as text (``target<-source, ...``),
-        action mapping, number of times
-    :param source_names: of the source's state variables, and of its actions
-    :param target_names: likewise
-    """
+    """Find the state mapping used most, and for each target action the source action most often used with it, of ``uses``."""
     states: Counter[str] = Counter()
     # (target action, source action, state mapping); and with any state mapping.
     times: Counter[tuple[str, ...]] = Counter()

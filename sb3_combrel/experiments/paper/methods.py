@@ -56,18 +56,12 @@ N_TARGET_TRANSITIONS = 4000
 
 @dataclass(frozen=True)
 class Sources:
-    """What is needed to make the transfer methods of a domain.
+    """What is needed to make the transfer methods of a domain."""
 
-    :param own: instances of the domain's source task
-    :param unrelated: instances of the other domain's
-    :param target: transitions of the target task, for the oracle of a domain whose right mapping nobody knows; None elsewhere
-    :param frequent: COMBREL's most frequent mapping, once its runs are complete
-    """
-
-    own: SourceInstances
-    unrelated: SourceInstances
-    target: SourceInstances | None = None
-    frequent: InterTaskMapping | None = None
+    own: SourceInstances  # instances of the domain's source task
+    unrelated: SourceInstances  # instances of the other domain's
+    target: SourceInstances | None = None  # target transitions, for the oracle where nobody knows the mapping
+    frequent: InterTaskMapping | None = None  # COMBREL's most frequent mapping, once its runs are complete
 
 
 def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
@@ -102,14 +96,7 @@ def learner_of(method: str, domain: Domain, setting: Setting) -> Mapping[str, An
 
 
 def transfer_of(method: str, domain: Domain, setting: Setting, sources: Sources, seed: int) -> Transfer | None:
-    """Make the transfer method of a method, not bound to a task; None for no transfer.
-
-    :param method: one that exists in the domain with the setting
-    :param domain: the domain
-    :param setting: the setting
-    :param sources: what is transferred
-    :param seed: of the run, for a mapping that is drawn once for it
-    """
+    """Make the transfer method of a method, not bound to a task; None for no transfer."""
     own, with_prior = sources.own, setting.use == "prior"
 
     def combrel(source: SourceInstances = own, mappings: str = setting.mappings, **arguments: Any) -> Transfer:
@@ -124,13 +111,8 @@ def transfer_of(method: str, domain: Domain, setting: Setting, sources: Sources,
 
     def all_mappings() -> Any:
         variables, actions = domain.target_names()
-        return resolve(
-            setting.mappings,
-            n_source_variables=own.n_variables,
-            n_target_variables=len(variables),
-            n_source_actions=own.n_actions,
-            n_target_actions=len(actions),
-        )
+        of_source = {"n_source_variables": own.n_variables, "n_source_actions": own.n_actions}
+        return resolve(setting.mappings, **of_source, n_target_variables=len(variables), n_target_actions=len(actions))
 
     def one_random() -> Transfer:
         mappings = all_mappings()

@@ -25,12 +25,7 @@ EAST = "East"
 def write_report(
     targets: Sequence[Target], setting: str, results: Sequence[Result], output: Path, console: Console
 ) -> list[Path]:
-    """Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs in the folder to one CSV file a domain.
-
-    :param results: of all runs that the figures and tables need
-    :param console: where to show the tables
-    :return: the files
-    """
+    """Make figures (PNG, SVG) and tables (Markdown, CSV), and write all runs in the folder to one CSV file a domain."""
     names = [name for name in DOMAINS if any(name in target.methods for target in targets)]
     by_domain = {name: [result for result in results if result.group == name] for name in names}
     # With the runs of earlier calls: they may have been for other figures.

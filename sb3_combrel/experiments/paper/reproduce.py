@@ -77,8 +77,8 @@ def reproduce(
         if m.TIMBREL_FREQUENT in methods_of(targets, domain, setting):
             with_frequent = replace(sources[domain.name], frequent=frequent_mapping(results, domain, sources[domain.name]))
             console.print(f"{m.TIMBREL_FREQUENT}: {with_frequent.frequent!r}", markup=False)
-            jobs = [*jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, *counts[domain.name])]
-            results += run_missing(jobs, output, backend, console)
+            of_frequent = jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, *counts[domain.name])
+            results += run_missing(of_frequent, output, backend, console)
             check_all_succeeded(results)
     return write_report(targets, setting, results, output, console)
 
@@ -89,9 +89,8 @@ def _check_folder(output: Path, domain: str, setting: str, n_episodes: int) -> N
     for before, result in results_in(output, domain):
         other = [f"{key} was {before.get(key)!r} and is {now[key]!r}" for key in now if before.get(key) != now[key]]
         if result.method in m.METHODS and other:
-            raise ValueError(
-                f"{output} has results of other settings ({result.name}: {'; '.join(other)}); use another --output"
-            )
+            what = f"results of other settings ({result.name}: {'; '.join(other)})"
+            raise ValueError(f"{output} has {what}; use another --output")
 
 
 def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:
@@ -99,8 +98,6 @@ def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sourc
     of_combrel = [each for each in results if (each.group, each.method) == (domain.name, m.COMBREL_PLAIN)]
     uses = [use for result in of_combrel for use in result.more["uses"]]
     if not uses:
-        raise ValueError(
-            f"{m.COMBREL_PLAIN} has used no mapping within episodes={len(of_combrel[0].steps)}, so {m.TIMBREL_FREQUENT} has "
-            "no mapping; use more --episodes"
-        )
+        none = f"{m.COMBREL_PLAIN} has used no mapping within episodes={len(of_combrel[0].steps)}"
+        raise ValueError(f"{none}, so {m.TIMBREL_FREQUENT} has no mapping; use more --episodes")
     return most_frequent_mapping(uses, (sources.own.state_names, sources.own.action_names), domain.target_names())

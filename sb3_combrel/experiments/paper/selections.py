@@ -20,10 +20,7 @@ ACTION, SOURCE_ACTION, STATES, MAPPING, ALL = "target action", "source action", 
 
 
 def action_mapping_table(results: Sequence[Result], target_actions: Sequence[str]) -> Table:
-    """Make a table of the action mappings used most, in percent of each target action's uses (the paper's Table 2).
-
-    :param results: of runs in which whole mappings were candidates
-    """
+    """Make a table of the action mappings used most, in percent of each target action's uses (the paper's Table 2)."""
     counts = _counts(results, MAPPING, target_actions)
     others = counts[N_SHOWN:].sum().to_frame(f"{len(counts[N_SHOWN:])} others").T
     title = "Action mappings used most, in percent: the source action (by its first letter) of each target action"
@@ -46,9 +43,8 @@ def state_mapping_table(results: Sequence[Result]) -> Table:
 
 def _counts(results: Sequence[Result], kind: str, target_actions: Sequence[str]) -> pd.DataFrame:
     """Uses of each mapping, the most used first, by target action and of all actions."""
-    uses = pd.DataFrame(
-        [use for result in results for use in result.more["uses"]], columns=[ACTION, SOURCE_ACTION, STATES, MAPPING, "n"]
-    )
+    rows = [use for result in results for use in result.more["uses"]]
+    uses = pd.DataFrame(rows, columns=[ACTION, SOURCE_ACTION, STATES, MAPPING, "n"])
     # An action mapping as the first letters of its source actions.
     uses[MAPPING] = uses[MAPPING].map(lambda names: "".join(name[:1] for name in names.split(", ")))
     counts = uses.pivot_table("n", kind, ACTION, "sum", fill_value=0).astype(int)
@@ -69,10 +65,7 @@ def _shares(counts: pd.DataFrame) -> list[tuple[str, ...]]:
 
 
 def selections_of(results: Sequence[Result], variables: Sequence[str]) -> pd.DataFrame:
-    """Collect the selections of runs that have recorded them: state, raw units, target action, and mapping, as text.
-
-    The mapping is the source action where none is whole.
-    """
+    """Collect recorded selections: state, raw units, target action, and mapping (or source action), as text."""
     rows = []
     for result in results:
         for place, *state in result.more.get("selections", ()):
@@ -82,10 +75,7 @@ def selections_of(results: Sequence[Result], variables: Sequence[str]) -> pd.Dat
 
 
 def thin(selections: pd.DataFrame, n: int) -> pd.DataFrame:
-    """Return one of ``n`` selections of each action.
-
-    In most steps there is one for every action, so one of ``n`` of them all, in their order, could always be of the same.
-    """
+    """Return one of ``n`` selections of each action; one of ``n`` of them all could always be of the same action."""
     actions = sorted(set(selections[ACTION]))
     # Not all in the same step.
     kept = [selections[selections[ACTION] == action][k * n // len(actions) :: n] for k, action in enumerate(actions)]
@@ -98,8 +88,6 @@ def dependence_table(selections: pd.DataFrame) -> Table:
     The effect is epsilon squared of the former and Cramer's V of the latter, both from 0, no relation, to 1. Successive steps
     have successive states, so that p-values of all selections are too low; the last columns have one selection in
     :data:`THINNED` of each target action.
-
-    :param selections: of all runs, see :func:`selections_of`
     """
     thinned = thin(selections, THINNED)
     rows = []

@@ -56,10 +56,7 @@ def _median_text(needed: np.ndarray) -> str:
 
 
 def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
-    """Make a table of Taylor & Stone's measures of transfer of each method, of runs with no transfer among them.
-
-    Each cell has the effect against no transfer and, in brackets, its p-value by Holm's method over the column.
-    """
+    """Make a table of Taylor & Stone's measures: effect against no transfer and Holm's p-value over the column."""
     curves = {method: curves_of(runs) for method, runs in by_method(results).items()}
     without = curves.pop(m.NO_TRANSFER)
     # The ratio depends on it: the lowest return of any run, the same for all rows.
@@ -96,8 +93,8 @@ def uses_table(results: Mapping[str, Sequence[Result]]) -> Table:
             n_uses = np.array([sum(row[-1] for row in each) for each in uses])
             n_mappings = np.array([len({tuple(row[1:4]) for row in each}) for each in uses])
             per_step = np.mean(n_uses / [sum(result.steps) for result in runs])
-            row = DOMAINS[name].title, method, f"{n_uses.mean():,.0f}", f"{per_step:.3f}", f"{n_mappings.mean():,.0f}"
-            rows.append(row)
+            cells = f"{n_uses.mean():,.0f}", f"{per_step:.3f}", f"{n_mappings.mean():,.0f}"
+            rows.append((DOMAINS[name].title, method, *cells))
     header = ("domain", "method", "uses", "uses a step", "mappings used")
     title = "State-action pairs at the agent's states for which transferred instances were used, mean of the runs"
     return Table(title, header, rows)

@@ -18,16 +18,11 @@ CONTROLS = (m.TIMBREL_RANDOM, m.ONE_RANDOM, m.ORACLE, m.UNRELATED, m.NO_TRANSFER
 
 @dataclass(frozen=True)
 class Target:
-    """A figure or table of the paper.
+    """A figure or table of the paper."""
 
-    :param name: on the command line
-    :param title: what it shows
-    :param methods: names of the methods whose runs it needs, by domain
-    """
-
-    name: str
-    title: str
-    methods: dict[str, tuple[str, ...]]
+    name: str  # on the command line
+    title: str  # what it shows
+    methods: dict[str, tuple[str, ...]]  # names of the methods whose runs it needs, by domain
 
 
 _CAR, _ROBOT = MOUNTAIN_CAR.name, ICUB.name
@@ -60,11 +55,7 @@ _WHY_NOT = {
 
 
 def targets_of(name: str, setting: str) -> list[Target]:
-    """
-    Return the figures and tables that a name stands for: one of :data:`TARGETS`, or "all" for all that exist in the setting.
-
-    :raises ValueError: if the name is unknown, or the figure or table does not exist in the setting
-    """
+    """Return the figures and tables of a name or "all"; ValueError if unknown, or not in the setting."""
     if name == ALL:
         return [target for target in TARGETS.values() if exists_in(target.name, setting)]
     if name not in TARGETS:

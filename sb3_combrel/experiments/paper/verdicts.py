@@ -19,16 +19,13 @@ PAPERS, CONTROL = "paper", "control"
 
 
 class Claim(NamedTuple):
-    """That one method needs fewer environment steps than another in a domain.
-
-    :param kind: whose claim it is: "paper": of its Table 6; "control": what must hold besides for the method to be the reason
-    """
+    """That one method needs fewer environment steps than another in a domain."""
 
     text: str
     domain: str
     better: str
     worse: str
-    kind: str = PAPERS
+    kind: str = PAPERS  # the paper's, of its Table 6; or a control's: what must hold besides
 
 
 _CAR, _ROBOT = MOUNTAIN_CAR.name, ICUB.name
@@ -63,26 +60,16 @@ CLAIMS: Sequence[Claim] = (
 
 
 class Verdict(NamedTuple):
-    """What the runs say of a claim.
-
-    :param saved: environment steps of all episodes that the better method saves, as a fraction of the other's; means
-    :param low: lower bound of its 95% bootstrap interval; ``high``: upper bound
-    :param delta: Cliff's delta: the probability that a run of the better method takes fewer steps than one of the other, less
-        that of the reverse
-    :param p_value: of the permutation test that both take the same steps in the mean
-    :param corrected: the same by Holm's method, for the number of rows of the table
-    :param p_threshold: of the test by Mann and Whitney that both need the same steps until the domain's last threshold, by
-        Holm's method as well
-    """
+    """What the runs say of a claim."""
 
     claim: Claim
-    saved: float
-    low: float
+    saved: float  # environment steps of all episodes that the better method saves, as a fraction of the other's; means
+    low: float  # lower bound of its 95% bootstrap interval; ``high``: upper bound
     high: float
-    delta: float
-    p_value: float
-    corrected: float
-    p_threshold: float
+    delta: float  # Cliff's delta: how much more often a run of the better method takes fewer steps than more
+    p_value: float  # of the permutation test that both take the same steps in the mean
+    corrected: float  # the same by Holm's method, for the number of rows of the table
+    p_threshold: float  # of Mann and Whitney's test of the steps until the domain's last threshold, by Holm's method as well
 
     @property
     def verdict(self) -> str:
@@ -97,9 +84,6 @@ def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verd
 
     The steps of all of a run's episodes, the area under its learning curve, are compared. A claim held if the better method
     takes fewer, with a corrected p-value below ``ALPHA``; the opposite if it takes more, with such a p-value.
-
-    :param steps: by domain and method the steps of each run's episodes, shape (n_runs, n_episodes)
-    :param kind: "paper" or "control"
     """
     totals, p_values, p_thresholds = {}, {}, {}
     for claim in CLAIMS:
@@ -123,16 +107,10 @@ def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verd
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
     """Make a table of verdicts."""
     header = ("claim", "domain", "steps saved", "95% interval", "Cliff's delta", "p", "p (Holm)", "p, threshold", "verdict")
-    rows = [
-        (
-            each.claim.text,
-            DOMAINS[each.claim.domain].title,
-            share_text(each.saved),
-            interval_text(each.low, each.high),
-            f"{without_minus_zero(each.delta, 2):+.2f}",
-            *map(p_text, (each.p_value, each.corrected, each.p_threshold)),
-            each.verdict,
-        )
-        for each in verdicts
-    ]
+    rows = []
+    for each in verdicts:
+        claim = each.claim.text, DOMAINS[each.claim.domain].title
+        saved = share_text(each.saved), interval_text(each.low, each.high), f"{without_minus_zero(each.delta, 2):+.2f}"
+        p_values = map(p_text, (each.p_value, each.corrected, each.p_threshold))
+        rows.append((*claim, *saved, *p_values, each.verdict))
     return Table(title, header, rows)

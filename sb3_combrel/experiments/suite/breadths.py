@@ -65,15 +65,11 @@ def table_of(summary: pd.DataFrame, n_episodes: int) -> Table:
     rows = []
     for setting, runs in summary.groupby("setting", sort=False):
         episodes, ends = runs["episodes_until_learnt"], runs["last_10_median"]
-        row = (
-            str(setting),
-            f"{np.isfinite(episodes).sum()} of {len(runs)}",
-            f"{episodes.median():.0f} ({episodes.min():.0f} to {episodes.max():.0f})",
-            f"{ends.median():g} ({ends.min():g} to {ends.max():g})",
-            f"{runs['steps'].median():,.0f}",
-            f"{runs['ms_per_step'].median():.2f}",
-        )
-        rows.append(row)
+        learnt = f"{np.isfinite(episodes).sum()} of {len(runs)}"
+        after = f"{episodes.median():.0f} ({episodes.min():.0f} to {episodes.max():.0f})"
+        in_the_end = f"{ends.median():g} ({ends.min():g} to {ends.max():g})"
+        steps, ms_per_step = f"{runs['steps'].median():,.0f}", f"{runs['ms_per_step'].median():.2f}"
+        rows.append((str(setting), learnt, after, in_the_end, steps, ms_per_step))
     header = ("task, breadth", "learnt", "after episodes", "commands in the end", "steps in all", "ms a step")
     limits = " and ".join(map(str, LEARNT.values()))
     title = f"Fitted R-Max in {n_episodes} episodes: median of {WINDOW} episodes at most {limits} commands (torso, arm)"

@@ -36,7 +36,6 @@ def variant_of(text: str) -> Variant:
 
     :param text: ``default``; ``name:key=value,key=value``; or a JSON object ``{"name": ..., key: value, ...}``. Keys are
         arguments of :class:`~sb3_combrel.FittedRMax`, and ``transfer``; values are JSON, or text if they are not.
-    :raises ValueError: if it is none of these, or an argument is unknown
     """
     if text.lstrip().startswith("{"):
         arguments = json.loads(text)
@@ -84,9 +83,6 @@ def run_suite(
 
     What is complete is not done again; all runs in the folder are in the CSV files, the tables are of these arguments' runs.
 
-    :param jobs: processes at a time; None: one a core
-    :param reference: name of the variant that the others are compared with; None for the first
-    :param test: one of :data:`~sb3_combrel.comparison.statistics.TESTS`
     :raises ValueError: if an argument is out of its range, or the folder has a run with the same name and other settings
     """
     check_count("jobs", jobs, none_allowed=True)

@@ -19,16 +19,11 @@ TOLERATED_LOSS = 0.05
 
 
 class Measure(NamedTuple):
-    """A number that describes the learning of a task.
+    """A number that describes the learning of a task."""
 
-    :param name: its column in tables
-    :param of: from the episodes of learning to the number; NaN if there were too few, inf if a limit was never reached
-    :param higher_is_better: whether more of it is better
-    """
-
-    name: str
-    of: Callable[[Episodes], float]
-    higher_is_better: bool = False
+    name: str  # its column in tables
+    of: Callable[[Episodes], float]  # NaN if there were too few episodes, inf if a limit was never reached
+    higher_is_better: bool = False  # whether more of it is better
 
 
 def steps_in(first: int, last: int) -> Measure:
@@ -51,10 +46,7 @@ def mean_return_in(first: int, last: int) -> Measure:
 
 
 def steps_until_always(limit: int) -> Measure:
-    """Measure after how many steps of learning every further episode has at most ``limit`` steps; inf if that is never so.
-
-    At least :data:`SHORTEST_TAIL` episodes must be left: a single short one at the end would prove nothing.
-    """
+    """Measure the steps until all further episodes (:data:`SHORTEST_TAIL` or more) have at most ``limit``, or inf."""
     return Measure(f"steps_until_always_{limit}", lambda episodes: settled_after(episodes.steps, limit))
 
 
@@ -75,7 +67,7 @@ def settled_after(steps: np.ndarray, limit: int) -> float:
 
 
 def failures(episodes: Episodes, failure_return: float | None) -> np.ndarray:
-    """Tell which episodes have failed: those whose return is at most ``failure_return``; None: those that a time limit ended."""
+    """Tell which episodes failed: return at most ``failure_return``; None: those that a time limit ended."""
     return ~episodes.terminated if failure_return is None else episodes.returns <= failure_return
 
 
@@ -89,10 +81,7 @@ def summary_of_learning(episodes: Episodes, failure_return: float | None) -> dic
 
 
 def summary_of_evaluation(episodes: Episodes, failure_return: float | None, last10_return: float) -> dict[str, float]:
-    """Return what is recorded of evaluation episodes, at least one.
-
-    ``as_good`` is 1 if the mean return is at most 5% below that of the last episodes of learning and no episode failed.
-    """
+    """Summarize evaluation episodes; ``as_good``: return at most 5% below that of the last of learning, and no failure."""
     mean, n_failures = float(episodes.returns.mean()), int(failures(episodes, failure_return).sum())
     as_good = n_failures == 0 and mean >= last10_return - TOLERATED_LOSS * abs(last10_return)
     return {"mean": mean, "worst": float(episodes.returns.min()), "failures": n_failures, "as_good": float(as_good)}

@@ -25,16 +25,11 @@ COMMON = {UNTESTED: False, "last10_return": True, "last10_failed": False} | {
 
 
 class Cell(NamedTuple):
-    """One column of the runs of one task and variant.
+    """One column of the runs of one task and variant."""
 
-    :param values: one for each seed; NaN and inf where a run has no value or never reached a limit
-    :param higher_is_better: whether more is better
-    :param p_value: against the reference variant, by Holm's correction; NaN without a test
-    """
-
-    values: np.ndarray
-    higher_is_better: bool
-    p_value: float
+    values: np.ndarray  # one for each seed; NaN and inf where a run has no value or never reached a limit
+    higher_is_better: bool  # whether more is better
+    p_value: float  # against the reference variant, by Holm's correction; NaN without a test
 
     def mean(self) -> str:
         """Mean and its standard error; where runs never reached a limit, how many did."""
@@ -61,13 +56,7 @@ def columns_of(task: Task) -> dict[str, bool]:
 def cells_of(
     rows: Sequence[dict[str, Any]], tasks: Sequence[Task], variants: Sequence[str], reference: str | None, test: str
 ) -> Cells:
-    """
-    Gather the values of all columns, and test the variants against a reference; Holm's correction is over those of a column.
-
-    :param rows: the ``row`` of each run
-    :param reference: the variant that the others are compared with; None for no tests
-    :param test: see :func:`~sb3_combrel.comparison.statistics.p_value_of_difference`
-    """
+    """Gather the values of all columns, and test variants against a reference, if any; Holm's correction is over a column."""
     runs = {key: own for key, own in pd.DataFrame(rows).groupby(["task", "variant"])}
     cells = {}
     for task in tasks:
@@ -109,10 +98,8 @@ def frozen_table(cells: Cells, tasks: Sequence[Task], variants: Sequence[str]) -
             stuck = np.sum(own["last10_failed"].values == 1.0)
             rows.append((*row, f"{stuck:.0f}", own[UNTESTED].mean()))
     header = ("task", "variant", "last 10 of learning", "greedy", "worst", "as good", "without state", "worst", "as good")
-    title = (
-        "Returns of the frozen policy; as good: no failure and at most 5% below the last 10 episodes of learning; "
-        "stuck: runs whose last 10 episodes of learning all failed"
-    )
+    as_good = "as good: no failure and at most 5% below the last 10 episodes of learning"
+    title = f"Returns of the frozen policy; {as_good}; stuck: runs whose last 10 episodes of learning all failed"
     return Table(title, (*header, "stuck", "ms a step"), rows)
 
 

@@ -35,10 +35,7 @@ LAST_EXPONENT = 3.0
 
 
 class MeanSuccessor(Model):
-    """Weighted linear regression on the nearest instances, computed anew at each transition; the mean is the only successor.
-
-    Parameters: see :class:`~sb3_combrel.models.base.Model`.
-    """
+    """Weighted linear regression on the nearest instances, computed anew at each transition; the only successor: the mean."""
 
     n_successors: ClassVar[int] = 1
 
@@ -97,11 +94,7 @@ def _successors(
 def _fit(
     at: np.ndarray, states: np.ndarray, effects: np.ndarray, weight: np.ndarray, ridge: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Fit effects as linear functions of the state, once for each of n states ``at``, from k instances of shape (n, k, d) each.
-
-    :return: effects at ``at``, shape (n, d), and residuals of the instances, shape (n, k, d)
-    """
+    """Fit effects at n states from k instances of shape (n, k, d) each: effects, (n, d), and residuals, (n, k, d)."""
     share = (weight / weight.sum(axis=1, keepdims=True))[..., None]
     mean_state, mean_effect = (share * states).sum(axis=1), (share * effects).sum(axis=1)
     away, differences = states - mean_state[:, None], effects - mean_effect[:, None]

@@ -30,16 +30,11 @@ WITH_STATE, WITHOUT_STATE = "greedy", "stateless"
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to set the learner.
+    """One way to set the learner."""
 
-    :param name: in tables and file names
-    :param learner: arguments of :class:`~sb3_combrel.FittedRMax`; they come before the task's own
-    :param transfer: a name of :data:`~sb3_combrel.experiments.suite.transfers.TRANSFERS`, or None
-    """
-
-    name: str
-    learner: Mapping[str, Any] = field(default_factory=dict)
-    transfer: str | None = None
+    name: str  # in tables and file names
+    learner: Mapping[str, Any] = field(default_factory=dict)  # of FittedRMax, before the task's own
+    transfer: str | None = None  # a name of :data:`~sb3_combrel.experiments.suite.transfers.TRANSFERS`, or None
 
     def source(self, task: Task) -> Source | None:
         """The source task that is transferred from to a task; None without transfer."""
@@ -48,12 +43,7 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteRun(Job):
-    """A task learnt with one variant and one seed.
-
-    :param task: the task
-    :param variant: the variant
-    :param evaluation_episodes: episodes to play after learning, with the state of ``predict`` and as many without
-    """
+    """A task learnt with one variant and one seed, then evaluated with the state of ``predict`` and as often without."""
 
     compiled_steps: ClassVar[int] = 60
 
@@ -68,29 +58,18 @@ class SuiteRun(Job):
 
     def settings(self) -> dict[str, Any]:
         """What the result depends on besides the names."""
-        return {
-            "learner": dict(self.learner),
-            "transfer": self.variant.transfer,
-            "n_steps": self.n_steps,
-            "n_episodes": self.n_episodes,
-            "evaluation_episodes": self.evaluation_episodes,
-        }
+        budget = {"n_steps": self.n_steps, "n_episodes": self.n_episodes, "evaluation_episodes": self.evaluation_episodes}
+        return {"learner": dict(self.learner), "transfer": self.variant.transfer, **budget}
 
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
         """Measure the learning, and play the task without exploration: a row of ``runs.csv``."""
         rows = list(zip(result.steps, result.returns, result.terminated, strict=True))
         learnt = Episodes.from_rows(rows)
-        row: dict[str, Any] = {
-            "run": f"{self.task.name}_{self.variant.name}_seed{self.seed}",
-            "task": self.task.name,
-            "variant": self.variant.name,
-            "seed": self.seed,
-            "episodes": len(rows),
-            "steps": result.n_steps,
-            "ms_per_step": 1000.0 * result.seconds / result.n_steps,
-            **{measure.name: measure.of(learnt) for measure in self.task.measures},
-            **summary_of_learning(learnt, self.task.failure_return),
-        }
+        task, variant, seed = self.task.name, self.variant.name, self.seed
+        row: dict[str, Any] = {"run": f"{task}_{variant}_seed{seed}", "task": task, "variant": variant, "seed": seed}
+        row |= {"episodes": len(rows), "steps": result.n_steps, "ms_per_step": 1000.0 * result.seconds / result.n_steps}
+        row |= {measure.name: measure.of(learnt) for measure in self.task.measures}
+        row |= summary_of_learning(learnt, self.task.failure_return)
         for policy, keeps_state in ((WITH_STATE, True), (WITHOUT_STATE, False)):
             with closing(self.make_env()) as env:
                 played = play(model, env, self.evaluation_episodes, EVALUATION_SEED + self.seed, keeps_state)

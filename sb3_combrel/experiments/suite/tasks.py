@@ -28,12 +28,7 @@ from sb3_combrel.wrappers import AngleObservation
 
 
 class NoisyActions(gym.ActionWrapper):
-    """Replaces an action, now and then, by one drawn uniformly from all actions, with the environment's own generator.
-
-    :param env: an environment with Discrete actions
-    :param probability: of a replacement, in [0, 1]
-    :raises ValueError: if the probability is out of its range
-    """
+    """Replaces a Discrete action, with a probability, by one drawn uniformly from all, by the environment's generator."""
 
     def __init__(self, env: gym.Env, probability: float = 0.1):
         super().__init__(env)
@@ -61,27 +56,18 @@ class Source:
 class Task:
     """A task to learn, and how learning it is measured. Exactly one of ``n_steps`` and ``n_episodes`` is given.
 
-    :param name: in tables and on the command line
-    :param make: makes the environment; its seed is that of the run
-    :param learner: arguments of :class:`~sb3_combrel.FittedRMax` that describe the task: ``gamma``, ``max_value``, ``bounds``
-    :param n_steps: steps to learn
-    :param n_episodes: episodes to learn
-    :param measures: of the episodes of learning
-    :param headline: the column that stands for the task in the overview, a measure or one of the evaluation
-    :param failure_return: an episode with at most this return is a failure; None: one that a time limit ends
-    :param source: source task for transfer
     :raises ValueError: if both or none of ``n_steps`` and ``n_episodes`` are given
     """
 
-    name: str
-    make: Callable[[], gym.Env]
-    learner: Mapping[str, Any] = field(default_factory=dict)
-    n_steps: int | None = None
-    n_episodes: int | None = None
-    measures: tuple[Measure, ...] = ()
-    headline: str = "greedy_mean"
-    failure_return: float | None = None
-    source: Source | None = None
+    name: str  # in tables and on the command line
+    make: Callable[[], gym.Env]  # makes the environment; its seed is that of the run
+    learner: Mapping[str, Any] = field(default_factory=dict)  # of FittedRMax, that describe the task: gamma, max_value, bounds
+    n_steps: int | None = None  # steps to learn
+    n_episodes: int | None = None  # episodes to learn
+    measures: tuple[Measure, ...] = ()  # of the episodes of learning
+    headline: str = "greedy_mean"  # the column that stands for the task in the overview, a measure or one of the evaluation
+    failure_return: float | None = None  # an episode with at most this return is a failure; None: one that a time limit ends
+    source: Source | None = None  # source task for transfer
 
     def __post_init__(self) -> None:
         check_budget(self.name, self.n_steps, self.n_episodes)
@@ -115,10 +101,7 @@ CAP = 2000
 #: A hit by the first command returns 99.
 STRIKE: dict[str, Any] = {"max_value": 100.0}
 #: As in zoo_configs/fitted_rmax.yml: the bounds of the velocities leave out what the swing-up does not reach.
-ACROBOT: dict[str, Any] = {
-    "gamma": 0.99,
-    "bounds": ([-np.pi, -np.pi, -7.0, -12.0], [np.pi, np.pi, 7.0, 12.0]),
-}
+ACROBOT: dict[str, Any] = {"gamma": 0.99, "bounds": ([-np.pi, -np.pi, -7.0, -12.0], [np.pi, np.pi, 7.0, 12.0])}
 
 #: A twentieth of the robot's step. Without any it visits the points of a lattice only, which is a case of its own.
 SLIGHT_NOISE = 0.003

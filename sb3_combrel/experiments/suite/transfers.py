@@ -56,27 +56,19 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
 
 
 def source_for(name: str, task: Task) -> Source:
-    """Return the source task from which a transfer method transfers to a task: its own; ``COMBREL@other-domain``: another's.
-
-    :raises ValueError: if the task has no source task, or none of another domain is known
-    """
+    """Return a transfer method's source task: the task's own; ``COMBREL@other-domain``: another's; else ValueError."""
     if task.source is None:
         raise ValueError(f"transfer={name}: the task {task.name} has no source task")
     if name != OTHER_DOMAIN:
         return task.source
     if task.source.name not in OTHER_DOMAINS:
-        raise ValueError(
-            f"transfer={name}: for {task.name} no source of another domain is known; known are those for tasks whose own "
-            f"source is one of {', '.join(OTHER_DOMAINS)}, got {task.source.name!r}"
-        )
+        known = f"known are those for tasks whose own source is one of {', '.join(OTHER_DOMAINS)}, got {task.source.name!r}"
+        raise ValueError(f"transfer={name}: for {task.name} no source of another domain is known; {known}")
     return OTHER_DOMAINS[task.source.name]
 
 
 def check_transfer(name: str, task: Task) -> None:
-    """Check that a task can be learnt with a transfer method.
-
-    :raises ValueError: if the name is unknown, the task has no such source task, or the mapping that is asked for is not known
-    """
+    """Raise ValueError if the transfer method's name is unknown, or the task has no such source task or known mapping."""
     if name not in TRANSFERS:
         raise ValueError(f"transfer must be one of {', '.join(TRANSFERS)}, got {name!r}")
     source_for(name, task)

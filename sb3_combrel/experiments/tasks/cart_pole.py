@@ -25,11 +25,7 @@ N_SOURCE_EPISODES = 50
 SOURCE_DEGREE = 0
 
 #: As in zoo_configs/fitted_rmax.yml. The velocities of the pole and the cart have no bounds of their own.
-LEARNER: dict[str, Any] = {
-    "gamma": 0.99,
-    "max_value": 100.0,
-    "bounds": ([-4.8, -3.0, -0.23, -3.2], [4.8, 3.0, 0.23, 3.2]),
-}
+LEARNER: dict[str, Any] = {"gamma": 0.99, "max_value": 100.0, "bounds": ([-4.8, -3.0, -0.23, -3.2], [4.8, 3.0, 0.23, 3.2])}
 
 #: Half the length of the pole, as Gymnasium counts it: 0.5 in CartPole-v1.
 LONG = 1.0
@@ -56,11 +52,7 @@ def make_cart_pole(half_length: float | None = None, order: Sequence[int] | None
 
 
 def permuted(env: gym.Env, order: Sequence[int]) -> gym.Env:
-    """Put the variables of an environment's observations, and their bounds, in another order.
-
-    :param order: for each variable of the new observation the index of the old one
-    :raises ValueError: if ``order`` is no permutation of the variables
-    """
+    """Put the variables of an environment's observations and bounds in another order: for each new one the old one's index."""
     box = env.observation_space
     assert isinstance(box, spaces.Box)
     (n_variables,) = box.shape

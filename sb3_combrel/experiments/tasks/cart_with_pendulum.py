@@ -41,7 +41,6 @@ class CartWithPendulumEnv(gym.Env[np.ndarray, np.int64]):
     in the negative and one in the positive direction. With both, a push also accelerates the pendulum a little, which neither
     part alone does.
 
-    :param parts: "cart", "pendulum" or "both"
     :raises ValueError: if ``parts`` is another
     """
 

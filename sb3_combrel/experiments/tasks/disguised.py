@@ -14,12 +14,7 @@ from sb3_combrel.experiments.tasks.cart_pole import permuted
 
 
 class RenamedActions(gym.ActionWrapper):
-    """Gives the actions of an environment other numbers.
-
-    :param env: an environment with Discrete actions that are counted from 0
-    :param order: for each new action the old one
-    :raises ValueError: if ``order`` is no permutation of the actions
-    """
+    """Gives the actions of an environment, counted from 0, other numbers: ``order`` has for each new action the old one."""
 
     def __init__(self, env: gym.Env, order: Sequence[int]):
         super().__init__(env)
@@ -34,11 +29,7 @@ class RenamedActions(gym.ActionWrapper):
 
 
 def mirrored(env: gym.Env, variables: Sequence[bool]) -> gym.Env:
-    """Mirror variables of an environment's observations in their ranges: what was lowest is highest.
-
-    :param variables: whether each variable is mirrored
-    :raises ValueError: if their number is another, or one that is mirrored has no finite bounds
-    """
+    """Mirror some variables of an environment's observations in their finite ranges: what was lowest is highest."""
     box = env.observation_space
     assert isinstance(box, spaces.Box)
     flags = np.array(variables, dtype=np.bool_)
@@ -58,14 +49,7 @@ def mirrored(env: gym.Env, variables: Sequence[bool]) -> gym.Env:
 
 
 def disguised(env: gym.Env, order: Sequence[int], signs: Sequence[int], actions: Sequence[int]) -> gym.Env:
-    """Make an environment that is another one, renamed; :func:`disguise` is the mapping back.
-
-    :param env: an environment with a Box of shape (n_variables,) and Discrete actions
-    :param order: for each new variable the index of the old one
-    :param signs: for each new variable 1, or -1 if it is mirrored
-    :param actions: for each new action the old one
-    :raises ValueError: if these do not fit the environment
-    """
+    """Make an environment with new orders, signs and actions, renamed; :func:`disguise` is the mapping back."""
     return RenamedActions(mirrored(permuted(env, order), [sign < 0 for sign in signs]), actions)
 
 

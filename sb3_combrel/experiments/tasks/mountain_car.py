@@ -18,10 +18,7 @@ NO_TRANSFER, RANDOM = "no transfer", "random mapping"
 
 
 def intuitive_mapping() -> list[InterTaskMapping]:
-    """Return the mapping that a person would choose, one for each action of the target.
-
-    With Neutral, West and East the variables of x are mapped, with South and North those of y; the others are left unmapped.
-    """
+    """Return what a person would choose: Neutral, West and East map the variables of x, South and North those of y."""
     to_source_action = (0, 1, 2, 1, 2)
     along_x = InterTaskMapping(state=(0, None, 1, None), action=to_source_action)
     along_y = InterTaskMapping(state=(None, 0, None, 1), action=to_source_action)
@@ -29,10 +26,7 @@ def intuitive_mapping() -> list[InterTaskMapping]:
 
 
 def factored_mapping(n_axes: int) -> FactoredMapping:
-    """Return the mapping that a person would choose with ``use="prior"``: for each axis a car of the source.
-
-    :param n_axes: 2 or 3, of the target
-    """
+    """Return the mapping that a person would choose with ``use="prior"``: for each axis a car of the source."""
     copies = []
     for axis in range(n_axes):
         state: list[int | None] = [None] * (2 * n_axes)

@@ -20,9 +20,7 @@ GOAL_SIZE = 0.15
 
 
 class Box(NamedTuple):
-    """
-    A box of the unit square or cube, given by two corners; a wall's inside is where the robot cannot be, its faces are free.
-    """
+    """A box of the unit square or cube, given by two corners; the robot cannot be inside a wall, whose faces are free."""
 
     low: np.ndarray
     high: np.ndarray
@@ -33,11 +31,7 @@ class Box(NamedTuple):
 
 
 def slab(axis: int, low: float, high: float, gap: Sequence[tuple[float, float]]) -> list[Box]:
-    """Make a wall across the unit box from ``low`` to ``high`` along an axis, with a gap.
-
-    :param gap: (lower, upper) end of the gap along each of the other axes, in their order
-    :return: boxes that together are the wall; a wall ends outside the unit box, so that its faces there are no way past it
-    """
+    """Make a wall of boxes, that end outside the unit box, from ``low`` to ``high`` along an axis, with a gap."""
     others = [other for other in range(len(gap) + 1) if other != axis]
     rest_low, rest_high = np.full(len(gap) + 1, -1.0), np.full(len(gap) + 1, 2.0)
     rest_low[axis], rest_high[axis] = low, high
@@ -64,9 +58,7 @@ WALLS: dict[int, tuple[Box, ...]] = {
 
 
 def move(position: np.ndarray, displacement: np.ndarray, walls: Sequence[Box]) -> np.ndarray:
-    """
-    Move a point of the unit box, axis by axis, until a wall or the boundary stops it; the new position, shape (n_variables,).
-    """
+    """Move a point of the unit box, axis by axis, until a wall or the boundary stops it; shape (n_variables,)."""
     position = position.copy()
     for axis in np.flatnonzero(displacement):
         here, there = position[axis], float(np.clip(position[axis] + displacement[axis], 0.0, 1.0))
