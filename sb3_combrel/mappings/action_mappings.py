@@ -80,11 +80,8 @@ class AllActionMappings(ActionMappings):
 
     def __getitem__(self, index: int) -> tuple[int, ...]:
         self._check_index(index)
-        digits = []
-        for _ in range(self.n_target_actions):
-            index, digit = divmod(index, self.n_source_actions)
-            digits.append(digit)
-        return tuple(reversed(digits))
+        n = self.n_source_actions
+        return tuple(index // n**place % n for place in reversed(range(self.n_target_actions)))
 
     def count(self, action: int, source_action: int) -> int:
         return self.n_source_actions ** (self.n_target_actions - 1) if 0 <= source_action < self.n_source_actions else 0
@@ -95,11 +92,7 @@ class AllActionMappings(ActionMappings):
 
 @dataclass(frozen=True)
 class BalancedActionMappings(ActionMappings):
-    """The functions that use the source actions as equally as possible, in lexicographic order; nothing is stored.
-
-    For five target and three source actions these are the 90 that use them 2, 2 and 1 times (the paper, Section 5.1;
-    all mappings of its Table 2 are of this kind).
-    """
+    """The functions that use the source actions as equally as possible (Section 5.1), in lexicographic order, not stored."""
 
     n_source_actions: int
     n_target_actions: int
@@ -169,18 +162,13 @@ def _balanced_completions(usage: tuple[int, ...], n_target: int) -> int:
 
 
 class ListedActionMappings(ActionMappings):
-    """Action mappings given one by one.
-
-    :param mappings: one mapping a row, shape (n, n_target_actions)
-    :param n_source_actions: number of actions of the source task; None to take the largest one used plus 1
-    :raises ValueError: if the rows are not integers in range
-    """
+    """Action mappings given one by one, one a row, shape (n, n_target_actions); ``ValueError`` for anything else."""
 
     def __init__(self, mappings: ArrayLike, n_source_actions: int | None = None) -> None:
         array = index_table("action mappings", mappings, "(n, n_target_actions)")
         check_count("n_source_actions", n_source_actions, none_allowed=True)
         self.mappings: Ints = array
-        self.mappings.flags.writeable = False
+        array.flags.writeable = False
         self.n_target_actions = int(array.shape[1])
         self.n_source_actions = int(array.max()) + 1 if n_source_actions is None else n_source_actions
         if array.min() < 0 or array.max() >= self.n_source_actions:

@@ -48,14 +48,10 @@ _FACTORED_SETS = ("factored", "signed_factored")
 
 
 class Candidates(NamedTuple):
-    """The different ways in which the mappings of a set treat one target action; compliance distinguishes no others.
+    """The different ways in which the mappings of a set treat one target action; compliance distinguishes no others."""
 
-    :param state_index: row of ``MappingSet.state_mappings``, shape (n_candidates,)
-    :param source_action: source action that the target action maps to, shape (n_candidates,)
-    """
-
-    state_index: Ints
-    source_action: Ints
+    state_index: Ints  # row of ``MappingSet.state_mappings``, shape (n_candidates,)
+    source_action: Ints  # that the target action maps to, same shape
 
 
 class MappingSet:
@@ -186,11 +182,8 @@ class MappingSet:
         unsigned = name.removeprefix("signed_")
         once, allow_none, action_mappings = _SETS[unsigned]
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=once, allow_none=allow_none)
-        actions = action_mappings(n_source_actions, n_target_actions)
-        mirrored = None
-        if signs or unsigned != name:
-            rows, mirrored = with_mirrored(rows)
-        return cls(rows, actions, mirrored)
+        rows, mirrored = with_mirrored(rows) if signs or unsigned != name else (rows, None)
+        return cls(rows, action_mappings(n_source_actions, n_target_actions), mirrored)
 
     @classmethod
     def paper_mountain_car(cls) -> MappingSet:
@@ -375,8 +368,7 @@ def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:
     if mappings.pairs is not None:
         members = [{"state": each.state, "action": each.action, "sign": each.sign} for each in mappings]
         return "ListedMappingSet", {"mappings": members}
-    factors = {"state_mappings": mappings.state_mappings, "signs": mappings.signs, "actions": mappings.actions}
-    return "MappingSet", factors
+    return "MappingSet", {name: getattr(mappings, name) for name in ("state_mappings", "signs", "actions")}
 
 
 register_writer(MappingSet, _write)

@@ -22,12 +22,9 @@ TWO_VARIABLES_ON_FOUR: Ints = np.array(list(permutations((0, 1, UNMAPPED, UNMAPP
 
 
 def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, allow_none: bool) -> Ints:
-    """Every state mapping that uses as many different source variables as there is room for.
+    """Every state mapping that uses as many different source variables as there is room for, -1 for None, one a row.
 
-    :param once: whether a source variable is used at most once
-    :param allow_none: whether target variables may be left unmapped
-    :return: one mapping a row in lexicographic order (None first), shape (n, n_target), -1 for None
-    :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` mappings
+    ``once``: each at most once. In lexicographic order, None first; ``ValueError`` if a number is below 1, or too many.
     """
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
@@ -45,11 +42,9 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
 
 
 def copies_of_source(n_source: int, n_target: int) -> Ints:
-    """Every way to make a copy of the source, or of some of its variables, of different target variables.
+    """Every way to make a copy of the source, or of some of its variables, of different target variables: as state mappings.
 
-    :return: source variable of each target variable, -1 for those that are not in the copy; one copy a row, those with more
-        variables first, shape (n, n_target)
-    :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` copies
+    Those with more variables come first; ``ValueError`` as of :func:`state_mappings_using_sources`.
     """
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
@@ -57,21 +52,14 @@ def copies_of_source(n_source: int, n_target: int) -> Ints:
     _check_n_state_mappings(sum(comb(n_source, k) * perm(n_target, k) for k in range(1, largest + 1)))
     rows = []
     for size in range(largest, 0, -1):
-        for used in combinations(range(n_source), size):
-            for taken in permutations(range(n_target), size):
-                row = np.full(n_target, UNMAPPED, dtype=np.int64)
-                row[list(taken)] = used
-                rows.append(row)
+        for used, taken in product(combinations(range(n_source), size), permutations(range(n_target), size)):
+            rows.append(np.full(n_target, UNMAPPED, dtype=np.int64))
+            rows[-1][list(taken)] = used
     return np.array(rows)
 
 
 def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
-    """Every state mapping with every choice of signs for its mapped variables.
-
-    :param state_mappings: shape (n, n_target), -1 for None
-    :return: the mappings and their signs (+1 or -1), both of shape (m, n_target); each mapping first with +1 throughout
-    :raises ValueError: if there are more than ``MAX_STATE_MAPPINGS``
-    """
+    """Every state mapping with every choice of signs for its mapped variables, +1 throughout first, and the signs."""
     mapped = state_mappings != UNMAPPED
     _check_n_state_mappings(sum(2**n for n in mapped.sum(axis=1).tolist()))
     rows, signs = [], []

@@ -28,8 +28,7 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     episodes = list(data.iterate_episodes())
     actions = np.concatenate([np.asarray(episode.actions) for episode in episodes])
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
-    env_spec = data.env_spec
-    unnamed = {"env": None if env_spec is None else env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
+    unnamed = {"env": None if data.env_spec is None else data.env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
     names = {name: tuple(each) for name, each in kept.get("names", {}).items()}
     return Transitions(
         np.concatenate([episode.observations[:-1] for episode in episodes]),

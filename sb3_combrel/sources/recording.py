@@ -80,11 +80,7 @@ def log_step(
     step: tuple[Any, NDArray[Any], NDArray[Any], Sequence[Mapping[str, Any]]],
     max_transitions: int | None = None,
 ) -> NDArray[Any]:
-    """Add one step of all environments, up to ``max_transitions`` in all, and return the raw states that it led to.
-
-    :param states: raw states in which the step began
-    :param step: what ``env.step`` returned: states as a model sees them, rewards, dones, infos
-    """
+    """Add what ``env.step`` returned to the log, which began in raw ``states``; return the raw states that it led to."""
     seen, rewards, dones, infos = step
     normalize = unwrap_vec_normalize(env)
     following = raw_states(env, seen)

@@ -161,8 +161,7 @@ class SourceInstances:
         total_timesteps = as_transition_count("total_timesteps", total_timesteps)
         n_instances = as_count("n_instances", n_instances, max=total_timesteps, why_max="total_timesteps")
         check_method(method)
-        learned = learn_q_learning(env, seed, total_timesteps, learner)
-        return cls(*learned).subset(n_instances, method, seed)
+        return cls(*learn_q_learning(env, seed, total_timesteps, learner)).subset(n_instances, method, seed)
 
     @classmethod
     def from_fitted_rmax(
@@ -185,8 +184,7 @@ class SourceInstances:
         """
         n_instances = as_transition_count("n_instances", n_instances)
         check_method(method)
-        learned = LEARNERS["fitted_rmax"](env, seed, n_episodes, learner)
-        return cls(*learned).subset(n_instances, method, seed)
+        return cls(*LEARNERS["fitted_rmax"](env, seed, n_episodes, learner)).subset(n_instances, method, seed)
 
     @classmethod
     def from_minari(

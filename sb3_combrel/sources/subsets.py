@@ -30,15 +30,7 @@ def covering_rows(
     rng: np.random.Generator,
     periodic: NDArray[np.bool_] | None = None,
 ) -> Ints:
-    """About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
-
-    :param units: where the instances start, unit coordinates, shape (n, n_variables)
-    :param actions: shape (n,); ``terminated``: bool, same shape
-    :param n_rows: number of instances to select, less than n
-    :param rng: picks the first instance of each action
-    :param periodic: which state variables are periodic, bool, shape (n_variables,); None for none
-    :return: row numbers, ascending
-    """
+    """About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection."""
     rows_of = [np.flatnonzero(actions == action) for action in np.unique(actions)]
     quotas = _equal_quotas(np.array([len(rows) for rows in rows_of]), n_rows)
     # Selected rows of an action come in the order of selection, so the last one is the least informative.

@@ -101,8 +101,12 @@ class Transfer(ABC):
 
         :param points: rows of ``task.sample_states``, int64, shape (n,)
         """
+        return self.transferred(self._bound_task.sample_states[points], actions, own_weight)
+
+    @property
+    def _bound_task(self) -> TargetTask:
         assert self.task is not None
-        return self.transferred(self.task.sample_states[points], actions, own_weight)
+        return self.task
 
     @property
     def informs_model(self) -> bool:

@@ -86,13 +86,10 @@ class Candidates:
     Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
     of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished
     (``whole``): then each is a candidate of every action, in the same order.
-
-    :raises ValueError: if source or mappings do not fit the target, or if there are too many whole mappings
     """
 
     def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask, whole: bool = False):
-        self.task = task
-        self.whole = whole
+        self.task, self.whole = task, whole
         self.sources = load_sources(source)
         self.sets = resolved_sets(self.sources, mappings, task)
         self.instances = stacked_instances(self.sources)
@@ -120,9 +117,7 @@ class Candidates:
 
     def _numbered(self) -> CandidateArrays:
         """Number the candidates of every target action, over all sources."""
-        rows: list[np.ndarray] = []
-        actions: list[np.ndarray] = []
-        first = [0]
+        rows, actions, first = [], [], [0]
         for a in range(self.task.n_actions):
             row_offset = action_offset = 0
             for number, (source, mappings) in enumerate(zip(self.sources, self.sets, strict=True)):
@@ -136,11 +131,8 @@ class Candidates:
                 row_offset += mappings.n_state_mappings
                 action_offset += source.n_actions
             first.append(len(self.origins))
-        return CandidateArrays(
-            first=np.array(first, dtype=np.int64),
-            row=np.concatenate(rows).astype(np.int64),
-            action=np.concatenate(actions).astype(np.int64),
-        )
+        row, action = (np.concatenate(columns).astype(np.int64) for columns in (rows, actions))
+        return CandidateArrays(np.array(first, dtype=np.int64), row, action)
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -165,8 +157,7 @@ class Candidates:
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""
         number, action, state_index, source_action = self.origins[candidate]
-        mappings = self.sets[number]
-        whole = repr(mappings[mappings.find(state_index, action, source_action)])
+        whole = repr(self.sets[number][self.sets[number].find(state_index, action, source_action)])
         variables = whole[whole.index("(") + 1 : whole.index(";")]
         names, whole_actions = self.sources[number].action_names, []
         if self.whole:
@@ -195,38 +186,26 @@ class Candidates:
 
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
-    """Return the instances that a user means (:func:`~sb3_combrel.sources.recipes.find_source`), of one source or of several.
-
-    :raises FileNotFoundError: if there is neither a file nor a task of that name
-    :raises ValueError: if it is something else, or the task cannot be learned
-    """
-    if isinstance(source, Sequence) and not isinstance(source, str):
-        check_source(source)
-        return [instances for one in source for instances in load_sources(one)]
+    """Return the instances of one source or of several, see :func:`~sb3_combrel.sources.recipes.find_source`."""
     check_source(source)
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        return [instances for one in source for instances in load_sources(one)]
     return [find_source(source)]
 
 
 def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:
-    """Return the set of mappings that a user means for each source, with names.
-
-    :raises ValueError: if it is factored, or does not fit the tasks
-    """
+    """Return the set of mappings that a user means for each source, with names; ``ValueError`` if it does not fit."""
     if isinstance(mappings, FactoredMapping):
         raise ValueError(f'factored mappings need use="prior", got mappings={mappings!r}')
-    return [
-        resolve(mappings, **sizes(one, task)).with_names(
-            one.state_names, task.state_names, one.action_names, task.action_names
-        )
-        for one in sources
-    ]
+    found = []
+    for one in sources:
+        names = one.state_names, task.state_names, one.action_names, task.action_names
+        found.append(resolve(mappings, **sizes(one, task)).with_names(*names))
+    return found
 
 
 def load_one_source(source: SourceLike, method: str) -> SourceInstances:
-    """Return what :func:`load_sources` does, of one source; ``method``: for the message.
-
-    :raises ValueError: also if there are several
-    """
+    """Return what :func:`load_sources` does, of one source; a ValueError that names the ``method`` if there are several."""
     found = load_sources(source)
     if len(found) > 1:
         raise ValueError(f"source must be one source with {method}, got {len(found)}")

@@ -69,21 +69,14 @@ class OutcomeEvidence:
 
     def __init__(self, rewards: np.ndarray, threshold: float, no_end: float | None = None):
         self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
-        self.threshold = threshold
-        self.no_end = threshold if no_end is None else no_end
+        self.threshold, self.no_end = threshold, threshold if no_end is None else no_end
         self.forget()
 
     def forget(self) -> None:
         """Forget all transitions."""
-        self.confirmed = 0
-        #: Ends that were not predicted.
-        self.unpredicted = 0
-        #: Visits to where an end is predicted that have left without one, or lasted for long.
-        self.absent = 0
-        self.rewards_right = 0
-        self.rewards_wrong = 0
-        self.in_vain = 0
-        self.steps_of_visit = 0
+        # Unpredicted: ends; absent: visits to where an end is predicted that have left without one, or lasted for long.
+        self.confirmed = self.unpredicted = self.absent = 0
+        self.rewards_right = self.rewards_wrong = self.in_vain = self.steps_of_visit = 0
         self.reward_range = (np.inf, -np.inf)
 
     def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
@@ -91,10 +84,8 @@ class OutcomeEvidence:
         self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
         has_data = weight >= self.threshold
         if has_data:
-            if abs(reward - predicted_reward) > self.tolerance:
-                self.rewards_wrong += 1
-            else:
-                self.rewards_right += 1
+            wrong = bool(abs(reward - predicted_reward) > self.tolerance)
+            self.rewards_wrong, self.rewards_right = self.rewards_wrong + wrong, self.rewards_right + (not wrong)
         if terminated:
             if end >= GOES_ON or self.steps_of_visit:
                 self.confirmed += 1

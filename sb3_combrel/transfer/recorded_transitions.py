@@ -16,11 +16,8 @@ class RecordedTransitions:
 
     def __init__(self, n_variables: int):
         self.n = 0
-        self.states = np.empty((64, n_variables))
-        self.effects = np.empty((64, n_variables))
-        self.rewards = np.empty(64)
-        self.actions = np.empty(64, dtype=np.int64)
-        self.ended = np.empty(64, dtype=np.int64)
+        self.states, self.effects, self.rewards = np.empty((64, n_variables)), np.empty((64, n_variables)), np.empty(64)
+        self.actions, self.ended = np.empty(64, dtype=np.int64), np.empty(64, dtype=np.int64)
 
     def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
         """Record one transition; ``effect``: next state minus state; return its number."""

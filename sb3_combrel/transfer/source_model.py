@@ -37,12 +37,7 @@ def source_arrays(plain):
 
 @inner
 def predict_source(instances, effect_range, kernel, near, action, state, effect):
-    """Predict one state and action of the source.
-
-    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
-    :param effect: receives the predicted displacement, shape (n_variables,)
-    :return: reward, probability of termination, weight (see :class:`SourceModel`); all 0 for an action without instances
-    """
+    """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
     item, distance = near.item[action], near.distance[action]
     length = nearest_instances(instances, action, state, kernel.reach, item, distance, near.length[action])
     near.length[action] = length
@@ -53,10 +48,7 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
     scale = narrowed(distance[length - 1], kernel) if length == kernel.n_neighbors else kernel.scale
     sums, products = near.products[0], near.products[1]
     sums[:] = 0.0
-    total = 0.0
-    outcomes = 0.0
-    reward = 0.0
-    end = 0.0
+    total, outcomes, reward, end = 0.0, 0.0, 0.0, 0.0
     for k in range(length):
         i = item[k]
         bring_near(instances.state[action, i], state, instances.periodic, near.state)
@@ -114,10 +106,7 @@ class SourceModel:
     far the state is from their mean in units of their spread along that way: so the variance of what a linear fit predicts
     grows. At the edge of its data a source knows less than the number of instances nearby suggests.
 
-    :param instances: of the source, in unit coordinates of it
-    :param breadth: unit coordinates of the source
-    :param n_neighbors: nearest instances of a fit
-    :param outcome_breadth: unit coordinates of the source; no broader than ``breadth``
+    All of it is in unit coordinates of the source. ``outcome_breadth`` is no broader than ``breadth``.
     """
 
     def __init__(
@@ -128,8 +117,7 @@ class SourceModel:
         outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
     ):
         n_actions, _, d = instances.state.shape
-        self.n_variables = d
-        self.instances = instances
+        self.n_variables, self.instances = d, instances
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
             reach=np.inf,

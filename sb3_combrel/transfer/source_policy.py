@@ -27,8 +27,7 @@ _TOLERANCE = 0.001
 def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadth: float, min_weight: float) -> FiniteMDP:
     """Write what each action, held until the cell is left, does at each point of a grid over the source's states.
 
-    :param model: of the source's instances; ``breadth``: its kernel breadth, for which the grid is chosen
-    :param min_weight: weight of the model's prediction from which on a pair has a model; the others are optimistic
+    Pairs of which the model's prediction weighs less than ``min_weight`` are optimistic.
     """
     grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
     mdp = FiniteMDP(grid, source.n_actions, gamma)
@@ -82,9 +81,7 @@ class SourcePolicy:
         self.grid = mdp.grid
         n, d = source.n_actions, source.n_variables
         self._function = self.values, tuple(CorrectionArrays.empty(d)), self.grid.plain, float(gamma), bounds, planner.upper
-        self._q = QValues(n, d)
-        self._actions = np.arange(n)
-        self._length = np.ones(n, dtype=np.int64)
+        self._q, self._actions, self._length = QValues(n, d), np.arange(n), np.ones(n, dtype=np.int64)
 
     def q_values(self, state: np.ndarray) -> np.ndarray:
         """Action values at a state of the source, unit coordinates; -inf for actions with too few instances near it."""

@@ -167,6 +167,5 @@ class COMBREL(MappingTransfer):
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
         """
         if self.use == "prior":
-            assert self.task is not None
-            return self.source_prior.mean_compliance()[pairs // len(self.task.sample_states)]
+            return self.source_prior.mean_compliance()[pairs // len(self._bound_task.sample_states)]
         return self._compliance_selector.mean_compliance(pairs)

@@ -240,7 +240,6 @@ class MappingExperts(Transfer):
         }
 
     def get_state(self) -> dict[str, np.ndarray]:
-        assert self.task is not None
         playing = [
             (environment, one.arm, one.total, one.steps, one.acted, *one.state)
             for environment, one in self._playing.items()
@@ -249,7 +248,7 @@ class MappingExperts(Transfer):
         return {
             "experts": self._numbers[:, None].astype(np.float64),
             "episodes": np.array(self._episodes, dtype=np.float64).reshape(-1, 4),
-            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self.task.n_variables),
+            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self._bound_task.n_variables),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:

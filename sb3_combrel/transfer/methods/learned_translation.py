@@ -99,10 +99,7 @@ class LearnedTranslation(Transfer):
 
     @abstractmethod
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        """Learn a mapping from samples of both tasks; return all the source's ``instances``, in order, in target coordinates.
-
-        They are brought into the target's box afterwards.
-        """
+        """Learn a mapping from samples; return the source's ``instances`` in target coordinates, to be clipped."""
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
@@ -128,8 +125,7 @@ class LearnedTranslation(Transfer):
         return len(self._samples)
 
     def action(self, state: np.ndarray) -> int | None:
-        assert self.task is not None
-        return int(self.rng.integers(self.task.n_actions)) if len(self._samples) < self.n_random_steps else None
+        return int(self.rng.integers(self._bound_task.n_actions)) if len(self._samples) < self.n_random_steps else None
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         if self._timbrel is not None:
@@ -140,9 +136,8 @@ class LearnedTranslation(Transfer):
             self._learn()
 
     def _learn(self) -> None:
-        assert self.task is not None
         began = perf_counter()
-        source, d = self._source, self.task.n_variables
+        source, d = self._source, self._bound_task.n_variables
         states = source.scaling.to_unit(source.states)
         instances = Triplets(states, source.actions, source.scaling.to_unit(source.next_states) - states)
         rows = np.sort(self.rng.permutation(len(source))[: self.n_source_samples])
@@ -155,8 +150,7 @@ class LearnedTranslation(Transfer):
         self._seconds = perf_counter() - began
 
     def _transfer_rows(self, rows: np.ndarray) -> None:
-        assert self.task is not None
-        task, source, d = self.task, self._source, self.task.n_variables
+        task, source, d = self._bound_task, self._source, self._bound_task.n_variables
         self._rows = rows
         self.translated = SourceInstances(
             states=task.scaling.to_raw(rows[:, :d]),
@@ -221,11 +215,12 @@ class LearnedTranslation(Transfer):
 
     def _state_of_timbrel(self) -> dict[str, np.ndarray]:
         """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
-        assert self.task is not None
         timbrel = self._timbrel
         if timbrel is None:
-            timbrel = TIMBREL(self._source, InterTaskMapping((0,) * self.task.n_variables, (0,) * self.task.n_actions))
-            timbrel.bind(self.task, np.random.default_rng(0))
+            timbrel = TIMBREL(
+                self._source, InterTaskMapping((0,) * self._bound_task.n_variables, (0,) * self._bound_task.n_actions)
+            )
+            timbrel.bind(self._bound_task, np.random.default_rng(0))
         return {f"timbrel_{name}": array for name, array in timbrel.get_state().items()}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:

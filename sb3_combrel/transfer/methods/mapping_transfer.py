@@ -243,7 +243,7 @@ class MappingTransfer(Transfer):
     def describe_prior(self) -> str:
         """Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
 
-        Target variables come first, then the source's where these have other names; a ValueError as of :attr:`source_prior`.
+        :raises ValueError: as of :attr:`source_prior`
         """
         self._check_bound("describe_prior")
         return self.source_prior.describe()
@@ -266,12 +266,7 @@ class MappingTransfer(Transfer):
         return self._source_use.choices()
 
     def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """
-        Return the candidates selected, whether or not their instances are needed: int64, shape (n,), -1 as in :meth:`choices`.
-
-        :param states: unit coordinates, shape (n, n_variables)
-        :param actions: int64, shape (n,)
-        """
+        """Return the candidates selected, whether or not their instances are needed, shape (n,), -1 as in :meth:`choices`."""
         return self._source_use.selected(states, actions)
 
     def source_action_names(self) -> list[str]:

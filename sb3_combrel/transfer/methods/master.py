@@ -101,8 +101,7 @@ class MASTER(MappingTransfer):
     def action(self, state: np.ndarray) -> int | None:
         if self.mapping_steps() >= self.n_random_steps:
             return None
-        assert self.task is not None
-        return int(self.rng.integers(self.task.n_actions))
+        return int(self.rng.integers(self._bound_task.n_actions))
 
     def mapping_steps(self) -> int:
         """Return how many random steps of the target have been taken to find the mapping."""
@@ -111,12 +110,11 @@ class MASTER(MappingTransfer):
     @property
     def chosen(self) -> InterTaskMapping | None:
         """The mapping that was chosen, with names; None before."""
-        assert self.task is not None
         made_by = self.source_prior if self.use == "prior" else self._least_error
         if made_by.choice is None:
             return None
         actions = tuple(made_by.choice.actions[:, 0].tolist())
-        return made_by.copies.mapping(int(made_by.choice.copies[0, 0]), self.task, actions)
+        return made_by.copies.mapping(int(made_by.choice.copies[0, 0]), self._bound_task, actions)
 
     def statistics(self) -> dict[str, float]:
         return {
@@ -133,11 +131,7 @@ def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
 
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
-    """Find the mapping with the least error, the first of equals: its error, state mapping, and each target action's source
-    action.
-
-    :param errors: shape (n_state_mappings, n_target_actions, n_source_actions)
-    """
+    """Find the mapping with the least error, the first of equals: error, state mapping, each target action's source action."""
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # Every combination is in the set: the best source action of each target action can be found on its own.
         of_row = errors.min(axis=2).sum(axis=1)

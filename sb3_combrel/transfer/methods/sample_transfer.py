@@ -113,12 +113,11 @@ class SampleTransfer(MappingTransfer):
         """Draw instances by compliance with the first ``n`` transitions, and relevance to them."""
         if self._n_draws == 0:
             self._seed = int(self.rng.integers(MAX_SEED))
-        assert self.task is not None
         relevances = np.ones((len(self.candidates), int(self.candidates.instances.size.max())))
         if self.relevance:
             self._instances.measure_relevance(n_used=n, values=relevances)
         compliances = candidate_compliances(self.candidates, self._tasks.sums, n)
-        n_each = max(1, self.n_instances // self.task.n_actions)
+        n_each = max(1, self.n_instances // self._bound_task.n_actions)
         generator = np.random.default_rng(self._seed)
         self._show_drawn(draw_instances(self.candidates, compliances, relevances, n_each, generator))
         self._n_of_draw = n
@@ -128,16 +127,14 @@ class SampleTransfer(MappingTransfer):
         self._instances.all_changed = True
 
     def _show_drawn(self, drawn: np.ndarray) -> None:
-        assert self.task is not None
         self.drawn = drawn
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
         instances = self._instances
-        instances.translator = self._make_translator(candidates, self.task, instances.translator.rules.breadth)
+        instances.translator = self._make_translator(candidates, self._bound_task, instances.translator.rules.breadth)
 
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
-        """Return the compliance, 0 to 1, of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
+        """Return the compliance, 0 to 1, of a mapping's virtual source task with the transitions so far, Lambda_X of Eq. 6.
 
-        :param mapping: from the target to the source numbered ``source``
         :raises ValueError: if the set has no such state mapping
         """
         return self._tasks.task_compliance(source, mapping)
@@ -172,11 +169,7 @@ class SampleTransfer(MappingTransfer):
 
 
 class TaskComplianceSelector(PooledSelector):
-    """Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
-
-    :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
-    :param max_transitions: how many are recorded
-    """
+    """Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6)."""
 
     needs_transitions = True
 
@@ -196,11 +189,7 @@ class TaskComplianceSelector(PooledSelector):
         self.sums[:, int(self.transitions.actions[i])] += self._table.values
 
     def task_compliance(self, source: int, mapping: InterTaskMapping) -> float:
-        """Return the compliance Lambda_X (Eq. 6) of the virtual source task of a mapping to source number ``source``.
-
-        :return: 0 before the first transition
-        :raises ValueError: if the set has no such state mapping
-        """
+        """See :meth:`SampleTransfer.task_compliance`; 0 before the first transition."""
         sets, sources = self.candidates.sets, self.candidates.sources
         mappings = sets[source]
         same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
@@ -218,13 +207,9 @@ class TaskComplianceSelector(PooledSelector):
 
 
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
+    """Return for each state mapping, target and source action the compliance of the tasks that have these, added up.
 
-    A task's, Lambda_X of Eq. 6, is the sum of its transitions' compliances, divided by the number of all transitions.
-
-    :param mappings: the mappings to one source, each as likely as any other
-    :param sums: of the transitions' compliances, shape (n_state_mappings, n_target_actions, n_source_actions)
-    :return: sum over X of Lambda_X / n_mappings, shape of ``sums``
+    A task's, Lambda_X of Eq. 6, is the sum of its transitions' compliances (of which ``sums`` are), over all transitions.
     """
     n_rows, n_actions, n_source_actions = sums.shape
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
@@ -242,10 +227,7 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
 
 
 def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """Return for each candidate the compliance of all virtual source tasks that have it, added up, shape (n_candidates,).
-
-    :param sums: see :func:`mean_compliances`; the state mappings of all sources one below the other, their actions numbered on
-    """
+    """Return for each candidate the compliance of all tasks that have it, added up; ``sums``: of all sources, numbered on."""
     origins = np.array(candidates.origins, dtype=np.int64)
     found, row, action = np.zeros(len(origins)), 0, 0
     for number, (source, mappings) in enumerate(zip(candidates.sources, candidates.sets, strict=True)):
@@ -265,14 +247,10 @@ def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transition
 def draw_instances(
     candidates: Candidates, compliances: np.ndarray, relevances: np.ndarray, n: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw translated instances for each target action, without replacement.
+    """Draw ``n`` instances at most for each target action, without replacement: candidate and number, shape (n_drawn, 2).
 
     A candidate in proportion to its compliance, and of it an instance in proportion to its relevance, of those that are left:
     the n largest of log-probabilities with Gumbel noise, which is the same.
-
-    :param relevances: of each candidate's instances, shape (n_candidates, most instances of an action)
-    :param n: instances of each target action, at most; fewer if no more have a probability above 0
-    :return: candidate and number of its instance, one a row, in order, int64, shape (n_drawn, 2)
     """
     size = candidates.instances.size[candidates.arrays.action]
     exists = np.arange(relevances.shape[1]) < size[:, None]

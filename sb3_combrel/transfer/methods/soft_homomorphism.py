@@ -128,9 +128,8 @@ class SoftHomomorphism(Transfer):
         return float(self._source.rewards.min())
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        assert self.task is not None
         if self._logits is None:
-            return PriorPredictions.nothing(len(actions), self.task.n_variables)
+            return PriorPredictions.nothing(len(actions), self._bound_task.n_variables)
         effect, reward, end, weight = self._mixture.predict(states, actions)
         return self._claims.restrict(effect, reward, end, weight, actions)
 
@@ -193,12 +192,11 @@ class SoftHomomorphism(Transfer):
 
     def _judge(self, predicted: soft.Predicted) -> None:
         """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
-        assert self.task is not None
         effects, actions = (column[: self._transitions.n] for column in (self._transitions.effects, self._transitions.actions))
         effect, _, _, weight = predicted
-        taken = np.arange(self.task.n_actions)[:, None] == actions
+        taken = np.arange(self._bound_task.n_actions)[:, None] == actions
         size = (taken @ np.abs(effects) / np.maximum(taken.sum(axis=1), 1)[:, None]).max(axis=0)
-        each = np.minimum(1.0, weight / self.task.exploration_threshold)
+        each = np.minimum(1.0, weight / self._bound_task.exploration_threshold)
         compared = np.maximum(effects**2, np.maximum((LEAST_EFFECT * size) ** 2, 1e-300))
         missed = taken @ (each[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared))
         founded = np.repeat((taken @ each)[:, None], len(size), axis=1)
@@ -224,9 +222,8 @@ class SoftHomomorphism(Transfer):
         """
         if self._logits is None:
             raise ValueError(f"there is no mapping before the target has been seen for {FIRST_RENEWAL} transitions")
-        assert self.task is not None
         of_mapping, of_action = soft.probabilities(self._logits, self._readings)
-        found = np.zeros((len(of_mapping), 2, self._source.n_variables, self.task.n_variables))
+        found = np.zeros((len(of_mapping), 2, self._source.n_variables, self._bound_task.n_variables))
         for (m, k), v in np.ndenumerate(self._readings.variable):
             if v >= 0:
                 found[:, int(self._readings.sign[m, k] < 0.0), k, v] += of_mapping[:, m]
@@ -234,18 +231,17 @@ class SoftHomomorphism(Transfer):
 
     def describe(self) -> str:
         """Say what each target action is most probably taken for, mapping and action: "East: Right on (x, vx) 0.97, ..."."""
-        assert self.task is not None
         if self._logits is None:
-            return "; ".join(f"{name}: nothing" for name in self.task.action_names)
+            return "; ".join(f"{name}: nothing" for name in self._bound_task.action_names)
         of_mapping, of_action = soft.probabilities(self._logits, self._readings)
         words = []
-        for a, target_action in enumerate(self.task.action_names):
+        for a, target_action in enumerate(self._bound_task.action_names):
             of_copies = []
             for copy, actions in zip(of_mapping, of_action[:, a], strict=True):
                 joint = np.outer(copy, actions)
                 m, b = np.unravel_index(joint.argmax(), joint.shape)
                 read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
-                names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self.task.state_names[v] for v, s in read]
+                names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self._bound_task.state_names[v] for v, s in read]
                 of_copies.append(f"{self._source.action_names[b]} on ({', '.join(names)}) {joint.max():.2f}")
             words.append(f"{target_action}: {', '.join(of_copies)}")
         return "; ".join(words)
@@ -276,8 +272,7 @@ class SoftHomomorphism(Transfer):
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        assert self.task is not None
-        self._transitions.restore(state["transitions"], self.task.n_actions)
+        self._transitions.restore(state["transitions"], self._bound_task.n_actions)
         *counts, self._fit_due, wrong, baseline = state["soft_figures"].tolist()
         self._n_observed, self._n_fits, self._version, self._steps_to_find = (int(count) for count in counts)
         self._squares = np.array([wrong, baseline])

@@ -27,8 +27,7 @@ Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 class Readings(NamedTuple):
     """The deterministic mappings of target to source states that a stochastic mapping is a mixture of.
 
-    In each, every source variable reads a target variable of its own, as it is or mirrored, in unit coordinates. Where the
-    source has more variables than the target, the others read nothing, and stand at their mean in the source's instances.
+    In each, every source variable reads a target variable of its own; those for which none is left stand at their mean.
     """
 
     variable: np.ndarray  # int64, shape (n_mappings, n_source_variables): target variable that is read, -1 for none
@@ -58,11 +57,7 @@ def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
 
 
 def to_source(states: np.ndarray, readings: Readings, mapping: np.ndarray | int, mean: np.ndarray) -> np.ndarray:
-    """Return target states as mappings have them in the source, unit coordinates, shape (n, n_source_variables).
-
-    :param mapping: the number of each state's mapping, shape (n,), or of that of all
-    :param mean: of the source's instances, for variables that read nothing
-    """
+    """Return target states as mappings (one, or one of each) have them in the source; what reads nothing is at ``mean``."""
     variable, sign = (np.broadcast_to(array[mapping], (len(states), len(mean))) for array in readings[:2])
     read = np.take_along_axis(states, np.maximum(variable, 0), axis=1)
     return np.where(variable == NOTHING, mean, np.where(sign < 0.0, 1.0 - read, read))
@@ -167,9 +162,6 @@ class MixturePredictions:
     """Predicts pairs of the target by the mean over a mixture.
 
     The effect is the copies' sum; the reward, their mean; an end, the product; the weight of the source's data, the least.
-
-    :param mean: of the source's states, unit coordinates, shape (n_source_variables,)
-    :param sample: states that are asked for again and again, unit coordinates, shape (n_points, n_target_variables)
     """
 
     terms: Terms

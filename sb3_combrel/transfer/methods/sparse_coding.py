@@ -106,8 +106,7 @@ class SparseCodingMapping(LearnedTranslation):
         check_positive("sparsity", self.sparsity)
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        assert self.task is not None
-        n_target, n_source = self.task.n_actions, self._source.n_actions
+        n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         seed = int(self.rng.integers(2**31))
         source_columns, target_columns = source.columns(n_source), target.columns(n_target)
         of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)

@@ -59,8 +59,7 @@ class ThreeWayRBM(LearnedTranslation):
             check_count(name, getattr(self, name))
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        assert self.task is not None
-        n_target, n_source = self.task.n_actions, self._source.n_actions
+        n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         source_columns, target_columns = source.columns(n_source), target.columns(n_target)
         of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
         machine = train(
