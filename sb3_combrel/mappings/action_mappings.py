@@ -16,8 +16,7 @@ from sb3_combrel.common.checks import check_count
 from sb3_combrel.common.serialisation import register_reader, register_writer
 from sb3_combrel.mappings.inter_task_mapping import Ints, index_table
 
-# The numbers of mappings, which are computed with, have at most 3,000 digits.
-MAX_ACTIONS = 1000
+MAX_ACTIONS = 1000  # the numbers of mappings, which are computed with, have at most 3,000 digits
 
 # Finding a member takes a number of steps in proportion to the third power of the number of actions.
 MAX_BALANCED_ACTIONS = 100

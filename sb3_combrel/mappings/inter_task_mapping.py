@@ -16,9 +16,9 @@ from sb3_combrel.mappings.named_entries import Entries, as_entries, as_given, ha
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Names = Iterable[str]
+Signs = Sequence[int] | Mapping[Any, int] | None
 
-UNMAPPED = -1
-"""Represents None in integer arrays of state mappings."""
+UNMAPPED = -1  # represents None in integer arrays of state mappings
 
 _MAX_INDEX = 2**31 - 1
 
@@ -68,20 +68,12 @@ class InterTaskMapping:
         have not been replaced yet, if something is asked that needs their numbers
     """
 
-    # With names that have not been replaced yet these are what the user gave, dicts as pairs.
-    state: tuple[int | None, ...]
+    state: tuple[int | None, ...]  # with names that have not been replaced yet these are what the user gave, dicts as pairs
     action: tuple[int, ...]
     sign: tuple[int, ...] | None
     names: MappingNames | None = field(default=None, compare=False, kw_only=True)
 
-    def __init__(
-        self,
-        state: Entries,
-        action: Entries,
-        sign: Sequence[int] | Mapping[Any, int] | None = None,
-        *,
-        names: MappingNames | None = None,
-    ) -> None:
+    def __init__(self, state: Entries, action: Entries, sign: Signs = None, *, names: MappingNames | None = None) -> None:
         states, actions = as_entries("state", state), as_entries("action", action)
         signs = None if sign is None else as_entries("sign", sign)
         if names is not None:

@@ -32,8 +32,7 @@ from sb3_combrel.mappings.inter_task_mapping import (
 )
 from sb3_combrel.mappings.state_mappings import TWO_VARIABLES_ON_FOUR, state_mappings_using_sources, with_mirrored
 
-MAX_CANDIDATES = 10_000_000
-"""Compliance is computed for every pair of a state mapping and a source action of a target action."""
+MAX_CANDIDATES = 10_000_000  # compliance is computed for every pair of a state mapping and a source action of a target action
 
 # Whether a source variable is used once at most, whether target variables may be unmapped, and the action mappings.
 _SETS: dict[str, tuple[bool, bool, type[AllActionMappings | BalancedActionMappings]]] = {
@@ -210,7 +209,6 @@ class MappingSet:
     def from_list(cls, mappings: Iterable[InterTaskMapping]) -> MappingSet:
         """Exactly the given mappings, in the given order; they need not be all pairs of their factors.
 
-        :param mappings: mappings between the same two tasks
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
         """
         listed = list(mappings)

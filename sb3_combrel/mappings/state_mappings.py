@@ -10,8 +10,7 @@ import numpy as np
 from sb3_combrel.common.checks import check_count, count_text
 from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Ints
 
-MAX_STATE_MAPPINGS = 100_000
-"""State mappings are rows of an array, and the table of compliances has a column for each."""
+MAX_STATE_MAPPINGS = 100_000  # they are rows of an array, and the table of compliances has a column for each
 
 # Far beyond what model learning on a grid is possible with; without limits, counting the mappings already takes for ever.
 MAX_SOURCE_VARIABLES = 1000
@@ -66,8 +65,7 @@ def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
     for row, is_mapped in zip(state_mappings, mapped, strict=True):
         for mirrored in product((1, -1), repeat=int(is_mapped.sum())):
             sign = np.ones_like(row)
-            # The first variable's changes fastest.
-            sign[is_mapped] = mirrored[::-1]
+            sign[is_mapped] = mirrored[::-1]  # the first variable's changes fastest
             rows.append(row)
             signs.append(sign)
     return np.array(rows), np.array(signs)

@@ -25,23 +25,13 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     data = minari.load_dataset(dataset) if isinstance(dataset, str) else dataset
     scaling = StateScaling.from_space(data.observation_space, bounds)
     n_actions = count_actions(data.action_space)
-    episodes = list(data.iterate_episodes())
-    actions = np.concatenate([np.asarray(episode.actions) for episode in episodes])
+    parts = [(e.observations[:-1], e.actions, e.rewards, e.observations[1:], e.terminations) for e in data.iterate_episodes()]
+    states, actions, rewards, next_states, terminated = map(np.concatenate, zip(*parts, strict=True))
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     unnamed = {"env": None if data.env_spec is None else data.env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
-    names = {name: tuple(each) for name, each in kept.get("names", {}).items()}
-    return Transitions(
-        np.concatenate([episode.observations[:-1] for episode in episodes]),
-        actions - int(data.action_space.start),
-        np.concatenate([episode.rewards for episode in episodes]),
-        np.concatenate([episode.observations[1:] for episode in episodes]),
-        np.concatenate([episode.terminations for episode in episodes]),
-        scaling.low,
-        scaling.high,
-        n_actions,
-        origin=kept.get("origin", unnamed),
-        **names,
-    )
+    names: dict[str, Any] = {name: tuple(each) for name, each in kept.get("names", {}).items()}
+    columns = states, actions - int(data.action_space.start), rewards, next_states, terminated
+    return Transitions(*columns, scaling.low, scaling.high, n_actions, origin=kept.get("origin", unnamed), **names)
 
 
 def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> MinariDataset:

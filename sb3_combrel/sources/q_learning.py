@@ -67,8 +67,7 @@ class QLearning:
     :param trace_decay: lambda, the decay of the traces; 0 for one-step Q-learning
     :param epsilon: probability of a random action while learning
     :param initial_value: value of every state and action at first
-    :param n_tilings: number of grids, see :class:`TileCoding`
-    :param n_tiles: tiles along each variable
+    :param n_tilings: number of grids, see :class:`TileCoding`; ``n_tiles``: tiles along each variable
     :param bounds: ``(low, high)`` of the states if the observation space has none
     :param seed: seed of the learner and its environment
     :raises ValueError: if the spaces are of another kind or an argument is out of range
@@ -131,8 +130,7 @@ class QLearning:
         for step in range(1, max_steps + 1):
             values = self._values(tiles)
             greedy = self._argmax(values)
-            explore = self._rng.random() < self.epsilon
-            action = int(self._rng.integers(self.n_actions)) if explore else greedy
+            action = int(self._rng.integers(self.n_actions)) if (self._rng.random() < self.epsilon) else greedy
             if values[action] < values[greedy]:
                 # What follows an exploratory action is no evidence on the greedy policy from the states before it.
                 traces[:] = 0.0

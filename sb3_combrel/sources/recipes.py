@@ -125,10 +125,7 @@ def _reason(file: Path) -> str:
 
 
 def cache_file(recipe: Mapping[str, Any]) -> Path:
-    """Return the file for the instances of a recipe, in the folder SB3_COMBREL_CACHE (a variable), or ~/.cache/sb3_combrel.
-
-    :param recipe: see :func:`find_source`
-    """
+    """Return the file of a recipe's instances (:func:`find_source`), in $SB3_COMBREL_CACHE or ~/.cache/sb3_combrel."""
     folder = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "sb3_combrel")
     text = json.dumps({key: value for key, value in recipe.items() if key != "renew"}, sort_keys=True, default=str)
     name = re.sub(r"\W+", "-", str(recipe["env"]))

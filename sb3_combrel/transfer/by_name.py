@@ -19,9 +19,8 @@ METHODS = f"{PACKAGE}.transfer.methods."
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
     """Make a transfer object of the algorithm's own from what the user gave.
 
-    :param transfer: None; a transfer object, which is copied; a class or its name; or a dict of one entry, from the name to
-        the arguments, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``. Methods of this package may go by their
-        class alone; others are imported: "package.module.Class" or "package.module:Class"
+    :param transfer: None; a transfer object, which is copied; a class or its name ("package.module.Class"; of this package its
+        class alone will do); or a dict of one entry, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``
     :raises ValueError: if it is none of these, or the name is not that of a transfer method
     """
     if transfer is None:

@@ -21,8 +21,7 @@ OneSource = SourceInstances | str | os.PathLike[str] | Mapping[str, Any]
 SourceLike = OneSource | Sequence[OneSource]
 MappingsLike = str | InterTaskMapping | FactoredMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
-# Compliance is stored with every candidate, for thousands of transitions.
-MAX_WHOLE_MAPPINGS = 20_000
+MAX_WHOLE_MAPPINGS = 20_000  # compliance is stored with every candidate, for thousands of transitions
 
 
 class Candidate(NamedTuple):
@@ -116,7 +115,6 @@ class Candidates:
         return found
 
     def _numbered(self) -> CandidateArrays:
-        """Number the candidates of every target action, over all sources."""
         rows, actions, first = [], [], [0]
         for a in range(self.task.n_actions):
             row_offset = action_offset = 0
@@ -144,15 +142,12 @@ class Candidates:
         made.arrays = self.arrays._replace(action=np.arange(len(self), dtype=np.int64))
         return made
 
-    def find(self, action: int, mapping: InterTaskMapping) -> int:
-        """Return the candidate that a mapping to the first source amounts to for one target action."""
-        return next(
-            c
-            for c in range(self.arrays.first[action], self.arrays.first[action + 1])
-            if np.array_equal(self.table.variable[self.arrays.row[c]], mapping.state_index)
-            and np.array_equal(self.table.sign[self.arrays.row[c]], mapping.state_sign)
-            and self.arrays.action[c] == mapping.action[action]
-        )
+    def find(self, action: int, variable: np.ndarray, sign: np.ndarray, source_action: int) -> int:
+        """Return the candidate that a state mapping and a source action, numbered on, amount to for a target action."""
+        first, last = self.arrays.first[action : action + 2]
+        same = ((self.table.variable == variable) & (self.table.sign == sign)).all(axis=1)
+        fits = same[self.arrays.row[first:last]] & (self.arrays.action[first:last] == source_action)
+        return int(first + np.flatnonzero(fits)[0])
 
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# The arrays, which grow together.
-_COLUMNS = ("states", "effects", "rewards", "actions", "ended")
+_COLUMNS = ("states", "effects", "rewards", "actions", "ended")  # the arrays, which grow together
 
 
 class RecordedTransitions:

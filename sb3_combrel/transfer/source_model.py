@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
+from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.models.fit_arrays import Kernel
 from sb3_combrel.models.linear_fits import RIDGE, narrowed
@@ -16,8 +16,7 @@ from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
 
 DEFAULT_SOURCE_BREADTH = 0.2
 DEFAULT_N_NEIGHBORS = 24
-# Rewards and ends jump from one state to the next: they are averaged over nearer instances.
-DEFAULT_OUTCOME_BREADTH = 0.05
+DEFAULT_OUTCOME_BREADTH = 0.05  # rewards and ends jump from one state to the next: they are averaged over nearer instances
 
 
 class SourcePredictions(NamedTuple):
@@ -64,8 +63,7 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
             end += weight
     solve_regression(sums, -RIDGE / scale, near.factor, near.fit)
     for v in range(d):
-        fitted = fitted_effect(near.fit, state, v)
-        effect[v] = min(max(fitted, effect_range[0, action, v]), effect_range[1, action, v])
+        effect[v] = min(max(fitted_effect(near.fit, state, v), effect_range[0, action, v]), effect_range[1, action, v])
     return reward / outcomes, end / outcomes, total / (1.0 + beyond_data(sums, near.factor, state, near.fit))
 
 
@@ -118,28 +116,14 @@ class SourceModel:
     ):
         n_actions, _, d = instances.state.shape
         self.n_variables, self.instances = d, instances
-        self.kernel = Kernel(
-            scale=-1.0 / breadth**2,
-            reach=np.inf,
-            outcome_scale=-1.0 / min(breadth, outcome_breadth) ** 2,
-            n_neighbors=n_neighbors,
-            counting_scale=-1.0 / breadth**2,
-        )
+        scale, outcome_scale = -1.0 / breadth**2, -1.0 / min(breadth, outcome_breadth) ** 2
+        self.kernel = Kernel(scale, np.inf, outcome_scale, n_neighbors, counting_scale=scale)
         effect_range = np.zeros((2, n_actions, d))
         for action, size in enumerate(instances.size.tolist()):
             if size:
                 effect_range[0, action] = instances.effect[action, :size].min(axis=0)
                 effect_range[1, action] = instances.effect[action, :size].max(axis=0)
-        near = NearestLists(
-            item=np.zeros((n_actions, n_neighbors), dtype=np.int32),
-            distance=np.empty((n_actions, n_neighbors)),
-            length=np.zeros(n_actions, dtype=np.int64),
-            state=np.empty(d),
-            products=np.empty((2, n_products(d))),
-            factor=np.empty((d, d)),
-            fit=np.empty(d + d * d),
-            outcome=np.empty(3 + 2 * d),
-        )
+        near = NearestLists.empty(n_actions, n_neighbors, d)
         #: For compiled code, see :func:`source_arrays`.
         self.plain = tuple(instances), effect_range, tuple(self.kernel), tuple(near)
 

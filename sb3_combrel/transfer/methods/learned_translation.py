@@ -18,8 +18,7 @@ from sb3_combrel.transfer.candidates import SourceLike, load_one_source
 from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
 from sb3_combrel.transfer.methods.timbrel import TIMBREL
 
-# With fewer samples there is nothing to learn a mapping from.
-MIN_SAMPLES = 10
+MIN_SAMPLES = 10  # with fewer samples there is nothing to learn a mapping from
 DEFAULT_SAMPLE_STEPS = 200
 
 
@@ -104,8 +103,7 @@ class LearnedTranslation(Transfer):
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         name = type(self).__name__
-        # A saved model must not depend on other files.
-        self.source = self._source = load_one_source(self.source, name)
+        self.source = self._source = load_one_source(self.source, name)  # a saved model must not depend on other files
         for of, periodic in (("source", self._source.periodic), ("target", tuple(task.periodic or ()))):
             if any(periodic):
                 raise ValueError(
@@ -152,26 +150,14 @@ class LearnedTranslation(Transfer):
     def _transfer_rows(self, rows: np.ndarray) -> None:
         task, source, d = self._bound_task, self._source, self._bound_task.n_variables
         self._rows = rows
-        self.translated = SourceInstances(
-            states=task.scaling.to_raw(rows[:, :d]),
-            actions=np.clip(rows[:, d], 0, task.n_actions - 1).astype(np.int64),
-            rewards=source.rewards,
-            next_states=task.scaling.to_raw(rows[:, d + 1 :]),
-            terminated=source.terminated,
-            low=task.scaling.low,
-            high=task.scaling.high,
-            n_actions=task.n_actions,
-            state_names=task.state_names,
-            action_names=task.action_names,
-            origin={"env": f"{source.origin.get('env', 'an unnamed task')} by {type(self).__name__}"},
-        )
-        self._timbrel = TIMBREL(
-            self.translated,
-            InterTaskMapping(tuple(range(task.n_variables)), tuple(range(task.n_actions))),
-            breadth=self.breadth,
-            breadth_decay=self.breadth_decay,
-            transfer_terminals=self.transfer_terminals,
-        )
+        states, after = task.scaling.to_raw(rows[:, :d]), task.scaling.to_raw(rows[:, d + 1 :])
+        actions = np.clip(rows[:, d], 0, task.n_actions - 1).astype(np.int64)
+        space = task.scaling.low, task.scaling.high, task.n_actions, task.state_names, task.action_names
+        origin = {"env": f"{source.origin.get('env', 'an unnamed task')} by {type(self).__name__}"}
+        self.translated = SourceInstances(states, actions, source.rewards, after, source.terminated, *space, origin)
+        identity = InterTaskMapping(tuple(range(task.n_variables)), tuple(range(task.n_actions)))
+        names = ("breadth", "breadth_decay", "transfer_terminals")
+        self._timbrel = TIMBREL(self.translated, identity, **{name: getattr(self, name) for name in names})
         self._timbrel.bind(task, self.rng)
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
@@ -217,10 +203,9 @@ class LearnedTranslation(Transfer):
         """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
         timbrel = self._timbrel
         if timbrel is None:
-            timbrel = TIMBREL(
-                self._source, InterTaskMapping((0,) * self._bound_task.n_variables, (0,) * self._bound_task.n_actions)
-            )
-            timbrel.bind(self._bound_task, np.random.default_rng(0))
+            task = self._bound_task
+            timbrel = TIMBREL(self._source, InterTaskMapping((0,) * task.n_variables, (0,) * task.n_actions))
+            timbrel.bind(task, np.random.default_rng(0))
         return {f"timbrel_{name}": array for name, array in timbrel.get_state().items()}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:

@@ -88,15 +88,9 @@ class MASTER(MappingTransfer):
         candidates = Candidates(self.source, self.mappings, task)
         check_action_mappings(candidates.sets)
         copies = copies_of(candidates, task, float(self.source_breadth))
-        return SourcePrior(
-            copies,
-            task,
-            partial(choose_least_error, copies, candidates.sets),
-            whole=True,
-            max_transitions=self.n_random_steps,
-            transfer_terminals=self.transfer_terminals,
-            first_renewal=self.n_random_steps,
-        )
+        choose = partial(choose_least_error, copies, candidates.sets)
+        steps = {"max_transitions": self.n_random_steps, "first_renewal": self.n_random_steps}
+        return SourcePrior(copies, task, choose, whole=True, transfer_terminals=self.transfer_terminals, **steps)
 
     def action(self, state: np.ndarray) -> int | None:
         if self.mapping_steps() >= self.n_random_steps:
@@ -117,11 +111,9 @@ class MASTER(MappingTransfer):
         return made_by.copies.mapping(int(made_by.choice.copies[0, 0]), self._bound_task, actions)
 
     def statistics(self) -> dict[str, float]:
-        return {
-            **super().statistics(),
-            "transfer/steps_to_find_mapping": self.mapping_steps(),
-            "transfer/mapping_found": float(self.chosen is not None),
-        }
+        found = float(self.chosen is not None)
+        figures = {"transfer/steps_to_find_mapping": self.mapping_steps(), "transfer/mapping_found": found}
+        return super().statistics() | figures
 
 
 def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
@@ -168,8 +160,7 @@ class LeastErrorSelector(FixedSelector):
         self.copies = copies
         self.n_transitions = n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
-        #: The mapping that was chosen, None before.
-        self.choice: Choice | None = None
+        self.choice: Choice | None = None  #: the mapping that was chosen, None before
         self._just_chosen = False
 
     def takes_transitions(self) -> bool:
@@ -186,13 +177,10 @@ class LeastErrorSelector(FixedSelector):
 
     def _find(self, action: int, row: int, source_action: int) -> int:
         """The candidate of a target action with a state mapping, or an equal one, and a source action of its source."""
-        arrays, table = self.candidates.arrays, self.candidates.table
-        first, last = arrays.first[action], arrays.first[action + 1]
-        same = (table.variable == table.variable[row]) & (table.sign == table.sign[row])
+        table = self.candidates.table
         # Actions are numbered on from source to source.
         number = source_action + sum(source.n_actions for source in self.candidates.sources[: self.copies.source[row]])
-        fits = same.all(axis=1)[arrays.row[first:last]] & (arrays.action[first:last] == number)
-        return int(first + np.flatnonzero(fits)[0])
+        return self.candidates.find(action, table.variable[row], table.sign[row], number)
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         chosen = self.fixed[actions]

@@ -22,8 +22,7 @@ from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check
 from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
-# Seeds are saved as float64.
-MAX_SEED = 2**53
+MAX_SEED = 2**53  # seeds are saved as float64
 
 
 @dataclass(repr=False, eq=False)
@@ -92,8 +91,7 @@ class SampleTransfer(MappingTransfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
-        #: Candidate and number of its instance of those drawn, one a row, int64, shape (n, 2).
-        self.drawn: np.ndarray
+        self.drawn: np.ndarray  #: candidate and number of its instance of those drawn, one a row, int64, shape (n, 2)
         self._show_drawn(np.empty((0, 2), dtype=np.int64))
         self._seed = 0
         self._n_of_draw = self._n_of_first = self._n_draws = 0
@@ -198,8 +196,7 @@ class TaskComplianceSelector(PooledSelector):
             raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
         row = int(rows[0]) + sum(each.n_state_mappings for each in sets[:source])
         actions = np.array(mapping.action) + sum(each.n_actions for each in sources[:source])
-        of_actions = self.sums[row, np.arange(len(actions)), actions]
-        return float(of_actions.sum() / max(self.transitions.n, 1))
+        return float(self.sums[row, np.arange(len(actions)), actions].sum() / max(self.transitions.n, 1))
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         for i in range(self.transitions.n):
@@ -215,14 +212,12 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # In the mean over all source actions that the other target actions may have.
         of_action = sums.mean(axis=2)
-        others = of_action.sum(axis=1, keepdims=True) - of_action
-        everything: np.ndarray = sums + others[:, :, None]
+        everything: np.ndarray = sums + (of_action.sum(axis=1, keepdims=True) - of_action)[:, :, None]
         return everything / (n_transitions * n_rows * n_source_actions)
     found = np.zeros_like(sums)
     for rows, actions in members_of(mappings):
         members = rows, np.arange(n_actions), actions
-        of_task = sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings)
-        np.add.at(found, members, of_task[:, None])
+        np.add.at(found, members, (sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings))[:, None])
     return found
 
 
@@ -252,8 +247,7 @@ def draw_instances(
     A candidate in proportion to its compliance, and of it an instance in proportion to its relevance, of those that are left:
     the n largest of log-probabilities with Gumbel noise, which is the same.
     """
-    size = candidates.instances.size[candidates.arrays.action]
-    exists = np.arange(relevances.shape[1]) < size[:, None]
+    exists = np.arange(relevances.shape[1]) < candidates.instances.size[candidates.arrays.action][:, None]
     relevant = np.where(exists, relevances, 0.0)
     total = relevant.sum(axis=1, keepdims=True)
     probability = compliances[:, None] * np.divide(relevant, total, out=np.zeros_like(relevant), where=total > 0.0)
@@ -271,7 +265,6 @@ def draw_instances(
 def instances_of_each(candidates: Candidates, drawn: np.ndarray) -> Instances:
     """Return what :func:`draw_instances` has drawn, by candidate, in the coordinates of their sources."""
     source, (candidate, number) = candidates.instances, drawn.T
-    action = candidates.arrays.action[candidate]
-    at = action, number
+    at = candidates.arrays.action[candidate], number
     columns = source.state[at], source.effect[at], source.reward[at], source.terminated[at]
     return Instances.of_rows(len(candidates), candidate, *columns, periodic=source.periodic)

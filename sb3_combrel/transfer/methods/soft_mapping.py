@@ -12,14 +12,11 @@ import torch as th
 from sb3_combrel.transfer.prior.copies import distinct_rows
 from sb3_combrel.transfer.source_model import SourceModel, SourcePredictions
 
-# Logits have a normal prior of this standard deviation: a few transitions do not make anything certain.
-LOGIT_DEVIATION = 3.0
+LOGIT_DEVIATION = 3.0  # logits have a normal prior of this standard deviation: a few transitions do not make anything certain
 N_STEPS, STEP_SIZE = 200, 0.1
 NOTHING = -1
-# Predictions of the sample are stored for so many mappings with a source action.
-MAX_STORED = 128
-# Pairs that are predicted at once.
-BATCH = 4096
+MAX_STORED = 128  # predictions of the sample are stored for so many mappings with a source action
+BATCH = 4096  # pairs that are predicted at once
 
 Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -43,12 +40,9 @@ def count_mappings(n_source: int, n_target: int, mirrored: bool) -> int:
 
 def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
     """List the deterministic mappings of states; ``mirrored``: target variables may be read mirrored as well."""
-    nothing = [NOTHING] * max(0, n_source - n_target)
-    orders = sorted(set(permutations([*range(n_target), *nothing], n_source)))
-    rows = []
-    for order in orders:
-        signs = product(*((1.0, -1.0) if mirrored and v != NOTHING else (1.0,) for v in order))
-        rows += [(order, sign) for sign in signs]
+    orders = sorted(set(permutations([*range(n_target), *([NOTHING] * max(0, n_source - n_target))], n_source)))
+    choices = [[(1.0, -1.0) if mirrored and v != NOTHING else (1.0,) for v in order] for order in orders]
+    rows = [(order, signs) for order, each in zip(orders, choices, strict=True) for signs in product(*each)]
     variable = np.array([order for order, _ in rows], dtype=np.int64)
     sign = np.array([signs for _, signs in rows], dtype=np.float64)
     number = np.where(sign < 0.0, variable + n_target, variable)
@@ -107,8 +101,7 @@ def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData)
     by_mapping = th.from_numpy(np.ascontiguousarray(data.predicted.transpose(0, 2, 3, 1)).reshape(n * b * d, m))
     s, c = of_mapping.shape[:2]
     mixed = (by_mapping @ of_mapping.reshape(s * c, m).T).reshape(n, b, d, s, c)
-    chosen = of_action[:, :, th.from_numpy(data.action)]
-    mean = th.einsum("nbdsc,scnb->snd", mixed, chosen)
+    mean = th.einsum("nbdsc,scnb->snd", mixed, of_action[:, :, th.from_numpy(data.action)])
     error = (mean - th.from_numpy(data.effect)) / th.from_numpy(data.scale)
     squares = (state**2).sum(dim=(1, 2, 3)) + (action**2).sum(dim=(1, 2, 3))
     return (th.sqrt(1.0 + error**2) - 1.0).sum(dim=(1, 2)) + squares / (2.0 * LOGIT_DEVIATION**2)
@@ -167,10 +160,7 @@ class MixturePredictions:
     terms: Terms
 
     def __init__(self, model: SourceModel, readings: Readings, mean: np.ndarray, sample: np.ndarray):
-        self.model = model
-        self.readings = readings
-        self.mean = mean
-        self.sample = sample
+        self.model, self.readings, self.mean, self.sample = model, readings, mean, sample
         self._stored: dict[tuple[int, int], tuple[np.ndarray, SourcePredictions]] = {}
 
     def set_terms(self, terms: Terms) -> None:
@@ -199,9 +189,8 @@ class MixturePredictions:
         predicted = self.model.predict(to_source(states[row], self.readings, mapping, self.mean), terms.action[term])
         effects = share[:, None] * to_target(predicted.effect, self.readings, mapping, d)
         effect = np.column_stack([np.bincount(row, effects[:, v], n) for v in range(d)])
-        each = [
-            np.bincount(place, share * of_terms, n * self.n_copies).reshape(n, self.n_copies) for of_terms in predicted[1:]
-        ]
+        size = n * self.n_copies
+        each = [np.bincount(place, share * of_terms, size).reshape(n, self.n_copies) for of_terms in predicted[1:]]
         return _joined(effect, each[0], each[1], each[2])
 
     def _predict_sample(self, action: int) -> Predicted:

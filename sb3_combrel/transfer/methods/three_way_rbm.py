@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -62,14 +62,9 @@ class ThreeWayRBM(LearnedTranslation):
         n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         source_columns, target_columns = source.columns(n_source), target.columns(n_target)
         of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
-        machine = train(
-            of_source.to(source_columns),
-            of_target.to(target_columns),
-            n_hidden=self.n_hidden,
-            n_factors=self.n_factors,
-            n_updates=self.n_updates,
-            seed=int(self.rng.integers(2**63)),
-        )
+        sizes: dict[str, Any] = {"n_hidden": self.n_hidden, "n_factors": self.n_factors, "n_updates": self.n_updates}
+        seed = int(self.rng.integers(2**63))
+        machine = train(of_source.to(source_columns), of_target.to(target_columns), seed=seed, **sizes)
         found = reconstruct(machine, of_source.to(instances.columns(n_source)))
         return Triplets.of_columns(of_target.back(found), n_target)
 
@@ -107,8 +102,7 @@ def contrastive_divergence(machine: Machine, source: th.Tensor, target: th.Tenso
     """Return what has CD-1's gradient: mean free energy of data less that of target units reconstructed from them."""
     with th.no_grad():
         on = th.sigmoid(hidden_input(machine, source, target))
-        drawn = (th.rand(on.shape, generator=generator, dtype=th.float64) < on).double()
-        again = target_mean(machine, source, drawn)
+        again = target_mean(machine, source, (th.rand(on.shape, generator=generator, dtype=th.float64) < on).double())
     return (free_energy(machine, source, target) - free_energy(machine, source, again)).mean()
 
 
