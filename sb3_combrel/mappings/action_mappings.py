@@ -197,11 +197,9 @@ class ListedActionMappings(ActionMappings):
 def paper_icub_actions() -> Ints:
     """The 48 action mappings of the iCub experiment, shape (48, 8); see :meth:`MappingSet.paper_icub`."""
     mappings = []
-    for first_joint in combinations(range(4), 2):
-        source_joint = [0 if joint in first_joint else 1 for joint in range(4)]
-        for others in product((True, False), repeat=3):
-            reversed_joint = (True, *others)
-            mappings.append([2 * source_joint[j] + (direction ^ reversed_joint[j]) for j in range(4) for direction in (0, 1)])
+    for first_joint, others in product(combinations(range(4), 2), product((True, False), repeat=3)):
+        source_joint, reversed_joint = [0 if joint in first_joint else 1 for joint in range(4)], (True, *others)
+        mappings.append([2 * source_joint[j] + (direction ^ reversed_joint[j]) for j in range(4) for direction in (0, 1)])
     return np.array(mappings, dtype=np.int64)
 
 

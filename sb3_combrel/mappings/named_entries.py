@@ -37,10 +37,7 @@ def has_names(entries: Sequence[Any]) -> bool:
 def numbers(
     argument: str, entries: Sequence[Any], target_names: Sequence[str], source_names: Sequence[str], default: Any = None
 ) -> tuple[Any, ...]:
-    """Replace names by the numbers that they stand for; of pairs, make one entry for each target variable or action.
-
-    ``ValueError`` if a name is not that of one variable or action, or one is in two pairs; ``default``: for what is in none.
-    """
+    """Replace names by their numbers; of pairs, make one entry for each of the target's, ``default`` where there is none."""
     if not any(isinstance(each, tuple) for each in entries):
         return tuple(_number(argument, each, source_names, "source") for each in entries)
     if not all(isinstance(each, tuple) for each in entries):

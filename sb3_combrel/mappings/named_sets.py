@@ -38,10 +38,7 @@ def check_mappings(mappings: Any) -> None:
 
 
 def with_numbers(mappings: Any, names: Sequence[MappingNames]) -> Any:
-    """Replace names of variables and actions by numbers, in mappings as of :func:`check_mappings`; ``names``: of each source.
-
-    ``ValueError`` if a name is not that of one variable or action, or stands for different ones in several sources.
-    """
+    """Replace names of variables and actions by their numbers, which must be the same for all sources; other things stay."""
     made = _made(mappings)
     if isinstance(made, list):
         return [with_numbers(each, names) for each in made]

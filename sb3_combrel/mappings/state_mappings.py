@@ -21,10 +21,7 @@ TWO_VARIABLES_ON_FOUR: Ints = np.array(list(permutations((0, 1, UNMAPPED, UNMAPP
 
 
 def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, allow_none: bool) -> Ints:
-    """Every state mapping that uses as many different source variables as there is room for, -1 for None, one a row.
-
-    ``once``: each at most once. In lexicographic order, None first; ``ValueError`` if a number is below 1, or too many.
-    """
+    """Every state mapping that uses as many source variables as there is room for (``once`` each), -1 for None, in order."""
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     different = min(n_source, n_target)
@@ -41,10 +38,7 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
 
 
 def copies_of_source(n_source: int, n_target: int) -> Ints:
-    """Every way to make a copy of the source, or of some of its variables, of different target variables: as state mappings.
-
-    Those with more variables come first; ``ValueError`` as of :func:`state_mappings_using_sources`.
-    """
+    """State mappings of every copy of the source, or of some of its variables: of different ones, most variables first."""
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     largest = min(n_source, n_target)

@@ -45,25 +45,15 @@ def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> Mina
     for rows in np.split(np.arange(len(source.states)), np.flatnonzero(~continues) + 1):
         truncated = np.zeros(len(rows), dtype=bool)
         truncated[-1] = not source.terminated[rows[-1]]
-        episodes.append(
-            EpisodeBuffer(
-                observations=np.vstack([source.states[rows], source.next_states[rows[-1:]]]),
-                actions=source.actions[rows],
-                rewards=source.rewards[rows],
-                terminations=source.terminated[rows],
-                truncations=truncated,
-            )
-        )
+        observations = np.vstack([source.states[rows], source.next_states[rows[-1:]]])
+        given: dict[str, Any] = {"actions": source.actions[rows], "rewards": source.rewards[rows], "truncations": truncated}
+        episodes.append(EpisodeBuffer(observations=observations, terminations=source.terminated[rows], **given))
     with warnings.catch_warnings():
         # Minari warns of every piece of metadata that is not given; which ones to give is the caller's choice.
         warnings.simplefilter("ignore", UserWarning)
-        dataset = minari.create_dataset_from_buffers(
-            dataset_id,
-            episodes,
-            observation_space=spaces.Box(source.low, source.high, dtype=np.float64),
-            action_space=spaces.Discrete(source.n_actions),
-            **metadata,
-        )
+        box = spaces.Box(source.low, source.high, dtype=np.float64)
+        task = {"observation_space": box, "action_space": spaces.Discrete(source.n_actions)}
+        dataset = minari.create_dataset_from_buffers(dataset_id, episodes, **task, **metadata)
     names = {name: getattr(source, name) for name in ("state_names", "action_names", "periodic")}
     dataset.storage.update_metadata({_METADATA_KEY: json.dumps({"names": names, "origin": source.origin})})
     return dataset

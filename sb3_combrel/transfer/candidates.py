@@ -80,11 +80,9 @@ class MappingTable(NamedTuple):
 
 
 class Candidates:
-    """The candidates of each target action: pairs of a state mapping and a source action.
+    """The candidates of each target action: pairs of a state mapping and a source action; all sources are numbered on.
 
-    Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
-    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished
-    (``whole``): then each is a candidate of every action, in the same order.
+    If whole mappings are to be distinguished (``whole``), each is a candidate of every action, in the same order.
     """
 
     def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask, whole: bool = False):
@@ -231,10 +229,8 @@ def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
 
 def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:
     """Return the state mappings of all sets, one below the other."""
-    return MappingTable(
-        variable=np.vstack([mappings.state_mappings for mappings in sets]).astype(np.int64),
-        sign=np.vstack([mappings.state_signs for mappings in sets]).astype(np.float64),
-    )
+    variable = np.vstack([mappings.state_mappings for mappings in sets]).astype(np.int64)
+    return MappingTable(variable, sign=np.vstack([mappings.state_signs for mappings in sets]).astype(np.float64))
 
 
 def sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:

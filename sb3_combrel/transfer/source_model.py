@@ -102,9 +102,7 @@ class SourceModel:
 
     The weight of a prediction is the sum of exp(-d^2 / breadth^2) over these instances, divided by 1 + z^2, where z is how
     far the state is from their mean in units of their spread along that way: so the variance of what a linear fit predicts
-    grows. At the edge of its data a source knows less than the number of instances nearby suggests.
-
-    All of it is in unit coordinates of the source. ``outcome_breadth`` is no broader than ``breadth``.
+    grows. All of it is in unit coordinates of the source; ``outcome_breadth`` is no broader than ``breadth``.
     """
 
     def __init__(

@@ -23,10 +23,7 @@ _TOLERANCE = 0.001  # changes of value up to this part of the range of a step's 
 
 
 def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadth: float, min_weight: float) -> FiniteMDP:
-    """Write what each action, held until the cell is left, does at each point of a grid over the source's states.
-
-    Pairs of which the model's prediction weighs less than ``min_weight`` are optimistic.
-    """
+    """Write what each action, held until the cell is left, does on a grid; below ``min_weight`` pairs are optimistic."""
     grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
     mdp = FiniteMDP(grid, source.n_actions, gamma)
     n_points, cells = grid.n_points, grid.arrays.cells
@@ -61,8 +58,7 @@ class SourcePolicy:
     """What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
 
     An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst of
-    its neighbours. ``gamma`` is below 1: the least and the largest value follow from it; ``breadth`` is that of the source's
-    model, in unit coordinates of the source.
+    its neighbours. ``gamma`` is below 1: the least and the largest value follow from it.
     """
 
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):

@@ -157,8 +157,7 @@ class LeastErrorSelector(FixedSelector):
     def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
         task = parts.task
         super().__init__(parts, fixed=np.full(task.n_actions, -1, dtype=np.int64))
-        self.copies = copies
-        self.n_transitions = n_transitions
+        self.copies, self.n_transitions = copies, n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
         self.choice: Choice | None = None  #: the mapping that was chosen, None before
         self._just_chosen = False

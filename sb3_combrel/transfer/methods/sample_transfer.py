@@ -78,9 +78,8 @@ class SampleTransfer(MappingTransfer):
     source_breadth: float = field(default=DEFAULT_SOURCE_BREADTH, init=False)
 
     def __post_init__(self) -> None:
-        check_count("n_instances", self.n_instances)
-        check_count("min_transitions", self.min_transitions)
-        check_count("max_transitions", self.max_transitions)
+        for name in ("n_instances", "min_transitions", "max_transitions"):
+            check_count(name, getattr(self, name))
         if self.max_transitions < self.min_transitions:
             least = f"min_transitions={self.min_transitions}"
             raise ValueError(f"max_transitions must be at least {least}, got {self.max_transitions}")
@@ -204,10 +203,7 @@ class TaskComplianceSelector(PooledSelector):
 
 
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """Return for each state mapping, target and source action the compliance of the tasks that have these, added up.
-
-    A task's, Lambda_X of Eq. 6, is the sum of its transitions' compliances (of which ``sums`` are), over all transitions.
-    """
+    """Return sum over X of Lambda_X (Eq. 6) / n_mappings by state mapping, target and source action, as ``sums`` are."""
     n_rows, n_actions, n_source_actions = sums.shape
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # In the mean over all source actions that the other target actions may have.

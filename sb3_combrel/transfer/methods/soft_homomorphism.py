@@ -107,8 +107,7 @@ class SoftHomomorphism(Transfer):
         self._claims = Claims(source.rewards, task, self.transfer_terminals)
         self._squares = np.zeros(2)  # squared errors of predictions, and squared effects, of transitions as they came
         self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
-        self._fit_due = float(FIRST_RENEWAL)
-        self._seconds = 0.0
+        self._fit_due, self._seconds = float(FIRST_RENEWAL), 0.0
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         return TransferredInstances.empty(len(actions), states.shape[1])

@@ -22,10 +22,7 @@ Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Readings(NamedTuple):
-    """The deterministic mappings of target to source states that a stochastic mapping is a mixture of.
-
-    In each, every source variable reads a target variable of its own; those for which none is left stand at their mean.
-    """
+    """Deterministic mappings: each source variable reads a target variable of its own, or none (its mean)."""
 
     variable: np.ndarray  # int64, shape (n_mappings, n_source_variables): target variable that is read, -1 for none
     sign: np.ndarray  # float64, same shape: -1 where it is mirrored
@@ -152,10 +149,7 @@ def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int,
 
 
 class MixturePredictions:
-    """Predicts pairs of the target by the mean over a mixture.
-
-    The effect is the copies' sum; the reward, their mean; an end, the product; the weight of the source's data, the least.
-    """
+    """Predicts by the mean over a mixture: of copies the sum of effects, mean reward, product of ends, least weight."""
 
     terms: Terms
 

@@ -70,10 +70,7 @@ class ThreeWayRBM(LearnedTranslation):
 
 
 class Machine(NamedTuple):
-    """Parameters of a machine with source and target units that are real numbers and hidden units that are 0 or 1.
-
-    The weight of source unit i, hidden unit j and target unit k: sum over factors of ``source[i] * hidden[j] * target[k]``.
-    """
+    """Parameters; a weight is the sum over factors of ``source[i] * hidden[j] * target[k]``; hidden units are 0 or 1."""
 
     source: th.Tensor  # float64, shape (n_source, n_factors)
     hidden: th.Tensor  # shape (n_hidden, n_factors)
