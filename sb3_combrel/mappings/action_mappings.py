@@ -16,8 +16,7 @@ from sb3_combrel.common.checks import check_count
 from sb3_combrel.common.serialisation import register_reader, register_writer
 from sb3_combrel.mappings.inter_task_mapping import Ints, index_table
 
-# The numbers of mappings, which are computed with, have at most 3,000 digits.
-MAX_ACTIONS = 1000
+MAX_ACTIONS = 1000  # the numbers of mappings, which are computed with, have at most 3,000 digits
 
 # Finding a member takes a number of steps in proportion to the third power of the number of actions.
 MAX_BALANCED_ACTIONS = 100
@@ -80,11 +79,8 @@ class AllActionMappings(ActionMappings):
 
     def __getitem__(self, index: int) -> tuple[int, ...]:
         self._check_index(index)
-        digits = []
-        for _ in range(self.n_target_actions):
-            index, digit = divmod(index, self.n_source_actions)
-            digits.append(digit)
-        return tuple(reversed(digits))
+        n = self.n_source_actions
+        return tuple(index // n**place % n for place in reversed(range(self.n_target_actions)))
 
     def count(self, action: int, source_action: int) -> int:
         return self.n_source_actions ** (self.n_target_actions - 1) if 0 <= source_action < self.n_source_actions else 0
@@ -95,11 +91,7 @@ class AllActionMappings(ActionMappings):
 
 @dataclass(frozen=True)
 class BalancedActionMappings(ActionMappings):
-    """The functions that use the source actions as equally as possible, in lexicographic order; nothing is stored.
-
-    For five target and three source actions these are the 90 that use them 2, 2 and 1 times (the paper, Section 5.1;
-    all mappings of its Table 2 are of this kind).
-    """
+    """The functions that use the source actions as equally as possible (Section 5.1), in lexicographic order, not stored."""
 
     n_source_actions: int
     n_target_actions: int
@@ -169,18 +161,13 @@ def _balanced_completions(usage: tuple[int, ...], n_target: int) -> int:
 
 
 class ListedActionMappings(ActionMappings):
-    """Action mappings given one by one.
-
-    :param mappings: one mapping a row, shape (n, n_target_actions)
-    :param n_source_actions: number of actions of the source task; None to take the largest one used plus 1
-    :raises ValueError: if the rows are not integers in range
-    """
+    """Action mappings given one by one, one a row, shape (n, n_target_actions); ``ValueError`` for anything else."""
 
     def __init__(self, mappings: ArrayLike, n_source_actions: int | None = None) -> None:
         array = index_table("action mappings", mappings, "(n, n_target_actions)")
         check_count("n_source_actions", n_source_actions, none_allowed=True)
         self.mappings: Ints = array
-        self.mappings.flags.writeable = False
+        array.flags.writeable = False
         self.n_target_actions = int(array.shape[1])
         self.n_source_actions = int(array.max()) + 1 if n_source_actions is None else n_source_actions
         if array.min() < 0 or array.max() >= self.n_source_actions:
@@ -210,11 +197,9 @@ class ListedActionMappings(ActionMappings):
 def paper_icub_actions() -> Ints:
     """The 48 action mappings of the iCub experiment, shape (48, 8); see :meth:`MappingSet.paper_icub`."""
     mappings = []
-    for first_joint in combinations(range(4), 2):
-        source_joint = [0 if joint in first_joint else 1 for joint in range(4)]
-        for others in product((True, False), repeat=3):
-            reversed_joint = (True, *others)
-            mappings.append([2 * source_joint[j] + (direction ^ reversed_joint[j]) for j in range(4) for direction in (0, 1)])
+    for first_joint, others in product(combinations(range(4), 2), product((True, False), repeat=3)):
+        source_joint, reversed_joint = [0 if joint in first_joint else 1 for joint in range(4)], (True, *others)
+        mappings.append([2 * source_joint[j] + (direction ^ reversed_joint[j]) for j in range(4) for direction in (0, 1)])
     return np.array(mappings, dtype=np.int64)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import index as as_index
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +16,9 @@ from sb3_combrel.mappings.named_entries import Entries, as_entries, as_given, ha
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Names = Iterable[str]
+Signs = Sequence[int] | Mapping[Any, int] | None
 
-UNMAPPED = -1
-"""Represents None in integer arrays of state mappings."""
+UNMAPPED = -1  # represents None in integer arrays of state mappings
 
 _MAX_INDEX = 2**31 - 1
 
@@ -68,20 +68,12 @@ class InterTaskMapping:
         have not been replaced yet, if something is asked that needs their numbers
     """
 
-    # With names that have not been replaced yet these are what the user gave, dicts as pairs.
-    state: tuple[int | None, ...]
+    state: tuple[int | None, ...]  # with names that have not been replaced yet these are what the user gave, dicts as pairs
     action: tuple[int, ...]
     sign: tuple[int, ...] | None
     names: MappingNames | None = field(default=None, compare=False, kw_only=True)
 
-    def __init__(
-        self,
-        state: Entries,
-        action: Entries,
-        sign: Sequence[int] | Mapping[Any, int] | None = None,
-        *,
-        names: MappingNames | None = None,
-    ) -> None:
+    def __init__(self, state: Entries, action: Entries, sign: Signs = None, *, names: MappingNames | None = None) -> None:
         states, actions = as_entries("state", state), as_entries("action", action)
         signs = None if sign is None else as_entries("sign", sign)
         if names is not None:
@@ -198,14 +190,13 @@ class InterTaskMapping:
         self._check_numbers()
         return np.flatnonzero(np.array(self.action) == source_action).astype(np.int64)
 
-    def check(self, *, n_source_variables: int, n_target_variables: int, n_source_actions: int, n_target_actions: int) -> None:
+    def check(self, **sizes: Unpack[TaskSizes]) -> None:
         """Check the mapping against the spaces of the two tasks.
 
         :raises ValueError: if a length or an index does not fit; the message names the argument and what would be right
         """
         self._check_numbers()
-        sizes = n_source_variables, n_target_variables, n_source_actions, n_target_actions
-        check_sizes(self.state, self.action, *sizes)
+        check_sizes(self.state, self.action, **sizes)
 
     def with_names(
         self, source_variables: Names, target_variables: Names, source_actions: Names, target_actions: Names
@@ -285,18 +276,11 @@ def _columns(name: str, values: ArrayLike, n_columns: int) -> Floats:
     return array
 
 
-def check_sizes(
-    state: Sequence[int | None],
-    action: Sequence[int],
-    n_source_variables: int,
-    n_target_variables: int,
-    n_source_actions: int,
-    n_target_actions: int,
-) -> None:
+def check_sizes(state: Sequence[int | None], action: Sequence[int], **sizes: Unpack[TaskSizes]) -> None:
     """See :meth:`InterTaskMapping.check`."""
     for name, kind, entries, n_target, n_source in (
-        ("state", "variables", state, n_target_variables, n_source_variables),
-        ("action", "actions", action, n_target_actions, n_source_actions),
+        ("state", "variables", state, sizes["n_target_variables"], sizes["n_source_variables"]),
+        ("action", "actions", action, sizes["n_target_actions"], sizes["n_source_actions"]),
     ):
         largest = max(entry for entry in entries if entry is not None)
         if len(entries) != n_target:

@@ -32,8 +32,7 @@ from sb3_combrel.mappings.inter_task_mapping import (
 )
 from sb3_combrel.mappings.state_mappings import TWO_VARIABLES_ON_FOUR, state_mappings_using_sources, with_mirrored
 
-MAX_CANDIDATES = 10_000_000
-"""Compliance is computed for every pair of a state mapping and a source action of a target action."""
+MAX_CANDIDATES = 10_000_000  # compliance is computed for every pair of a state mapping and a source action of a target action
 
 # Whether a source variable is used once at most, whether target variables may be unmapped, and the action mappings.
 _SETS: dict[str, tuple[bool, bool, type[AllActionMappings | BalancedActionMappings]]] = {
@@ -48,14 +47,10 @@ _FACTORED_SETS = ("factored", "signed_factored")
 
 
 class Candidates(NamedTuple):
-    """The different ways in which the mappings of a set treat one target action; compliance distinguishes no others.
+    """The different ways in which the mappings of a set treat one target action; compliance distinguishes no others."""
 
-    :param state_index: row of ``MappingSet.state_mappings``, shape (n_candidates,)
-    :param source_action: source action that the target action maps to, shape (n_candidates,)
-    """
-
-    state_index: Ints
-    source_action: Ints
+    state_index: Ints  # row of ``MappingSet.state_mappings``, shape (n_candidates,)
+    source_action: Ints  # that the target action maps to, same shape
 
 
 class MappingSet:
@@ -186,11 +181,8 @@ class MappingSet:
         unsigned = name.removeprefix("signed_")
         once, allow_none, action_mappings = _SETS[unsigned]
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=once, allow_none=allow_none)
-        actions = action_mappings(n_source_actions, n_target_actions)
-        mirrored = None
-        if signs or unsigned != name:
-            rows, mirrored = with_mirrored(rows)
-        return cls(rows, actions, mirrored)
+        rows, mirrored = with_mirrored(rows) if signs or unsigned != name else (rows, None)
+        return cls(rows, action_mappings(n_source_actions, n_target_actions), mirrored)
 
     @classmethod
     def paper_mountain_car(cls) -> MappingSet:
@@ -217,7 +209,6 @@ class MappingSet:
     def from_list(cls, mappings: Iterable[InterTaskMapping]) -> MappingSet:
         """Exactly the given mappings, in the given order; they need not be all pairs of their factors.
 
-        :param mappings: mappings between the same two tasks
         :raises ValueError: if there is none, or if they differ in their numbers of target variables or actions
         """
         listed = list(mappings)
@@ -375,8 +366,7 @@ def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:
     if mappings.pairs is not None:
         members = [{"state": each.state, "action": each.action, "sign": each.sign} for each in mappings]
         return "ListedMappingSet", {"mappings": members}
-    factors = {"state_mappings": mappings.state_mappings, "signs": mappings.signs, "actions": mappings.actions}
-    return "MappingSet", factors
+    return "MappingSet", {name: getattr(mappings, name) for name in ("state_mappings", "signs", "actions")}
 
 
 register_writer(MappingSet, _write)

@@ -37,15 +37,7 @@ def has_names(entries: Sequence[Any]) -> bool:
 def numbers(
     argument: str, entries: Sequence[Any], target_names: Sequence[str], source_names: Sequence[str], default: Any = None
 ) -> tuple[Any, ...]:
-    """Replace names by the numbers that they stand for.
-
-    :param argument: "state" or "action", for messages
-    :param entries: one for each target variable or action, or pairs of one of these and its counterpart
-    :param target_names: names of the target's variables or actions; ``source_names``: of the source's
-    :param default: what a target variable that is in no pair is mapped to
-    :return: one entry for each target variable or action, if ``entries`` are pairs; entries that are no names as they were
-    :raises ValueError: if a name is not that of one variable or action, or one is in two pairs
-    """
+    """Replace names by their numbers; of pairs, make one entry for each of the target's, ``default`` where there is none."""
     if not any(isinstance(each, tuple) for each in entries):
         return tuple(_number(argument, each, source_names, "source") for each in entries)
     if not all(isinstance(each, tuple) for each in entries):

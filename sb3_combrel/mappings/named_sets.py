@@ -19,7 +19,6 @@ def resolve(
     :param mappings: the name of a set (:meth:`MappingSet.from_name`, or "paper_mountain_car", "paper_icub"), a set, one
         mapping or a sequence of mappings. A mapping may be given as a dict of its arguments, as in a YAML file:
         ``{"state": [0, None, 1, None], "action": [1, 0, 2, 1, 1]}``.
-    :param sizes: numbers of variables and actions of the tasks, see :class:`TaskSizes`
     :raises ValueError: if ``mappings`` is none of these or does not fit the two tasks
     """
     papers = {"paper_mountain_car": MappingSet.paper_mountain_car, "paper_icub": MappingSet.paper_icub}
@@ -33,23 +32,13 @@ def resolve(
 
 
 def check_mappings(mappings: Any) -> None:
-    """Check as much of what a user gives as can be checked before the tasks are known.
-
-    :param mappings: see :func:`resolve`, or a factored mapping or a dict of its copies
-    :raises ValueError: for a set that does not exist, an empty list, or something else than mappings
-    """
+    """Check as much of what a user gives, factored or as of :func:`resolve`, as is possible without the tasks."""
     if isinstance(_made(mappings), str):
         check_set_name(mappings)
 
 
 def with_numbers(mappings: Any, names: Sequence[MappingNames]) -> Any:
-    """Replace names of variables and actions by their numbers.
-
-    :param mappings: see :func:`check_mappings`
-    :param names: of each source and the target
-    :return: mappings that were given by name, with numbers; anything else as it is
-    :raises ValueError: if a name is not that of one variable or action, or stands for different ones in several sources
-    """
+    """Replace names of variables and actions by their numbers, which must be the same for all sources; other things stay."""
     made = _made(mappings)
     if isinstance(made, list):
         return [with_numbers(each, names) for each in made]

@@ -10,8 +10,7 @@ import numpy as np
 from sb3_combrel.common.checks import check_count, count_text
 from sb3_combrel.mappings.inter_task_mapping import UNMAPPED, Ints
 
-MAX_STATE_MAPPINGS = 100_000
-"""State mappings are rows of an array, and the table of compliances has a column for each."""
+MAX_STATE_MAPPINGS = 100_000  # they are rows of an array, and the table of compliances has a column for each
 
 # Far beyond what model learning on a grid is possible with; without limits, counting the mappings already takes for ever.
 MAX_SOURCE_VARIABLES = 1000
@@ -22,13 +21,7 @@ TWO_VARIABLES_ON_FOUR: Ints = np.array(list(permutations((0, 1, UNMAPPED, UNMAPP
 
 
 def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, allow_none: bool) -> Ints:
-    """Every state mapping that uses as many different source variables as there is room for.
-
-    :param once: whether a source variable is used at most once
-    :param allow_none: whether target variables may be left unmapped
-    :return: one mapping a row in lexicographic order (None first), shape (n, n_target), -1 for None
-    :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` mappings
-    """
+    """Every state mapping that uses as many source variables as there is room for (``once`` each), -1 for None, in order."""
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     different = min(n_source, n_target)
@@ -45,41 +38,28 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
 
 
 def copies_of_source(n_source: int, n_target: int) -> Ints:
-    """Every way to make a copy of the source, or of some of its variables, of different target variables.
-
-    :return: source variable of each target variable, -1 for those that are not in the copy; one copy a row, those with more
-        variables first, shape (n, n_target)
-    :raises ValueError: if a number is below 1 or too large, or if there are more than ``MAX_STATE_MAPPINGS`` copies
-    """
+    """State mappings of every copy of the source, or of some of its variables: of different ones, most variables first."""
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     largest = min(n_source, n_target)
     _check_n_state_mappings(sum(comb(n_source, k) * perm(n_target, k) for k in range(1, largest + 1)))
     rows = []
     for size in range(largest, 0, -1):
-        for used in combinations(range(n_source), size):
-            for taken in permutations(range(n_target), size):
-                row = np.full(n_target, UNMAPPED, dtype=np.int64)
-                row[list(taken)] = used
-                rows.append(row)
+        for used, taken in product(combinations(range(n_source), size), permutations(range(n_target), size)):
+            rows.append(np.full(n_target, UNMAPPED, dtype=np.int64))
+            rows[-1][list(taken)] = used
     return np.array(rows)
 
 
 def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
-    """Every state mapping with every choice of signs for its mapped variables.
-
-    :param state_mappings: shape (n, n_target), -1 for None
-    :return: the mappings and their signs (+1 or -1), both of shape (m, n_target); each mapping first with +1 throughout
-    :raises ValueError: if there are more than ``MAX_STATE_MAPPINGS``
-    """
+    """Every state mapping with every choice of signs for its mapped variables, +1 throughout first, and the signs."""
     mapped = state_mappings != UNMAPPED
     _check_n_state_mappings(sum(2**n for n in mapped.sum(axis=1).tolist()))
     rows, signs = [], []
     for row, is_mapped in zip(state_mappings, mapped, strict=True):
         for mirrored in product((1, -1), repeat=int(is_mapped.sum())):
             sign = np.ones_like(row)
-            # The first variable's changes fastest.
-            sign[is_mapped] = mirrored[::-1]
+            sign[is_mapped] = mirrored[::-1]  # the first variable's changes fastest
             rows.append(row)
             signs.append(sign)
     return np.array(rows), np.array(signs)

@@ -25,24 +25,13 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     data = minari.load_dataset(dataset) if isinstance(dataset, str) else dataset
     scaling = StateScaling.from_space(data.observation_space, bounds)
     n_actions = count_actions(data.action_space)
-    episodes = list(data.iterate_episodes())
-    actions = np.concatenate([np.asarray(episode.actions) for episode in episodes])
+    parts = [(e.observations[:-1], e.actions, e.rewards, e.observations[1:], e.terminations) for e in data.iterate_episodes()]
+    states, actions, rewards, next_states, terminated = map(np.concatenate, zip(*parts, strict=True))
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
-    env_spec = data.env_spec
-    unnamed = {"env": None if env_spec is None else env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
-    names = {name: tuple(each) for name, each in kept.get("names", {}).items()}
-    return Transitions(
-        np.concatenate([episode.observations[:-1] for episode in episodes]),
-        actions - int(data.action_space.start),
-        np.concatenate([episode.rewards for episode in episodes]),
-        np.concatenate([episode.observations[1:] for episode in episodes]),
-        np.concatenate([episode.terminations for episode in episodes]),
-        scaling.low,
-        scaling.high,
-        n_actions,
-        origin=kept.get("origin", unnamed),
-        **names,
-    )
+    unnamed = {"env": None if data.env_spec is None else data.env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
+    names: dict[str, Any] = {name: tuple(each) for name, each in kept.get("names", {}).items()}
+    columns = states, actions - int(data.action_space.start), rewards, next_states, terminated
+    return Transitions(*columns, scaling.low, scaling.high, n_actions, origin=kept.get("origin", unnamed), **names)
 
 
 def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> MinariDataset:
@@ -56,25 +45,15 @@ def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> Mina
     for rows in np.split(np.arange(len(source.states)), np.flatnonzero(~continues) + 1):
         truncated = np.zeros(len(rows), dtype=bool)
         truncated[-1] = not source.terminated[rows[-1]]
-        episodes.append(
-            EpisodeBuffer(
-                observations=np.vstack([source.states[rows], source.next_states[rows[-1:]]]),
-                actions=source.actions[rows],
-                rewards=source.rewards[rows],
-                terminations=source.terminated[rows],
-                truncations=truncated,
-            )
-        )
+        observations = np.vstack([source.states[rows], source.next_states[rows[-1:]]])
+        given: dict[str, Any] = {"actions": source.actions[rows], "rewards": source.rewards[rows], "truncations": truncated}
+        episodes.append(EpisodeBuffer(observations=observations, terminations=source.terminated[rows], **given))
     with warnings.catch_warnings():
         # Minari warns of every piece of metadata that is not given; which ones to give is the caller's choice.
         warnings.simplefilter("ignore", UserWarning)
-        dataset = minari.create_dataset_from_buffers(
-            dataset_id,
-            episodes,
-            observation_space=spaces.Box(source.low, source.high, dtype=np.float64),
-            action_space=spaces.Discrete(source.n_actions),
-            **metadata,
-        )
+        box = spaces.Box(source.low, source.high, dtype=np.float64)
+        task = {"observation_space": box, "action_space": spaces.Discrete(source.n_actions)}
+        dataset = minari.create_dataset_from_buffers(dataset_id, episodes, **task, **metadata)
     names = {name: getattr(source, name) for name in ("state_names", "action_names", "periodic")}
     dataset.storage.update_metadata({_METADATA_KEY: json.dumps({"names": names, "origin": source.origin})})
     return dataset

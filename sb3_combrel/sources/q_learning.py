@@ -32,13 +32,7 @@ _MAX_TILES = 10_000_000
 
 
 class TileCoding:
-    """Overlapping grids over the unit cube; each state lies in one tile of each grid (Sutton and Barto, Section 9.5.4).
-
-    :param n_variables: number of state variables
-    :param n_tilings: number of grids, each shifted against the others
-    :param n_tiles: tiles along each variable of a grid
-    :raises ValueError: if a number is below 1, or if there would be too many tiles
-    """
+    """Overlapping grids over the unit cube; each state lies in one tile of each grid (Sutton and Barto, Section 9.5.4)."""
 
     def __init__(self, n_variables: int, n_tilings: int = 8, n_tiles: int = 8) -> None:
         check_count("n_tilings", n_tilings, max=_MAX_TILES)
@@ -50,18 +44,14 @@ class TileCoding:
                 f"n_tiles={n_tiles} makes {count_text(self.n_features)} tiles for {n_variables} state variables, more than "
                 f"{_MAX_TILES:,}; choose a smaller n_tiles or n_tilings"
             )
-        self.n_tilings = n_tilings
-        self.n_tiles = n_tiles
+        self.n_tilings, self.n_tiles = n_tilings, n_tiles
         # Odd multiples 1, 3, 5, ... of the unit shift keep the tiles of different grids from lining up on diagonals.
         self._offsets = (np.arange(n_tilings)[:, None] * (2 * np.arange(n_variables) + 1) % n_tilings) / n_tilings
         self._strides = (n_tiles + 1) ** np.arange(n_variables)
         self._first = np.arange(n_tilings) * (n_tiles + 1) ** n_variables
 
     def tiles(self, unit_state: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The tiles in which a state lies, as feature numbers, one for each grid, shape (n_tilings,).
-
-        :param unit_state: unit coordinates, shape (n_variables,); what is outside the cube counts as its border
-        """
+        """The tiles in which a state lies, unit coordinates (outside: at the border), one of each grid, shape (n_tilings,)."""
         inside = np.minimum(np.maximum(unit_state, 0.0), 1.0) * self.n_tiles
         return self._first + (inside + self._offsets).astype(np.int64) @ self._strides
 
@@ -77,8 +67,7 @@ class QLearning:
     :param trace_decay: lambda, the decay of the traces; 0 for one-step Q-learning
     :param epsilon: probability of a random action while learning
     :param initial_value: value of every state and action at first
-    :param n_tilings: number of grids, see :class:`TileCoding`
-    :param n_tiles: tiles along each variable
+    :param n_tilings: number of grids, see :class:`TileCoding`; ``n_tiles``: tiles along each variable
     :param bounds: ``(low, high)`` of the states if the observation space has none
     :param seed: seed of the learner and its environment
     :raises ValueError: if the spaces are of another kind or an argument is out of range
@@ -105,14 +94,10 @@ class QLearning:
                 raise ValueError(f"{name} must be between 0 and 1, got {value}")
         check_finite("initial_value", initial_value)
         self.env = make_env(env)
-        self.observation_space = self.env.observation_space
-        self.action_space = self.env.action_space
+        self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
         self.scaling = StateScaling.from_space(self.observation_space, bounds)
         self.n_actions = count_actions(self.action_space)
-        self.learning_rate = learning_rate
-        self.gamma = gamma
-        self.trace_decay = trace_decay
-        self.epsilon = epsilon
+        self.learning_rate, self.gamma, self.trace_decay, self.epsilon = learning_rate, gamma, trace_decay, epsilon
         self.seed = seed
         self.coding = TileCoding(self.scaling.n_variables, n_tilings, n_tiles)
         self.weights = np.full((self.coding.n_features, self.n_actions), initial_value / n_tilings)
@@ -145,8 +130,7 @@ class QLearning:
         for step in range(1, max_steps + 1):
             values = self._values(tiles)
             greedy = self._argmax(values)
-            explore = self._rng.random() < self.epsilon
-            action = int(self._rng.integers(self.n_actions)) if explore else greedy
+            action = int(self._rng.integers(self.n_actions)) if (self._rng.random() < self.epsilon) else greedy
             if values[action] < values[greedy]:
                 # What follows an exploratory action is no evidence on the greedy policy from the states before it.
                 traces[:] = 0.0

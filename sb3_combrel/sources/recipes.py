@@ -28,12 +28,7 @@ _SEEN: set[Path] = set()
 
 
 def check_source(source: Any) -> None:
-    """Check that a source can be found, without reading or learning it.
-
-    :param source: what :func:`find_source` takes, or a list of such
-    :raises FileNotFoundError: if there is neither a file nor a task of that name
-    :raises ValueError: if it is something else
-    """
+    """Check that a source, or each of a list, can be found, without reading or learning it; raises as :func:`find_source`."""
     if isinstance(source, Sequence) and not isinstance(source, str) and len(source) > 0:
         for each in source:
             check_source(each)
@@ -90,10 +85,7 @@ def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
 
 
 def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
-    """Instances of a recipe's task, read from its file if they were learned before.
-
-    Processes that start at the same time each learn the task, with the same seed and so with the same result.
-    """
+    """Instances of a recipe, from its file if it exists; processes that start together learn it each, with one result."""
     arguments = dict(recipe)
     renew = arguments.pop("renew", False)
     if not isinstance(renew, bool):
@@ -133,10 +125,7 @@ def _reason(file: Path) -> str:
 
 
 def cache_file(recipe: Mapping[str, Any]) -> Path:
-    """Return the file for the instances of a recipe, in the folder SB3_COMBREL_CACHE (a variable), or ~/.cache/sb3_combrel.
-
-    :param recipe: see :func:`find_source`
-    """
+    """Return the file of a recipe's instances (:func:`find_source`), in $SB3_COMBREL_CACHE or ~/.cache/sb3_combrel."""
     folder = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "sb3_combrel")
     text = json.dumps({key: value for key, value in recipe.items() if key != "renew"}, sort_keys=True, default=str)
     name = re.sub(r"\W+", "-", str(recipe["env"]))
@@ -144,11 +133,7 @@ def cache_file(recipe: Mapping[str, Any]) -> Path:
 
 
 def fingerprint(env_id: str) -> str:
-    """Return a text that changes with an environment: with its specification and the source files of its class.
-
-    All base classes count, but for Gymnasium's own, and all modules of the same package that these use, such as one of the
-    dynamics.
-    """
+    """A text that changes with an environment: its specification, and the source of its class, bases and what they use."""
     spec = task_spec(env_id)
     if spec is None:
         return ""

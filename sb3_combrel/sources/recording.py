@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.sources.transitions import (
+    AnyEnv,
     TransitionLog,
     Transitions,
     as_transition_count,
@@ -30,12 +30,7 @@ Behaviour = PolicyPredictor | Callable[[NDArray[Any]], int]
 
 
 def record(
-    model: Behaviour | None,
-    env: str | gym.Env[Any, Any] | VecEnv,
-    n_instances: int,
-    seed: int | None,
-    deterministic: bool,
-    bounds: Bounds | None,
+    model: Behaviour | None, env: str | AnyEnv, n_instances: int, seed: int | None, deterministic: bool, bounds: Bounds | None
 ) -> Transitions:
     """Let a behaviour act in a task; for the parameters see :meth:`SourceInstances.record`."""
     n_instances = as_transition_count("n_instances", n_instances)
@@ -59,8 +54,7 @@ def record(
                 states = log_step(log, venv, states, actions, step, n_instances)
                 seen, _, starts, _ = step
         recorder = "random actions" if model is None else getattr(model, "__name__", type(model).__name__)
-        origin = describe_origin(venv, recorder, seed)
-        return log.transitions(scaling, n_actions, task_names(venv), origin)
+        return log.transitions(scaling, n_actions, task_names(venv), describe_origin(venv, recorder, seed))
     finally:
         if isinstance(env, str):
             venv.close()
@@ -80,11 +74,7 @@ def log_step(
     step: tuple[Any, NDArray[Any], NDArray[Any], Sequence[Mapping[str, Any]]],
     max_transitions: int | None = None,
 ) -> NDArray[Any]:
-    """Add one step of all environments, up to ``max_transitions`` in all, and return the raw states that it led to.
-
-    :param states: raw states in which the step began
-    :param step: what ``env.step`` returned: states as a model sees them, rewards, dones, infos
-    """
+    """Add what ``env.step`` returned to the log, which began in raw ``states``; return the raw states that it led to."""
     seen, rewards, dones, infos = step
     normalize = unwrap_vec_normalize(env)
     following = raw_states(env, seen)

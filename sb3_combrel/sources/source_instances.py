@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# Each action has a name.
-_MAX_ACTIONS = 1_000_000
+_MAX_ACTIONS = 1_000_000  # each action has a name
 _FORMAT, _VERSION = "sb3_combrel.SourceInstances", 1
 _ROW_ARRAYS = ("states", "actions", "rewards", "next_states", "terminated")
 _ARRAYS = (*_ROW_ARRAYS, "low", "high")
@@ -57,11 +56,9 @@ class SourceInstances:
     :param rewards: its reward, shape (n_instances,)
     :param next_states: where it ends, raw units, shape (n_instances, n_variables); of an episode's last transition too
     :param terminated: whether it reached a terminal state, shape (n_instances,); a time limit is no such state
-    :param low: lower bound of each state variable, raw units, shape (n_variables,)
-    :param high: upper bound of each state variable, raw units, shape (n_variables,)
+    :param low: lower bound of each state variable, raw units, shape (n_variables,); ``high``: upper bound, the same
     :param n_actions: number of actions of the task, also of those that no instance has
-    :param state_names: name of each state variable; by default s0, s1, ...
-    :param action_names: name of each action; by default a0, a1, ...
+    :param state_names: name of each state variable, by default s0, s1, ...; ``action_names``: of each action, a0, a1, ...
     :param origin: where the instances came from, a dict that JSON can hold
     :param periodic: which state variables are periodic, their bounds one period apart: one bool for each; () for none
     :raises ValueError: if there are no instances, or if an argument does not fit the others or is not finite
@@ -102,8 +99,7 @@ class SourceInstances:
         object.__setattr__(self, "action_names", checked_names("action_names", self.action_names, self.n_actions, "a"))
         object.__setattr__(self, "periodic", periodic_flags(None if self.periodic == () else self.periodic, d))
         try:
-            # As a file of it would be read.
-            object.__setattr__(self, "origin", json.loads(json.dumps(dict(self.origin))))
+            object.__setattr__(self, "origin", json.loads(json.dumps(dict(self.origin))))  # as a file of it would be read
         except (TypeError, ValueError) as error:
             raise ValueError(f"origin must be a dict that JSON can hold, got {self.origin!r}") from error
 
@@ -161,8 +157,7 @@ class SourceInstances:
         total_timesteps = as_transition_count("total_timesteps", total_timesteps)
         n_instances = as_count("n_instances", n_instances, max=total_timesteps, why_max="total_timesteps")
         check_method(method)
-        learned = learn_q_learning(env, seed, total_timesteps, learner)
-        return cls(*learned).subset(n_instances, method, seed)
+        return cls(*learn_q_learning(env, seed, total_timesteps, learner)).subset(n_instances, method, seed)
 
     @classmethod
     def from_fitted_rmax(
@@ -185,8 +180,7 @@ class SourceInstances:
         """
         n_instances = as_transition_count("n_instances", n_instances)
         check_method(method)
-        learned = LEARNERS["fitted_rmax"](env, seed, n_episodes, learner)
-        return cls(*learned).subset(n_instances, method, seed)
+        return cls(*LEARNERS["fitted_rmax"](env, seed, n_episodes, learner)).subset(n_instances, method, seed)
 
     @classmethod
     def from_minari(
@@ -283,10 +277,9 @@ class SourceInstances:
             )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write a compressed npz file without pickled objects. The file appears complete or not at all.
+        """Write a compressed npz file without pickled objects, complete or not at all, and return its path.
 
         :param path: path of the file; the suffix .npz is added if there is none
-        :return: the path written to
         """
         target = _with_suffix(path)
         write_whole(target, self.to_bytes())
@@ -337,7 +330,5 @@ def _with_suffix(path: str | os.PathLike[str]) -> Path:
     return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
 
 
-register_writer(
-    SourceInstances, lambda source: ("SourceInstances", {"npz": base64.b64encode(source.to_bytes()).decode("ascii")})
-)
+register_writer(SourceInstances, lambda one: ("SourceInstances", {"npz": base64.b64encode(one.to_bytes()).decode("ascii")}))
 register_reader("SourceInstances", lambda npz: SourceInstances.from_bytes(base64.b64decode(npz, validate=True)))

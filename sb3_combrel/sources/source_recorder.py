@@ -28,8 +28,7 @@ class SourceRecorder(BaseCallback):
         self, max_instances: int | None = None, bounds: Bounds | None = None, seed: int | None = None, verbose: int = 0
     ) -> None:
         super().__init__(verbose)
-        self.bounds = bounds
-        self.seed = seed
+        self.bounds, self.seed = bounds, seed
         self.log = TransitionLog(max_instances, seed)
         self._states: NDArray[Any] | None = None
 

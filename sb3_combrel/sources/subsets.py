@@ -9,6 +9,7 @@ from sb3_combrel.common.periodic import differences
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 def check_method(method: str) -> None:
@@ -17,28 +18,15 @@ def check_method(method: str) -> None:
         raise ValueError(f"method must be 'random' or 'covering', got {method!r}")
 
 
-def random_rows(terminated: NDArray[np.bool_], n_rows: int, rng: np.random.Generator) -> Ints:
+def random_rows(terminated: Flags, n_rows: int, rng: np.random.Generator) -> Ints:
     """A uniform sample of ``n_rows`` < n row numbers, ascending, with at least one terminal instance if there is any."""
     return _keep_terminal(rng.choice(len(terminated), n_rows, replace=False), terminated, rng)
 
 
 def covering_rows(
-    units: Floats,
-    actions: Ints,
-    terminated: NDArray[np.bool_],
-    n_rows: int,
-    rng: np.random.Generator,
-    periodic: NDArray[np.bool_] | None = None,
+    units: Floats, actions: Ints, terminated: Flags, n_rows: int, rng: np.random.Generator, periodic: Flags | None = None
 ) -> Ints:
-    """About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection.
-
-    :param units: where the instances start, unit coordinates, shape (n, n_variables)
-    :param actions: shape (n,); ``terminated``: bool, same shape
-    :param n_rows: number of instances to select, less than n
-    :param rng: picks the first instance of each action
-    :param periodic: which state variables are periodic, bool, shape (n_variables,); None for none
-    :return: row numbers, ascending
-    """
+    """About equally many instances of each action, spread over the states: farthest-point (greedy k-centre) selection."""
     rows_of = [np.flatnonzero(actions == action) for action in np.unique(actions)]
     quotas = _equal_quotas(np.array([len(rows) for rows in rows_of]), n_rows)
     # Selected rows of an action come in the order of selection, so the last one is the least informative.
@@ -46,7 +34,7 @@ def covering_rows(
     return _keep_terminal(np.concatenate(chosen), terminated, rng)
 
 
-def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator, periodic: NDArray[np.bool_] | None) -> Ints:
+def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator, periodic: Flags | None) -> Ints:
     """Begin anywhere, then always add the point that is farthest from all points so far."""
     chosen = np.empty(n_points, dtype=np.int64)
     distance = np.full(len(units), np.inf)
@@ -54,8 +42,7 @@ def _farthest_points(units: Floats, n_points: int, rng: np.random.Generator, per
     for i in range(n_points):
         chosen[i] = candidate
         np.minimum(distance, (differences(units, units[candidate], periodic) ** 2).sum(axis=1), out=distance)
-        # Of identical states one is as good as another, but none must be chosen twice.
-        distance[candidate] = -1.0
+        distance[candidate] = -1.0  # of identical states one is as good as another, but none must be chosen twice
         candidate = int(distance.argmax())
     return chosen
 
@@ -68,7 +55,7 @@ def _equal_quotas(available: Ints, total: int) -> Ints:
     return quotas
 
 
-def _keep_terminal(rows: Ints, terminated: NDArray[np.bool_], rng: np.random.Generator) -> Ints:
+def _keep_terminal(rows: Ints, terminated: Flags, rng: np.random.Generator) -> Ints:
     # Without a terminal instance nothing of the goal is transferred. It replaces the last row chosen.
     if terminated.any() and not terminated[rows].any():
         rows[-1] = rng.choice(np.flatnonzero(terminated))

@@ -49,12 +49,7 @@ LEARNERS: dict[str, Callable[[str | gym.Env[Any, Any], int | None, int, dict[str
 
 
 class TransitionLog:
-    """Transitions in the order in which they came; of too many, a uniform random sample.
-
-    :param max_instances: how many to keep at most (reservoir sampling); None for all
-    :param seed: seed of the sample
-    :raises ValueError: if ``max_instances`` is not a whole number of at least 1 or None
-    """
+    """Transitions in the order in which they came; of more than ``max_instances`` a uniform random sample."""
 
     def __init__(self, max_instances: int | None = None, seed: int | None = None) -> None:
         self.max_instances = None if max_instances is None else as_count("max_instances", max_instances)
@@ -66,10 +61,7 @@ class TransitionLog:
         return len(self._rows)
 
     def add(self, state: NDArray[Any], action: int, reward: float, next_state: NDArray[Any], terminated: bool) -> None:
-        """Add a transition, with its action from 0 on and states in raw units, shape (n_variables,), which are not copied.
-
-        :raises ValueError: if a state or the reward is not finite
-        """
+        """Add a transition, in raw units; states are not copied. ``ValueError`` if a state or the reward is not finite."""
         when = f"in transition {self.n_seen}"
         check_observation(state, when)
         check_observation(next_state, when)
@@ -85,11 +77,7 @@ class TransitionLog:
     def transitions(
         self, scaling: StateScaling, n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
     ) -> Transitions:
-        """What is in the log; ``ValueError`` if that is nothing.
-
-        :param names: ``state_names``, ``action_names`` and ``periodic``, as far as known
-        :param origin: where the transitions came from
-        """
+        """What is in the log; ``ValueError`` if that is nothing."""
         if not self._rows:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
         _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
@@ -158,9 +146,5 @@ def _attribute(env: AnyEnv, name: str) -> Any:
 def describe_origin(env: AnyEnv, recorder: str, seed: int | None) -> dict[str, Any]:
     """Where instances come from: id of the environment, what acted in it (``recorder``), seed and version of this package."""
     spec = _attribute(env, "spec")
-    return {
-        "env": None if spec is None else spec.id,
-        "recorder": recorder,
-        "seed": seed,
-        "package": f"sb3-combrel {metadata.version('sb3-combrel')}",
-    }
+    package = f"sb3-combrel {metadata.version('sb3-combrel')}"
+    return {"env": None if spec is None else spec.id, "recorder": recorder, "seed": seed, "package": package}

@@ -64,8 +64,7 @@ class Transfer(ABC):
     effects are in unit coordinates of the target.
     """
 
-    #: The target task and the random number generator, from :meth:`bind` on.
-    task: TargetTask | None = None
+    task: TargetTask | None = None  #: the target task and the random number generator, from :meth:`bind` on
     rng: np.random.Generator
 
     #: How the model uses the source: "instances": they join the target's own where these do not suffice; "prior": it is the
@@ -78,7 +77,6 @@ class Transfer(ABC):
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         """Prepare for a target task; what was learned of another one is forgotten.
 
-        :param task: the target task
         :param rng: generator of all random numbers that the method draws; predictions must draw none
         :raises ValueError: if the method does not fit the task
         """
@@ -101,8 +99,12 @@ class Transfer(ABC):
 
         :param points: rows of ``task.sample_states``, int64, shape (n,)
         """
+        return self.transferred(self._bound_task.sample_states[points], actions, own_weight)
+
+    @property
+    def _bound_task(self) -> TargetTask:
         assert self.task is not None
-        return self.transferred(self.task.sample_states[points], actions, own_weight)
+        return self.task
 
     @property
     def informs_model(self) -> bool:
@@ -123,10 +125,7 @@ class Transfer(ABC):
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         """Take in a transition of the target task.
 
-        :param state: unit coordinates, shape (n_variables,)
-        :param action: from 0 on
-        :param reward: raw
-        :param next_state: unit coordinates
+        :param state: unit coordinates, shape (n_variables,), as ``next_state``; ``action``: from 0 on; ``reward``: raw
         :param terminated: the episode ended in a terminal state; a time limit is none
         """
 

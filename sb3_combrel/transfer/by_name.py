@@ -19,9 +19,8 @@ METHODS = f"{PACKAGE}.transfer.methods."
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
     """Make a transfer object of the algorithm's own from what the user gave.
 
-    :param transfer: None; a transfer object, which is copied; a class or its name; or a dict of one entry, from the name to
-        the arguments, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``. Methods of this package may go by their
-        class alone; others are imported: "package.module.Class" or "package.module:Class"
+    :param transfer: None; a transfer object, which is copied; a class or its name ("package.module.Class"; of this package its
+        class alone will do); or a dict of one entry, such as ``{"sb3_combrel.COMBREL": {"source": "source.npz"}}``
     :raises ValueError: if it is none of these, or the name is not that of a transfer method
     """
     if transfer is None:
@@ -54,22 +53,19 @@ def _method(name: str) -> Any:
 
 def _own_methods() -> dict[str, type[Transfer]]:
     """The package's own transfer methods that are complete, by their public names."""
-    methods = (each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS) and not inspect.isabstract(each))
-    return {_name(each): each for each in methods}
+    methods = (each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS))
+    return {_name(each): each for each in methods if not inspect.isabstract(each)}
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
-    """Describe a transfer object, bound or not, as plain data for a file; :func:`restore_transfer` makes it again.
-
-    Of an object that plain data cannot describe only the name is kept, with a warning.
-    """
+    """Describe a transfer object as plain data for a file; with a warning, of one that cannot be described only the name."""
     if transfer is None:
         return None
     name = _name(type(transfer))
-    arguments = None
     try:
         arguments = to_plain(transfer.arguments())
     except (AttributeError, TypeError) as error:
+        arguments = None
         warnings.warn(
             f"{name} is not saved with the model ({error}): give it the method arguments(), or pass it again when the "
             f"model is loaded, load(..., transfer={type(transfer).__name__}(...))",
@@ -82,8 +78,6 @@ def restore_transfer(transfer: Any) -> Any:
     """Make the transfer object that :func:`describe_transfer` described; anything else is returned as it is.
 
     A file may come from anyone: nothing is imported, only classes that are defined already are considered.
-
-    :raises ValueError: if the method is not known or was not saved, or the arguments do not fit it
     """
     if not isinstance(transfer, dict) or transfer.get(KIND) != SAVED:
         return transfer

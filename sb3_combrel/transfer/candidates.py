@@ -21,8 +21,7 @@ OneSource = SourceInstances | str | os.PathLike[str] | Mapping[str, Any]
 SourceLike = OneSource | Sequence[OneSource]
 MappingsLike = str | InterTaskMapping | FactoredMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
-# Compliance is stored with every candidate, for thousands of transitions.
-MAX_WHOLE_MAPPINGS = 20_000
+MAX_WHOLE_MAPPINGS = 20_000  # compliance is stored with every candidate, for thousands of transitions
 
 
 class Candidate(NamedTuple):
@@ -81,18 +80,13 @@ class MappingTable(NamedTuple):
 
 
 class Candidates:
-    """The candidates of each target action: pairs of a state mapping and a source action.
+    """The candidates of each target action: pairs of a state mapping and a source action; all sources are numbered on.
 
-    Several source tasks are held as one: their actions are numbered on, and their state mappings stacked. The source actions
-    of other target actions play no part in what is translated for an action, unless whole mappings are to be distinguished
-    (``whole``): then each is a candidate of every action, in the same order.
-
-    :raises ValueError: if source or mappings do not fit the target, or if there are too many whole mappings
+    If whole mappings are to be distinguished (``whole``), each is a candidate of every action, in the same order.
     """
 
     def __init__(self, source: SourceLike, mappings: MappingsLike, task: TargetTask, whole: bool = False):
-        self.task = task
-        self.whole = whole
+        self.task, self.whole = task, whole
         self.sources = load_sources(source)
         self.sets = resolved_sets(self.sources, mappings, task)
         self.instances = stacked_instances(self.sources)
@@ -119,10 +113,7 @@ class Candidates:
         return found
 
     def _numbered(self) -> CandidateArrays:
-        """Number the candidates of every target action, over all sources."""
-        rows: list[np.ndarray] = []
-        actions: list[np.ndarray] = []
-        first = [0]
+        rows, actions, first = [], [], [0]
         for a in range(self.task.n_actions):
             row_offset = action_offset = 0
             for number, (source, mappings) in enumerate(zip(self.sources, self.sets, strict=True)):
@@ -136,11 +127,8 @@ class Candidates:
                 row_offset += mappings.n_state_mappings
                 action_offset += source.n_actions
             first.append(len(self.origins))
-        return CandidateArrays(
-            first=np.array(first, dtype=np.int64),
-            row=np.concatenate(rows).astype(np.int64),
-            action=np.concatenate(actions).astype(np.int64),
-        )
+        row, action = (np.concatenate(columns).astype(np.int64) for columns in (rows, actions))
+        return CandidateArrays(np.array(first, dtype=np.int64), row, action)
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -152,21 +140,17 @@ class Candidates:
         made.arrays = self.arrays._replace(action=np.arange(len(self), dtype=np.int64))
         return made
 
-    def find(self, action: int, mapping: InterTaskMapping) -> int:
-        """Return the candidate that a mapping to the first source amounts to for one target action."""
-        return next(
-            c
-            for c in range(self.arrays.first[action], self.arrays.first[action + 1])
-            if np.array_equal(self.table.variable[self.arrays.row[c]], mapping.state_index)
-            and np.array_equal(self.table.sign[self.arrays.row[c]], mapping.state_sign)
-            and self.arrays.action[c] == mapping.action[action]
-        )
+    def find(self, action: int, variable: np.ndarray, sign: np.ndarray, source_action: int) -> int:
+        """Return the candidate that a state mapping and a source action, numbered on, amount to for a target action."""
+        first, last = self.arrays.first[action : action + 2]
+        same = ((self.table.variable == variable) & (self.table.sign == sign)).all(axis=1)
+        fits = same[self.arrays.row[first:last]] & (self.arrays.action[first:last] == source_action)
+        return int(first + np.flatnonzero(fits)[0])
 
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""
         number, action, state_index, source_action = self.origins[candidate]
-        mappings = self.sets[number]
-        whole = repr(mappings[mappings.find(state_index, action, source_action)])
+        whole = repr(self.sets[number][self.sets[number].find(state_index, action, source_action)])
         variables = whole[whole.index("(") + 1 : whole.index(";")]
         names, whole_actions = self.sources[number].action_names, []
         if self.whole:
@@ -195,38 +179,26 @@ class Candidates:
 
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
-    """Return the instances that a user means (:func:`~sb3_combrel.sources.recipes.find_source`), of one source or of several.
-
-    :raises FileNotFoundError: if there is neither a file nor a task of that name
-    :raises ValueError: if it is something else, or the task cannot be learned
-    """
-    if isinstance(source, Sequence) and not isinstance(source, str):
-        check_source(source)
-        return [instances for one in source for instances in load_sources(one)]
+    """Return the instances of one source or of several, see :func:`~sb3_combrel.sources.recipes.find_source`."""
     check_source(source)
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        return [instances for one in source for instances in load_sources(one)]
     return [find_source(source)]
 
 
 def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:
-    """Return the set of mappings that a user means for each source, with names.
-
-    :raises ValueError: if it is factored, or does not fit the tasks
-    """
+    """Return the set of mappings that a user means for each source, with names; ``ValueError`` if it does not fit."""
     if isinstance(mappings, FactoredMapping):
         raise ValueError(f'factored mappings need use="prior", got mappings={mappings!r}')
-    return [
-        resolve(mappings, **sizes(one, task)).with_names(
-            one.state_names, task.state_names, one.action_names, task.action_names
-        )
-        for one in sources
-    ]
+    found = []
+    for one in sources:
+        names = one.state_names, task.state_names, one.action_names, task.action_names
+        found.append(resolve(mappings, **sizes(one, task)).with_names(*names))
+    return found
 
 
 def load_one_source(source: SourceLike, method: str) -> SourceInstances:
-    """Return what :func:`load_sources` does, of one source; ``method``: for the message.
-
-    :raises ValueError: also if there are several
-    """
+    """Return what :func:`load_sources` does, of one source; a ValueError that names the ``method`` if there are several."""
     found = load_sources(source)
     if len(found) > 1:
         raise ValueError(f"source must be one source with {method}, got {len(found)}")
@@ -257,10 +229,8 @@ def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
 
 def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:
     """Return the state mappings of all sets, one below the other."""
-    return MappingTable(
-        variable=np.vstack([mappings.state_mappings for mappings in sets]).astype(np.int64),
-        sign=np.vstack([mappings.state_signs for mappings in sets]).astype(np.float64),
-    )
+    variable = np.vstack([mappings.state_mappings for mappings in sets]).astype(np.int64)
+    return MappingTable(variable, sign=np.vstack([mappings.state_signs for mappings in sets]).astype(np.float64))
 
 
 def sizes(source: SourceInstances, task: TargetTask) -> dict[str, int]:

@@ -15,25 +15,17 @@ from sb3_combrel.transfer.report import Contradiction
 # Above the first probability a transition is predicted to end the episode, below the second not to: between them, at the
 # border of where episodes end, a kernel average decides nothing.
 ENDS, GOES_ON = 0.5, 0.1
-# So many steps in a row where an end is predicted, and none comes, contradict it once.
-STEPS_OF_A_VISIT = 10
-# So many episodes that ran into their time limit, and never an end where one is predicted.
-EPISODES_IN_VAIN = 3
-# Rewards from which on wrong ones count.
-MIN_REWARDS = 10
-# So many visits to where an end is predicted, and none has come yet: one or two may be near misses.
-MIN_ABSENT = 3
+STEPS_OF_A_VISIT = 10  # so many steps in a row where an end is predicted, and none comes, contradict it once
+EPISODES_IN_VAIN = 3  # so many episodes that ran into their time limit, and never an end where one is predicted
+MIN_REWARDS = 10  # rewards from which on wrong ones count
+MIN_ABSENT = 3  # so many visits to where an end is predicted, and none has come yet: one or two may be near misses
 # What is counted, in the order in which it is saved.
 COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "in_vain", "steps_of_visit")
-# Transitions from which on predictions worse than "no change" are warned of.
-TRANSITIONS_BEFORE_WARNING = 300
-# Each state variable's range is divided into so many parts.
-N_PARTS = 4
-# A part with fewer transitions says nothing.
-MIN_IN_PART = 10
+TRANSITIONS_BEFORE_WARNING = 300  # transitions from which on predictions worse than "no change" are warned of
+N_PARTS = 4  # each state variable's range is divided into so many parts
+MIN_IN_PART = 10  # a part with fewer transitions says nothing
 MAX_CONTRADICTIONS = 8
-# Effects are squared unit coordinates; less than this is no movement.
-NO_MOVEMENT = 1e-18
+NO_MOVEMENT = 1e-18  # effects are squared unit coordinates; less than this is no movement
 _N, _ERROR, _EFFECT, _WORSE = range(4)
 
 
@@ -62,28 +54,19 @@ class OutcomeEvidence:
     their time limit without a confirmed end, if all rewards were alike, so that nothing but an end tells states apart.
     Predicted ends are :attr:`ends_believed` once they have come, unless those that did not outnumber them.
 
-    :param rewards: of the source's instances, shape (n,)
-    :param threshold: weight from which on the source has data
-    :param no_end: weight from which on it says that there is no end; None: the same
+    From the weight ``threshold`` on the source has data, from ``no_end`` on (None: the same) it says that there is no end.
     """
 
     def __init__(self, rewards: np.ndarray, threshold: float, no_end: float | None = None):
         self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
-        self.threshold = threshold
-        self.no_end = threshold if no_end is None else no_end
+        self.threshold, self.no_end = threshold, threshold if no_end is None else no_end
         self.forget()
 
     def forget(self) -> None:
         """Forget all transitions."""
-        self.confirmed = 0
-        #: Ends that were not predicted.
-        self.unpredicted = 0
-        #: Visits to where an end is predicted that have left without one, or lasted for long.
-        self.absent = 0
-        self.rewards_right = 0
-        self.rewards_wrong = 0
-        self.in_vain = 0
-        self.steps_of_visit = 0
+        # Unpredicted: ends; absent: visits to where an end is predicted that have left without one, or lasted for long.
+        self.confirmed = self.unpredicted = self.absent = 0
+        self.rewards_right = self.rewards_wrong = self.in_vain = self.steps_of_visit = 0
         self.reward_range = (np.inf, -np.inf)
 
     def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
@@ -91,10 +74,8 @@ class OutcomeEvidence:
         self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
         has_data = weight >= self.threshold
         if has_data:
-            if abs(reward - predicted_reward) > self.tolerance:
-                self.rewards_wrong += 1
-            else:
-                self.rewards_right += 1
+            wrong = bool(abs(reward - predicted_reward) > self.tolerance)
+            self.rewards_wrong, self.rewards_right = self.rewards_wrong + wrong, self.rewards_right + (not wrong)
         if terminated:
             if end >= GOES_ON or self.steps_of_visit:
                 self.confirmed += 1
@@ -174,8 +155,7 @@ class RegionErrors:
     @property
     def of_actions(self) -> np.ndarray:
         """Sums by target action: number, squared error, squared effect, number that are worse; shape (n_actions, 4)."""
-        # Each transition is in one part of every variable.
-        return self.sums[:, 0].sum(axis=1)
+        return self.sums[:, 0].sum(axis=1)  # each transition is in one part of every variable
 
     def errors(self) -> np.ndarray:
         """Return the mean squared error over that of "no change", by target action, NaN where nothing moved."""
@@ -198,23 +178,17 @@ class RegionErrors:
     def report_fields(self, evidence: OutcomeEvidence) -> dict[str, Any]:
         """Return the fields of a report that say how the target's transitions compare with what was predicted of them."""
         totals = self.of_actions.sum(axis=0)
-        return dict(
-            n_compared=int(totals[_N]),
-            n_worse=int(totals[_WORSE]),
-            contradictions=self.contradictions(),
-            ends=(evidence.confirmed, evidence.contradicted),
-            rewards=(evidence.rewards_right, evidence.rewards_wrong),
-        )
+        found: dict[str, Any] = {"n_compared": int(totals[_N]), "n_worse": int(totals[_WORSE])}
+        outcomes = {
+            "ends": (evidence.confirmed, evidence.contradicted),
+            "rewards": (evidence.rewards_right, evidence.rewards_wrong),
+        }
+        return {**found, "contradictions": self.contradictions(), **outcomes}
 
     def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
         n, error, effect, _ = self.sums[action, variable, part].tolist()
         low, high = (float(bound[variable]) for bound in (self.task.scaling.low, self.task.scaling.high))
         width = (high - low) / N_PARTS
-        return Contradiction(
-            target_action=self.task.action_names[action],
-            variable=self.task.state_names[variable],
-            low=low + part * width,
-            high=low + (part + 1) * width,
-            n_compared=int(n),
-            error=error / effect if effect > NO_MOVEMENT else np.inf,
-        )
+        names = self.task.action_names[action], self.task.state_names[variable]
+        ratio = error / effect if effect > NO_MOVEMENT else np.inf
+        return Contradiction(*names, low=low + part * width, high=low + (part + 1) * width, n_compared=int(n), error=ratio)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# The arrays, which grow together.
-_COLUMNS = ("states", "effects", "rewards", "actions", "ended")
+_COLUMNS = ("states", "effects", "rewards", "actions", "ended")  # the arrays, which grow together
 
 
 class RecordedTransitions:
@@ -16,11 +15,8 @@ class RecordedTransitions:
 
     def __init__(self, n_variables: int):
         self.n = 0
-        self.states = np.empty((64, n_variables))
-        self.effects = np.empty((64, n_variables))
-        self.rewards = np.empty(64)
-        self.actions = np.empty(64, dtype=np.int64)
-        self.ended = np.empty(64, dtype=np.int64)
+        self.states, self.effects, self.rewards = np.empty((64, n_variables)), np.empty((64, n_variables)), np.empty(64)
+        self.actions, self.ended = np.empty(64, dtype=np.int64), np.empty(64, dtype=np.int64)
 
     def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
         """Record one transition; ``effect``: next state minus state; return its number."""

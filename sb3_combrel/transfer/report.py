@@ -128,11 +128,8 @@ class TransferReport:
             f'Compared on {self.n_compared:,} steps, the source was worse than "no change" on {self.n_worse:,} '
             f"({100 * self.n_worse / self.n_compared:.0f} %)."
         ]
-        if self.contradictions:
-            lines.append("Contradicted (prediction error above 1):")
-            lines += [f"  {each}" for each in self.contradictions]
-        else:
-            lines.append("Nowhere was it contradicted on average.")
+        where = [f"  {each}" for each in self.contradictions]
+        lines += ["Contradicted (prediction error above 1):", *where] if where else ["Nowhere was it contradicted on average."]
         if self.not_used:
             pairs = ", ".join(f"{variable} under {action}" for action, variable in self.not_used)
             lines.append(f"Not used any more, as the source explains too little of it: {pairs}.")

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.linear_regression import add_products, fitted_effect, n_products, products_of, solve_regression
+from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
 from sb3_combrel.common.periodic import bring_near
 from sb3_combrel.models.fit_arrays import Kernel
 from sb3_combrel.models.linear_fits import RIDGE, narrowed
@@ -16,8 +16,7 @@ from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
 
 DEFAULT_SOURCE_BREADTH = 0.2
 DEFAULT_N_NEIGHBORS = 24
-# Rewards and ends jump from one state to the next: they are averaged over nearer instances.
-DEFAULT_OUTCOME_BREADTH = 0.05
+DEFAULT_OUTCOME_BREADTH = 0.05  # rewards and ends jump from one state to the next: they are averaged over nearer instances
 
 
 class SourcePredictions(NamedTuple):
@@ -37,12 +36,7 @@ def source_arrays(plain):
 
 @inner
 def predict_source(instances, effect_range, kernel, near, action, state, effect):
-    """Predict one state and action of the source.
-
-    :param effect_range: float64, shape (2, n_actions, n_variables): least and largest effect that was seen
-    :param effect: receives the predicted displacement, shape (n_variables,)
-    :return: reward, probability of termination, weight (see :class:`SourceModel`); all 0 for an action without instances
-    """
+    """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
     item, distance = near.item[action], near.distance[action]
     length = nearest_instances(instances, action, state, kernel.reach, item, distance, near.length[action])
     near.length[action] = length
@@ -53,10 +47,7 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
     scale = narrowed(distance[length - 1], kernel) if length == kernel.n_neighbors else kernel.scale
     sums, products = near.products[0], near.products[1]
     sums[:] = 0.0
-    total = 0.0
-    outcomes = 0.0
-    reward = 0.0
-    end = 0.0
+    total, outcomes, reward, end = 0.0, 0.0, 0.0, 0.0
     for k in range(length):
         i = item[k]
         bring_near(instances.state[action, i], state, instances.periodic, near.state)
@@ -72,8 +63,7 @@ def predict_source(instances, effect_range, kernel, near, action, state, effect)
             end += weight
     solve_regression(sums, -RIDGE / scale, near.factor, near.fit)
     for v in range(d):
-        fitted = fitted_effect(near.fit, state, v)
-        effect[v] = min(max(fitted, effect_range[0, action, v]), effect_range[1, action, v])
+        effect[v] = min(max(fitted_effect(near.fit, state, v), effect_range[0, action, v]), effect_range[1, action, v])
     return reward / outcomes, end / outcomes, total / (1.0 + beyond_data(sums, near.factor, state, near.fit))
 
 
@@ -112,12 +102,7 @@ class SourceModel:
 
     The weight of a prediction is the sum of exp(-d^2 / breadth^2) over these instances, divided by 1 + z^2, where z is how
     far the state is from their mean in units of their spread along that way: so the variance of what a linear fit predicts
-    grows. At the edge of its data a source knows less than the number of instances nearby suggests.
-
-    :param instances: of the source, in unit coordinates of it
-    :param breadth: unit coordinates of the source
-    :param n_neighbors: nearest instances of a fit
-    :param outcome_breadth: unit coordinates of the source; no broader than ``breadth``
+    grows. All of it is in unit coordinates of the source; ``outcome_breadth`` is no broader than ``breadth``.
     """
 
     def __init__(
@@ -128,30 +113,15 @@ class SourceModel:
         outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
     ):
         n_actions, _, d = instances.state.shape
-        self.n_variables = d
-        self.instances = instances
-        self.kernel = Kernel(
-            scale=-1.0 / breadth**2,
-            reach=np.inf,
-            outcome_scale=-1.0 / min(breadth, outcome_breadth) ** 2,
-            n_neighbors=n_neighbors,
-            counting_scale=-1.0 / breadth**2,
-        )
+        self.n_variables, self.instances = d, instances
+        scale, outcome_scale = -1.0 / breadth**2, -1.0 / min(breadth, outcome_breadth) ** 2
+        self.kernel = Kernel(scale, np.inf, outcome_scale, n_neighbors, counting_scale=scale)
         effect_range = np.zeros((2, n_actions, d))
         for action, size in enumerate(instances.size.tolist()):
             if size:
                 effect_range[0, action] = instances.effect[action, :size].min(axis=0)
                 effect_range[1, action] = instances.effect[action, :size].max(axis=0)
-        near = NearestLists(
-            item=np.zeros((n_actions, n_neighbors), dtype=np.int32),
-            distance=np.empty((n_actions, n_neighbors)),
-            length=np.zeros(n_actions, dtype=np.int64),
-            state=np.empty(d),
-            products=np.empty((2, n_products(d))),
-            factor=np.empty((d, d)),
-            fit=np.empty(d + d * d),
-            outcome=np.empty(3 + 2 * d),
-        )
+        near = NearestLists.empty(n_actions, n_neighbors, d)
         #: For compiled code, see :func:`source_arrays`.
         self.plain = tuple(instances), effect_range, tuple(self.kernel), tuple(near)
 

@@ -13,23 +13,17 @@ from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel
 
-# Weight of instances from which on a prediction counts, as by default in Fitted R-Max.
-MIN_WEIGHT = 1.0
+MIN_WEIGHT = 1.0  # weight of instances from which on a prediction counts, as by default in Fitted R-Max
 # An action is held until its cell of the grid is left, but for no more than so many steps: values that are interpolated at
 # every step would spread over the grid.
 MAX_STEPS = 50
 # What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
 LEAST_WEIGHT_ON_GRID = 0.05
-# Changes of value up to this part of the range of a step's rewards end the planning.
-_TOLERANCE = 0.001
+_TOLERANCE = 0.001  # changes of value up to this part of the range of a step's rewards end the planning
 
 
 def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadth: float, min_weight: float) -> FiniteMDP:
-    """Write what each action, held until the cell is left, does at each point of a grid over the source's states.
-
-    :param model: of the source's instances; ``breadth``: its kernel breadth, for which the grid is chosen
-    :param min_weight: weight of the model's prediction from which on a pair has a model; the others are optimistic
-    """
+    """Write what each action, held until the cell is left, does on a grid; below ``min_weight`` pairs are optimistic."""
     grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
     mdp = FiniteMDP(grid, source.n_actions, gamma)
     n_points, cells = grid.n_points, grid.arrays.cells
@@ -50,8 +44,7 @@ def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadt
         left = (np.abs(at[going] - states[going]) * cells).max(axis=1) >= 1.0
         # Of those that have no model it does not matter.
         going = going[~left & (goes_on[going] > 0.0) & (weight[going] >= min_weight)]
-    pairs = np.arange(len(states))
-    mdp.write_rows(pairs, weight >= min_weight, goes_on[:, None], (at - states)[:, None], reward)
+    mdp.write_rows(np.arange(len(states)), weight >= min_weight, goes_on[:, None], (at - states)[:, None], reward)
     return mdp
 
 
@@ -65,8 +58,7 @@ class SourcePolicy:
     """What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
 
     An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst of
-    its neighbours. ``gamma`` is below 1: the least and the largest value follow from it; ``breadth`` is that of the source's
-    model, in unit coordinates of the source.
+    its neighbours. ``gamma`` is below 1: the least and the largest value follow from it.
     """
 
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):
@@ -75,16 +67,12 @@ class SourcePolicy:
         lowest, highest = float(source.rewards.min()), float(source.rewards.max())
         bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
         planner = Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=planning_tolerance(source))
-        # From below: values then come from ways that exist, however few sweeps there are.
-        planner.values[:] = bounds[0]
-        #: Value of each grid point.
-        self.values = planner.exploitation_values()
+        planner.values[:] = bounds[0]  # from below: values then come from ways that exist, however few sweeps there are
+        self.values = planner.exploitation_values()  #: value of each grid point
         self.grid = mdp.grid
         n, d = source.n_actions, source.n_variables
         self._function = self.values, tuple(CorrectionArrays.empty(d)), self.grid.plain, float(gamma), bounds, planner.upper
-        self._q = QValues(n, d)
-        self._actions = np.arange(n)
-        self._length = np.ones(n, dtype=np.int64)
+        self._q, self._actions, self._length = QValues(n, d), np.arange(n), np.ones(n, dtype=np.int64)
 
     def q_values(self, state: np.ndarray) -> np.ndarray:
         """Action values at a state of the source, unit coordinates; -inf for actions with too few instances near it."""

@@ -15,7 +15,7 @@ from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.instances.compliance_selector import ComplianceSelector, SelectionOptions
 from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_either
-from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
+from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 # Arguments of COMBREL that have a meaning for a prior as well.
@@ -130,33 +130,17 @@ class COMBREL(MappingTransfer):
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         assert self.mappings is not None
-        return make_prior(
-            self.source,
-            self.mappings,
-            task,
-            breadth=float(self.source_breadth),
-            given=is_factored(self.mappings) and not isinstance(self.mappings, str),
-            drawn=None,
-            max_transitions=self.max_transitions,
-            transfer_terminals=self.transfer_terminals,
-        )
+        given = is_factored(self.mappings) and not isinstance(self.mappings, str)
+        return self._prior_of_set(task, given=given, drawn=None, max_transitions=self.max_transitions)
 
     def _whole_mappings(self) -> bool:
         return self.neighbors == "state_action"
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> ComplianceSelector:
-        options = SelectionOptions(
-            bandwidths=bandwidths.of_all,
-            starts=bandwidths.starts,
-            n_neighbors=self.n_neighbors,
-            all_actions=self._whole_mappings(),
-            neighbor_radius=self.neighbor_radius,
-            drawn=self.choice == "drawn",
-            online=self.measured == "online",
-            max_transitions=self.max_transitions,
-            min_evidence=self.min_evidence,
-            min_compliance=self.min_compliance,
-        )
+        names = ("n_neighbors", "neighbor_radius", "max_transitions", "min_evidence", "min_compliance")
+        given = {name: getattr(self, name) for name in names}
+        given |= {"all_actions": self._whole_mappings(), "drawn": self.choice == "drawn", "online": self.measured == "online"}
+        options = SelectionOptions(bandwidths.of_all, bandwidths.starts, **given)
         self._compliance_selector = ComplianceSelector(parts, options)
         return self._compliance_selector
 
@@ -167,6 +151,5 @@ class COMBREL(MappingTransfer):
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
         """
         if self.use == "prior":
-            assert self.task is not None
-            return self.source_prior.mean_compliance()[pairs // len(self.task.sample_states)]
+            return self.source_prior.mean_compliance()[pairs // len(self._bound_task.sample_states)]
         return self._compliance_selector.mean_compliance(pairs)

@@ -17,10 +17,8 @@ from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
 DEFAULT_MAX_EXPERTS = 10
-# Numbers of mappings are saved as float64.
-MAX_MAPPINGS = 2**53
-#: The number of the learning agent among those who may act; the experts come after it.
-AGENT = 0
+MAX_MAPPINGS = 2**53  # numbers of mappings are saved as float64
+AGENT = 0  #: the number of the learning agent among those who may act; the experts come after it
 
 
 class Expert(NamedTuple):
@@ -115,8 +113,7 @@ class MappingExperts(Transfer):
         if self.n_mappings > MAX_MAPPINGS:
             raise ValueError(f"mappings must hold at most {MAX_MAPPINGS:,} mappings to draw from; list those of interest")
         if not self._policies:
-            given = float(self.gamma), float(self.source_breadth)
-            self._policies = [SourcePolicy(source, *given) for source in self.sources]
+            self._policies = [SourcePolicy(each, float(self.gamma), float(self.source_breadth)) for each in self.sources]
         # Source coordinates that a mapping does not determine are typical ones.
         self._typical = [np.median(source.scaling.to_unit(source.states), axis=0) for source in self.sources]
         self._numbers = np.empty(0, dtype=np.int64)
@@ -160,13 +157,11 @@ class MappingExperts(Transfer):
         return int(actions[0] if len(actions) == 1 else self.rng.choice(actions))
 
     def _most_steps(self) -> float:
-        """Steps for which an expert may act in an episode."""
         if self.patience is None:
             return np.inf
         return self.patience * next((steps for arm, _, steps, _ in reversed(self._episodes) if arm == AGENT), np.inf)
 
     def _choose(self) -> int:
-        """Choose who acts in an episode."""
         if len(self._numbers) == 0:
             every = self.n_mappings <= self.max_experts
             drawn = np.arange(self.n_mappings) if every else self.rng.choice(self.n_mappings, self.max_experts, replace=False)
@@ -174,8 +169,7 @@ class MappingExperts(Transfer):
         acting = {playing.arm for playing in self._playing.values()}
         returns = self._returns()
         if not returns[AGENT]:
-            # Several environments: nobody else acts before it is known how long the agent takes.
-            return AGENT
+            return AGENT  # several environments: nobody else acts before it is known how long the agent takes
         untried = [k for k, of_arm in enumerate(returns) if not of_arm and k not in acting]
         return untried[0] if untried else best_by_ucb1(returns, float(self.exploration))
 
@@ -204,7 +198,6 @@ class MappingExperts(Transfer):
         return np.array([mean_return(k, of_arm) if of_arm else np.nan for k, of_arm in enumerate(self._returns())])
 
     def _returns(self) -> list[list[float]]:
-        """The returns of the agent's episodes, and of each expert's."""
         return [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
 
     def describe(self) -> list[tuple[str, float, int]]:
@@ -240,16 +233,12 @@ class MappingExperts(Transfer):
         }
 
     def get_state(self) -> dict[str, np.ndarray]:
-        assert self.task is not None
-        playing = [
-            (environment, one.arm, one.total, one.steps, one.acted, *one.state)
-            for environment, one in self._playing.items()
-            if one.state is not None
-        ]
+        going = [(number, one, one.state) for number, one in self._playing.items() if one.state is not None]
+        playing = [(number, one.arm, one.total, one.steps, one.acted, *state) for number, one, state in going]
         return {
             "experts": self._numbers[:, None].astype(np.float64),
             "episodes": np.array(self._episodes, dtype=np.float64).reshape(-1, 4),
-            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self.task.n_variables),
+            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self._bound_task.n_variables),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:

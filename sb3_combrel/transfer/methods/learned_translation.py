@@ -18,8 +18,7 @@ from sb3_combrel.transfer.candidates import SourceLike, load_one_source
 from sb3_combrel.transfer.methods.mapping_transfer import DEFAULT_BREADTH, DEFAULT_BREADTH_DECAY
 from sb3_combrel.transfer.methods.timbrel import TIMBREL
 
-# With fewer samples there is nothing to learn a mapping from.
-MIN_SAMPLES = 10
+MIN_SAMPLES = 10  # with fewer samples there is nothing to learn a mapping from
 DEFAULT_SAMPLE_STEPS = 200
 
 
@@ -99,16 +98,12 @@ class LearnedTranslation(Transfer):
 
     @abstractmethod
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        """Learn a mapping from samples of both tasks; return all the source's ``instances``, in order, in target coordinates.
-
-        They are brought into the target's box afterwards.
-        """
+        """Learn a mapping from samples; return the source's ``instances`` in target coordinates, to be clipped."""
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
         name = type(self).__name__
-        # A saved model must not depend on other files.
-        self.source = self._source = load_one_source(self.source, name)
+        self.source = self._source = load_one_source(self.source, name)  # a saved model must not depend on other files
         for of, periodic in (("source", self._source.periodic), ("target", tuple(task.periodic or ()))):
             if any(periodic):
                 raise ValueError(
@@ -128,8 +123,7 @@ class LearnedTranslation(Transfer):
         return len(self._samples)
 
     def action(self, state: np.ndarray) -> int | None:
-        assert self.task is not None
-        return int(self.rng.integers(self.task.n_actions)) if len(self._samples) < self.n_random_steps else None
+        return int(self.rng.integers(self._bound_task.n_actions)) if len(self._samples) < self.n_random_steps else None
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         if self._timbrel is not None:
@@ -140,9 +134,8 @@ class LearnedTranslation(Transfer):
             self._learn()
 
     def _learn(self) -> None:
-        assert self.task is not None
         began = perf_counter()
-        source, d = self._source, self.task.n_variables
+        source, d = self._source, self._bound_task.n_variables
         states = source.scaling.to_unit(source.states)
         instances = Triplets(states, source.actions, source.scaling.to_unit(source.next_states) - states)
         rows = np.sort(self.rng.permutation(len(source))[: self.n_source_samples])
@@ -155,29 +148,16 @@ class LearnedTranslation(Transfer):
         self._seconds = perf_counter() - began
 
     def _transfer_rows(self, rows: np.ndarray) -> None:
-        assert self.task is not None
-        task, source, d = self.task, self._source, self.task.n_variables
+        task, source, d = self._bound_task, self._source, self._bound_task.n_variables
         self._rows = rows
-        self.translated = SourceInstances(
-            states=task.scaling.to_raw(rows[:, :d]),
-            actions=np.clip(rows[:, d], 0, task.n_actions - 1).astype(np.int64),
-            rewards=source.rewards,
-            next_states=task.scaling.to_raw(rows[:, d + 1 :]),
-            terminated=source.terminated,
-            low=task.scaling.low,
-            high=task.scaling.high,
-            n_actions=task.n_actions,
-            state_names=task.state_names,
-            action_names=task.action_names,
-            origin={"env": f"{source.origin.get('env', 'an unnamed task')} by {type(self).__name__}"},
-        )
-        self._timbrel = TIMBREL(
-            self.translated,
-            InterTaskMapping(tuple(range(task.n_variables)), tuple(range(task.n_actions))),
-            breadth=self.breadth,
-            breadth_decay=self.breadth_decay,
-            transfer_terminals=self.transfer_terminals,
-        )
+        states, after = task.scaling.to_raw(rows[:, :d]), task.scaling.to_raw(rows[:, d + 1 :])
+        actions = np.clip(rows[:, d], 0, task.n_actions - 1).astype(np.int64)
+        space = task.scaling.low, task.scaling.high, task.n_actions, task.state_names, task.action_names
+        origin = {"env": f"{source.origin.get('env', 'an unnamed task')} by {type(self).__name__}"}
+        self.translated = SourceInstances(states, actions, source.rewards, after, source.terminated, *space, origin)
+        identity = InterTaskMapping(tuple(range(task.n_variables)), tuple(range(task.n_actions)))
+        names = ("breadth", "breadth_decay", "transfer_terminals")
+        self._timbrel = TIMBREL(self.translated, identity, **{name: getattr(self, name) for name in names})
         self._timbrel.bind(task, self.rng)
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
@@ -221,11 +201,11 @@ class LearnedTranslation(Transfer):
 
     def _state_of_timbrel(self) -> dict[str, np.ndarray]:
         """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
-        assert self.task is not None
         timbrel = self._timbrel
         if timbrel is None:
-            timbrel = TIMBREL(self._source, InterTaskMapping((0,) * self.task.n_variables, (0,) * self.task.n_actions))
-            timbrel.bind(self.task, np.random.default_rng(0))
+            task = self._bound_task
+            timbrel = TIMBREL(self._source, InterTaskMapping((0,) * task.n_variables, (0,) * task.n_actions))
+            timbrel.bind(task, np.random.default_rng(0))
         return {f"timbrel_{name}": array for name, array in timbrel.get_state().items()}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:

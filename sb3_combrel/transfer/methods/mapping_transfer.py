@@ -27,7 +27,7 @@ from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
 from sb3_combrel.transfer.instances.relevance import renew_relevance
 from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
 from sb3_combrel.transfer.instances.translation import Translator
-from sb3_combrel.transfer.prior.prior_sets import is_factored
+from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
@@ -38,10 +38,8 @@ from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 SourceUse = InstanceTransfer | SourcePrior
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8
-#: The relevance that does not favour distant instances, ``equations.near_relevances``.
-NEAR = "near"
-# Action mappings that are restricted as a whole are compared one by one.
-MAX_ACTION_MAPPINGS = 100_000
+NEAR = "near"  #: the relevance that does not favour distant instances, ``equations.near_relevances``
+MAX_ACTION_MAPPINGS = 100_000  # action mappings that are restricted as a whole are compared one by one
 
 
 @dataclass(repr=False, eq=False)
@@ -118,8 +116,7 @@ class MappingTransfer(Transfer):
         self.relevance = NEAR if is_near else bool(self.relevance)
 
     def __getattr__(self, name: str) -> Any:
-        # Called only for what is not there otherwise.
-        self._check_bound(name)
+        self._check_bound(name)  # called only for what is not there otherwise
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def arguments(self) -> dict[str, Any]:
@@ -137,48 +134,29 @@ class MappingTransfer(Transfer):
         self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
     def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
-        """Replace names of variables and actions in mappings by their numbers, now that both tasks are known."""
-        names = [
-            MappingNames(each.state_names, tuple(task.state_names), each.action_names, tuple(task.action_names))
-            for each in sources
-        ]
+        states, actions = tuple(task.state_names), tuple(task.action_names)
+        names = [MappingNames(each.state_names, states, each.action_names, actions) for each in sources]
         self.mappings = with_numbers(self.mappings, names)
 
     def _make_instances(self, task: TargetTask) -> InstanceTransfer:
-        """Make the transfer of instances to the target task that the method was just bound to."""
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         bandwidths = candidate_bandwidths(self.candidates, self.bandwidths)
         parts = SelectorParts(self.candidates, task, RecordedTransitions(task.n_variables), self.rng)
         selector = self._make_selector(parts, bandwidths)
-        return InstanceTransfer(
-            selector,
-            self._make_translator(self.candidates, task, float(self.breadth)),
-            breadth_decay=self.breadth_decay,
-            measure_relevance=partial(
-                renew_relevance,
-                self.candidates,
-                parts.transitions,
-                bandwidths=bandwidths,
-                periodic=self._periodic,
-                mu=None if self.relevance == NEAR else float(self.relevance_fraction),
-            ),
-        )
+        translator = self._make_translator(self.candidates, task, float(self.breadth))
+        mu = None if self.relevance == NEAR else float(self.relevance_fraction)
+        seen = self.candidates, parts.transitions
+        measure = partial(renew_relevance, *seen, bandwidths=bandwidths, periodic=self._periodic, mu=mu)
+        return InstanceTransfer(selector, translator, breadth_decay=self.breadth_decay, measure_relevance=measure)
 
     def _whole_mappings(self) -> bool:
         """Return whether whole mappings are the candidates."""
         return False
 
     def _make_translator(self, candidates: Candidates, task: TargetTask, breadth: float) -> Translator:
-        """Make the translator of the instances of some candidates."""
-        by_relevance = bool(self.relevance) and self.ranks_by_relevance
-        return Translator(
-            candidates,
-            task,
-            breadth=breadth,
-            transfer_terminals=self.transfer_terminals,
-            by_relevance=by_relevance,
-            times_weight=by_relevance and self.relevance == NEAR,
-        )
+        ranked = bool(self.relevance) and self.ranks_by_relevance
+        order = {"by_relevance": ranked, "times_weight": ranked and self.relevance == NEAR}
+        return Translator(candidates, task, breadth=breadth, transfer_terminals=self.transfer_terminals, **order)
 
     @abstractmethod
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
@@ -187,6 +165,11 @@ class MappingTransfer(Transfer):
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         """Make the prior of the target task that the method was just bound to."""
         raise NotImplementedError(f"{type(self).__name__} transfers instances, it has no prior")
+
+    def _prior_of_set(self, task: TargetTask, **rules: Any) -> SourcePrior:
+        """Make the prior by the set of mappings; ``rules``: others of :func:`make_prior`."""
+        given = {"breadth": float(self.source_breadth), "transfer_terminals": self.transfer_terminals, **rules}
+        return make_prior(self.source, self.mappings, task, **given)
 
     @property
     def sources(self) -> list[SourceInstances]:
@@ -243,7 +226,7 @@ class MappingTransfer(Transfer):
     def describe_prior(self) -> str:
         """Say what the source is taken for: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v)".
 
-        Target variables come first, then the source's where these have other names; a ValueError as of :attr:`source_prior`.
+        :raises ValueError: as of :attr:`source_prior`
         """
         self._check_bound("describe_prior")
         return self.source_prior.describe()
@@ -266,12 +249,7 @@ class MappingTransfer(Transfer):
         return self._source_use.choices()
 
     def selected(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """
-        Return the candidates selected, whether or not their instances are needed: int64, shape (n,), -1 as in :meth:`choices`.
-
-        :param states: unit coordinates, shape (n, n_variables)
-        :param actions: int64, shape (n,)
-        """
+        """Return the candidates selected, whether or not their instances are needed, shape (n,), -1 as in :meth:`choices`."""
         return self._source_use.selected(states, actions)
 
     def source_action_names(self) -> list[str]:
@@ -292,7 +270,6 @@ class MappingTransfer(Transfer):
     def report(self) -> TransferReport:
         """Say what was transferred: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
-        :return: a report to print, with all its figures as fields
         :raises ValueError: before the first step of learning; NotBoundError, which is one, if no algorithm uses this object
         """
         self._check_bound("report")

@@ -88,21 +88,14 @@ class MASTER(MappingTransfer):
         candidates = Candidates(self.source, self.mappings, task)
         check_action_mappings(candidates.sets)
         copies = copies_of(candidates, task, float(self.source_breadth))
-        return SourcePrior(
-            copies,
-            task,
-            partial(choose_least_error, copies, candidates.sets),
-            whole=True,
-            max_transitions=self.n_random_steps,
-            transfer_terminals=self.transfer_terminals,
-            first_renewal=self.n_random_steps,
-        )
+        choose = partial(choose_least_error, copies, candidates.sets)
+        steps = {"max_transitions": self.n_random_steps, "first_renewal": self.n_random_steps}
+        return SourcePrior(copies, task, choose, whole=True, transfer_terminals=self.transfer_terminals, **steps)
 
     def action(self, state: np.ndarray) -> int | None:
         if self.mapping_steps() >= self.n_random_steps:
             return None
-        assert self.task is not None
-        return int(self.rng.integers(self.task.n_actions))
+        return int(self.rng.integers(self._bound_task.n_actions))
 
     def mapping_steps(self) -> int:
         """Return how many random steps of the target have been taken to find the mapping."""
@@ -111,19 +104,16 @@ class MASTER(MappingTransfer):
     @property
     def chosen(self) -> InterTaskMapping | None:
         """The mapping that was chosen, with names; None before."""
-        assert self.task is not None
         made_by = self.source_prior if self.use == "prior" else self._least_error
         if made_by.choice is None:
             return None
         actions = tuple(made_by.choice.actions[:, 0].tolist())
-        return made_by.copies.mapping(int(made_by.choice.copies[0, 0]), self.task, actions)
+        return made_by.copies.mapping(int(made_by.choice.copies[0, 0]), self._bound_task, actions)
 
     def statistics(self) -> dict[str, float]:
-        return {
-            **super().statistics(),
-            "transfer/steps_to_find_mapping": self.mapping_steps(),
-            "transfer/mapping_found": float(self.chosen is not None),
-        }
+        found = float(self.chosen is not None)
+        figures = {"transfer/steps_to_find_mapping": self.mapping_steps(), "transfer/mapping_found": found}
+        return super().statistics() | figures
 
 
 def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
@@ -133,11 +123,7 @@ def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
 
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
-    """Find the mapping with the least error, the first of equals: its error, state mapping, and each target action's source
-    action.
-
-    :param errors: shape (n_state_mappings, n_target_actions, n_source_actions)
-    """
+    """Find the mapping with the least error, the first of equals: error, state mapping, each target action's source action."""
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # Every combination is in the set: the best source action of each target action can be found on its own.
         of_row = errors.min(axis=2).sum(axis=1)
@@ -171,11 +157,9 @@ class LeastErrorSelector(FixedSelector):
     def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
         task = parts.task
         super().__init__(parts, fixed=np.full(task.n_actions, -1, dtype=np.int64))
-        self.copies = copies
-        self.n_transitions = n_transitions
+        self.copies, self.n_transitions = copies, n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
-        #: The mapping that was chosen, None before.
-        self.choice: Choice | None = None
+        self.choice: Choice | None = None  #: the mapping that was chosen, None before
         self._just_chosen = False
 
     def takes_transitions(self) -> bool:
@@ -192,13 +176,10 @@ class LeastErrorSelector(FixedSelector):
 
     def _find(self, action: int, row: int, source_action: int) -> int:
         """The candidate of a target action with a state mapping, or an equal one, and a source action of its source."""
-        arrays, table = self.candidates.arrays, self.candidates.table
-        first, last = arrays.first[action], arrays.first[action + 1]
-        same = (table.variable == table.variable[row]) & (table.sign == table.sign[row])
+        table = self.candidates.table
         # Actions are numbered on from source to source.
         number = source_action + sum(source.n_actions for source in self.candidates.sources[: self.copies.source[row]])
-        fits = same.all(axis=1)[arrays.row[first:last]] & (arrays.action[first:last] == number)
-        return int(first + np.flatnonzero(fits)[0])
+        return self.candidates.find(action, table.variable[row], table.sign[row], number)
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         chosen = self.fixed[actions]

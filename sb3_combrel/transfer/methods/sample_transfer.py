@@ -22,8 +22,7 @@ from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check
 from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
-# Seeds are saved as float64.
-MAX_SEED = 2**53
+MAX_SEED = 2**53  # seeds are saved as float64
 
 
 @dataclass(repr=False, eq=False)
@@ -79,9 +78,8 @@ class SampleTransfer(MappingTransfer):
     source_breadth: float = field(default=DEFAULT_SOURCE_BREADTH, init=False)
 
     def __post_init__(self) -> None:
-        check_count("n_instances", self.n_instances)
-        check_count("min_transitions", self.min_transitions)
-        check_count("max_transitions", self.max_transitions)
+        for name in ("n_instances", "min_transitions", "max_transitions"):
+            check_count(name, getattr(self, name))
         if self.max_transitions < self.min_transitions:
             least = f"min_transitions={self.min_transitions}"
             raise ValueError(f"max_transitions must be at least {least}, got {self.max_transitions}")
@@ -92,8 +90,7 @@ class SampleTransfer(MappingTransfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
-        #: Candidate and number of its instance of those drawn, one a row, int64, shape (n, 2).
-        self.drawn: np.ndarray
+        self.drawn: np.ndarray  #: candidate and number of its instance of those drawn, one a row, int64, shape (n, 2)
         self._show_drawn(np.empty((0, 2), dtype=np.int64))
         self._seed = 0
         self._n_of_draw = self._n_of_first = self._n_draws = 0
@@ -113,12 +110,11 @@ class SampleTransfer(MappingTransfer):
         """Draw instances by compliance with the first ``n`` transitions, and relevance to them."""
         if self._n_draws == 0:
             self._seed = int(self.rng.integers(MAX_SEED))
-        assert self.task is not None
         relevances = np.ones((len(self.candidates), int(self.candidates.instances.size.max())))
         if self.relevance:
             self._instances.measure_relevance(n_used=n, values=relevances)
         compliances = candidate_compliances(self.candidates, self._tasks.sums, n)
-        n_each = max(1, self.n_instances // self.task.n_actions)
+        n_each = max(1, self.n_instances // self._bound_task.n_actions)
         generator = np.random.default_rng(self._seed)
         self._show_drawn(draw_instances(self.candidates, compliances, relevances, n_each, generator))
         self._n_of_draw = n
@@ -128,16 +124,14 @@ class SampleTransfer(MappingTransfer):
         self._instances.all_changed = True
 
     def _show_drawn(self, drawn: np.ndarray) -> None:
-        assert self.task is not None
         self.drawn = drawn
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
         instances = self._instances
-        instances.translator = self._make_translator(candidates, self.task, instances.translator.rules.breadth)
+        instances.translator = self._make_translator(candidates, self._bound_task, instances.translator.rules.breadth)
 
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
-        """Return the compliance, 0 to 1, of one virtual source task with the target's transitions so far, Lambda_X of Eq. 6.
+        """Return the compliance, 0 to 1, of a mapping's virtual source task with the transitions so far, Lambda_X of Eq. 6.
 
-        :param mapping: from the target to the source numbered ``source``
         :raises ValueError: if the set has no such state mapping
         """
         return self._tasks.task_compliance(source, mapping)
@@ -172,11 +166,7 @@ class SampleTransfer(MappingTransfer):
 
 
 class TaskComplianceSelector(PooledSelector):
-    """Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6).
-
-    :param starts: the start bandwidth of each state mapping, shape (n_state_mappings,)
-    :param max_transitions: how many are recorded
-    """
+    """Selects all candidates of an action, and adds up the compliance of the target's transitions with each (Eq. 6)."""
 
     needs_transitions = True
 
@@ -196,11 +186,7 @@ class TaskComplianceSelector(PooledSelector):
         self.sums[:, int(self.transitions.actions[i])] += self._table.values
 
     def task_compliance(self, source: int, mapping: InterTaskMapping) -> float:
-        """Return the compliance Lambda_X (Eq. 6) of the virtual source task of a mapping to source number ``source``.
-
-        :return: 0 before the first transition
-        :raises ValueError: if the set has no such state mapping
-        """
+        """See :meth:`SampleTransfer.task_compliance`; 0 before the first transition."""
         sets, sources = self.candidates.sets, self.candidates.sources
         mappings = sets[source]
         same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
@@ -209,8 +195,7 @@ class TaskComplianceSelector(PooledSelector):
             raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
         row = int(rows[0]) + sum(each.n_state_mappings for each in sets[:source])
         actions = np.array(mapping.action) + sum(each.n_actions for each in sources[:source])
-        of_actions = self.sums[row, np.arange(len(actions)), actions]
-        return float(of_actions.sum() / max(self.transitions.n, 1))
+        return float(self.sums[row, np.arange(len(actions)), actions].sum() / max(self.transitions.n, 1))
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         for i in range(self.transitions.n):
@@ -218,34 +203,22 @@ class TaskComplianceSelector(PooledSelector):
 
 
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """Return for each state mapping, target action and source action the compliance of the tasks that have these, added up.
-
-    A task's, Lambda_X of Eq. 6, is the sum of its transitions' compliances, divided by the number of all transitions.
-
-    :param mappings: the mappings to one source, each as likely as any other
-    :param sums: of the transitions' compliances, shape (n_state_mappings, n_target_actions, n_source_actions)
-    :return: sum over X of Lambda_X / n_mappings, shape of ``sums``
-    """
+    """Return sum over X of Lambda_X (Eq. 6) / n_mappings by state mapping, target and source action, as ``sums`` are."""
     n_rows, n_actions, n_source_actions = sums.shape
     if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
         # In the mean over all source actions that the other target actions may have.
         of_action = sums.mean(axis=2)
-        others = of_action.sum(axis=1, keepdims=True) - of_action
-        everything: np.ndarray = sums + others[:, :, None]
+        everything: np.ndarray = sums + (of_action.sum(axis=1, keepdims=True) - of_action)[:, :, None]
         return everything / (n_transitions * n_rows * n_source_actions)
     found = np.zeros_like(sums)
     for rows, actions in members_of(mappings):
         members = rows, np.arange(n_actions), actions
-        of_task = sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings)
-        np.add.at(found, members, of_task[:, None])
+        np.add.at(found, members, (sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings))[:, None])
     return found
 
 
 def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
-    """Return for each candidate the compliance of all virtual source tasks that have it, added up, shape (n_candidates,).
-
-    :param sums: see :func:`mean_compliances`; the state mappings of all sources one below the other, their actions numbered on
-    """
+    """Return for each candidate the compliance of all tasks that have it, added up; ``sums``: of all sources, numbered on."""
     origins = np.array(candidates.origins, dtype=np.int64)
     found, row, action = np.zeros(len(origins)), 0, 0
     for number, (source, mappings) in enumerate(zip(candidates.sources, candidates.sets, strict=True)):
@@ -265,17 +238,12 @@ def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transition
 def draw_instances(
     candidates: Candidates, compliances: np.ndarray, relevances: np.ndarray, n: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Draw translated instances for each target action, without replacement.
+    """Draw ``n`` instances at most for each target action, without replacement: candidate and number, shape (n_drawn, 2).
 
     A candidate in proportion to its compliance, and of it an instance in proportion to its relevance, of those that are left:
     the n largest of log-probabilities with Gumbel noise, which is the same.
-
-    :param relevances: of each candidate's instances, shape (n_candidates, most instances of an action)
-    :param n: instances of each target action, at most; fewer if no more have a probability above 0
-    :return: candidate and number of its instance, one a row, in order, int64, shape (n_drawn, 2)
     """
-    size = candidates.instances.size[candidates.arrays.action]
-    exists = np.arange(relevances.shape[1]) < size[:, None]
+    exists = np.arange(relevances.shape[1]) < candidates.instances.size[candidates.arrays.action][:, None]
     relevant = np.where(exists, relevances, 0.0)
     total = relevant.sum(axis=1, keepdims=True)
     probability = compliances[:, None] * np.divide(relevant, total, out=np.zeros_like(relevant), where=total > 0.0)
@@ -293,7 +261,6 @@ def draw_instances(
 def instances_of_each(candidates: Candidates, drawn: np.ndarray) -> Instances:
     """Return what :func:`draw_instances` has drawn, by candidate, in the coordinates of their sources."""
     source, (candidate, number) = candidates.instances, drawn.T
-    action = candidates.arrays.action[candidate]
-    at = action, number
+    at = candidates.arrays.action[candidate], number
     columns = source.state[at], source.effect[at], source.reward[at], source.terminated[at]
     return Instances.of_rows(len(candidates), candidate, *columns, periodic=source.periodic)

@@ -19,8 +19,7 @@ from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
 
-# Each mapping predicts every transition that is fitted to with each source action.
-MAX_MAPPINGS = 2000
+MAX_MAPPINGS = 2000  # each mapping predicts every transition that is fitted to with each source action
 MAX_FITTED = 500
 # The prediction of a copy is the mean over its most probable mappings and source actions: as many as have this probability
 # together, at most so many.
@@ -85,9 +84,8 @@ class SoftHomomorphism(Transfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
-        self._source = load_one_source(self.source, type(self).__name__)
         # A saved model must not depend on other files.
-        self.source = source = self._source
+        self.source = self._source = source = load_one_source(self.source, type(self).__name__)
         d = task.n_variables
         n_mappings = soft.count_mappings(source.n_variables, d, self.mirrored)
         if n_mappings > MAX_MAPPINGS:
@@ -100,20 +98,16 @@ class SoftHomomorphism(Transfer):
         self._mean = source.scaling.to_unit(source.states).mean(axis=0)
         self._readings = soft.all_readings(source.n_variables, d, self.mirrored)
         copies = max(1, d // source.n_variables) if self.n_copies is None else self.n_copies
-        columns = 1 + int(self._readings.number.max())
-        self._shape = Logits(
-            np.zeros((copies, source.n_variables, columns)), np.zeros((copies, task.n_actions, source.n_actions))
-        )
+        shape = copies, source.n_variables, 1 + int(self._readings.number.max())
+        self._shape = Logits(np.zeros(shape), np.zeros((copies, task.n_actions, source.n_actions)))
         self._logits: Logits | None = None
         self._mixture = soft.MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
         self._periodic = np.array(task.periodic)
         self._transitions = RecordedTransitions(d)
         self._claims = Claims(source.rewards, task, self.transfer_terminals)
-        # Squared errors of predictions, and squared effects, of transitions as they came.
-        self._squares = np.zeros(2)
+        self._squares = np.zeros(2)  # squared errors of predictions, and squared effects, of transitions as they came
         self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
-        self._fit_due = float(FIRST_RENEWAL)
-        self._seconds = 0.0
+        self._fit_due, self._seconds = float(FIRST_RENEWAL), 0.0
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         return TransferredInstances.empty(len(actions), states.shape[1])
@@ -128,9 +122,8 @@ class SoftHomomorphism(Transfer):
         return float(self._source.rewards.min())
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        assert self.task is not None
         if self._logits is None:
-            return PriorPredictions.nothing(len(actions), self.task.n_variables)
+            return PriorPredictions.nothing(len(actions), self._bound_task.n_variables)
         effect, reward, end, weight = self._mixture.predict(states, actions)
         return self._claims.restrict(effect, reward, end, weight, actions)
 
@@ -164,8 +157,7 @@ class SoftHomomorphism(Transfer):
         scale = np.maximum(size, max(1e-2 * float(size.max()), 1e-6))
         data = soft.FitData(self._all_predictions(seen.states[rows]), seen.actions[rows], seen.effects[rows], scale)
         found = self._state_mappings()
-        seed = int(self.rng.integers(2**63))
-        self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, seed))
+        self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, int(self.rng.integers(2**63))))
         if self._state_mappings() != found:
             self._steps_to_find = self._n_observed
         predicted = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
@@ -176,7 +168,6 @@ class SoftHomomorphism(Transfer):
         self._seconds += perf_counter() - began
 
     def _use(self, logits: Logits) -> None:
-        """Predict with these parameters from now on."""
         self._logits = logits
         self._mixture.set_terms(soft.most_probable(*soft.probabilities(logits, self._readings), MAX_TERMS, MASS))
 
@@ -193,16 +184,14 @@ class SoftHomomorphism(Transfer):
 
     def _judge(self, predicted: soft.Predicted) -> None:
         """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
-        assert self.task is not None
         effects, actions = (column[: self._transitions.n] for column in (self._transitions.effects, self._transitions.actions))
         effect, _, _, weight = predicted
-        taken = np.arange(self.task.n_actions)[:, None] == actions
+        taken = np.arange(self._bound_task.n_actions)[:, None] == actions
         size = (taken @ np.abs(effects) / np.maximum(taken.sum(axis=1), 1)[:, None]).max(axis=0)
-        each = np.minimum(1.0, weight / self.task.exploration_threshold)
+        each = np.minimum(1.0, weight / self._bound_task.exploration_threshold)
         compared = np.maximum(effects**2, np.maximum((LEAST_EFFECT * size) ** 2, 1e-300))
         missed = taken @ (each[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared))
-        founded = np.repeat((taken @ each)[:, None], len(size), axis=1)
-        self._claims.renew(missed, founded)
+        self._claims.renew(missed, np.repeat((taken @ each)[:, None], len(size), axis=1))
 
     def _state_mappings(self) -> list[int]:
         """The most probable mapping of states of each copy, in any order of the copies; none before the first fit."""
@@ -224,9 +213,8 @@ class SoftHomomorphism(Transfer):
         """
         if self._logits is None:
             raise ValueError(f"there is no mapping before the target has been seen for {FIRST_RENEWAL} transitions")
-        assert self.task is not None
         of_mapping, of_action = soft.probabilities(self._logits, self._readings)
-        found = np.zeros((len(of_mapping), 2, self._source.n_variables, self.task.n_variables))
+        found = np.zeros((len(of_mapping), 2, self._source.n_variables, self._bound_task.n_variables))
         for (m, k), v in np.ndenumerate(self._readings.variable):
             if v >= 0:
                 found[:, int(self._readings.sign[m, k] < 0.0), k, v] += of_mapping[:, m]
@@ -234,18 +222,17 @@ class SoftHomomorphism(Transfer):
 
     def describe(self) -> str:
         """Say what each target action is most probably taken for, mapping and action: "East: Right on (x, vx) 0.97, ..."."""
-        assert self.task is not None
         if self._logits is None:
-            return "; ".join(f"{name}: nothing" for name in self.task.action_names)
+            return "; ".join(f"{name}: nothing" for name in self._bound_task.action_names)
         of_mapping, of_action = soft.probabilities(self._logits, self._readings)
         words = []
-        for a, target_action in enumerate(self.task.action_names):
+        for a, target_action in enumerate(self._bound_task.action_names):
             of_copies = []
             for copy, actions in zip(of_mapping, of_action[:, a], strict=True):
                 joint = np.outer(copy, actions)
                 m, b = np.unravel_index(joint.argmax(), joint.shape)
                 read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
-                names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self.task.state_names[v] for v, s in read]
+                names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self._bound_task.state_names[v] for v, s in read]
                 of_copies.append(f"{self._source.action_names[b]} on ({', '.join(names)}) {joint.max():.2f}")
             words.append(f"{target_action}: {', '.join(of_copies)}")
         return "; ".join(words)
@@ -276,8 +263,7 @@ class SoftHomomorphism(Transfer):
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        assert self.task is not None
-        self._transitions.restore(state["transitions"], self.task.n_actions)
+        self._transitions.restore(state["transitions"], self._bound_task.n_actions)
         *counts, self._fit_due, wrong, baseline = state["soft_figures"].tolist()
         self._n_observed, self._n_fits, self._version, self._steps_to_find = (int(count) for count in counts)
         self._squares = np.array([wrong, baseline])

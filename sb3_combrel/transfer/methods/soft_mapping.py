@@ -12,24 +12,17 @@ import torch as th
 from sb3_combrel.transfer.prior.copies import distinct_rows
 from sb3_combrel.transfer.source_model import SourceModel, SourcePredictions
 
-# Logits have a normal prior of this standard deviation: a few transitions do not make anything certain.
-LOGIT_DEVIATION = 3.0
+LOGIT_DEVIATION = 3.0  # logits have a normal prior of this standard deviation: a few transitions do not make anything certain
 N_STEPS, STEP_SIZE = 200, 0.1
 NOTHING = -1
-# Predictions of the sample are stored for so many mappings with a source action.
-MAX_STORED = 128
-# Pairs that are predicted at once.
-BATCH = 4096
+MAX_STORED = 128  # predictions of the sample are stored for so many mappings with a source action
+BATCH = 4096  # pairs that are predicted at once
 
 Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class Readings(NamedTuple):
-    """The deterministic mappings of target to source states that a stochastic mapping is a mixture of.
-
-    In each, every source variable reads a target variable of its own, as it is or mirrored, in unit coordinates. Where the
-    source has more variables than the target, the others read nothing, and stand at their mean in the source's instances.
-    """
+    """Deterministic mappings: each source variable reads a target variable of its own, or none (its mean)."""
 
     variable: np.ndarray  # int64, shape (n_mappings, n_source_variables): target variable that is read, -1 for none
     sign: np.ndarray  # float64, same shape: -1 where it is mirrored
@@ -44,12 +37,9 @@ def count_mappings(n_source: int, n_target: int, mirrored: bool) -> int:
 
 def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
     """List the deterministic mappings of states; ``mirrored``: target variables may be read mirrored as well."""
-    nothing = [NOTHING] * max(0, n_source - n_target)
-    orders = sorted(set(permutations([*range(n_target), *nothing], n_source)))
-    rows = []
-    for order in orders:
-        signs = product(*((1.0, -1.0) if mirrored and v != NOTHING else (1.0,) for v in order))
-        rows += [(order, sign) for sign in signs]
+    orders = sorted(set(permutations([*range(n_target), *([NOTHING] * max(0, n_source - n_target))], n_source)))
+    choices = [[(1.0, -1.0) if mirrored and v != NOTHING else (1.0,) for v in order] for order in orders]
+    rows = [(order, signs) for order, each in zip(orders, choices, strict=True) for signs in product(*each)]
     variable = np.array([order for order, _ in rows], dtype=np.int64)
     sign = np.array([signs for _, signs in rows], dtype=np.float64)
     number = np.where(sign < 0.0, variable + n_target, variable)
@@ -58,11 +48,7 @@ def all_readings(n_source: int, n_target: int, mirrored: bool) -> Readings:
 
 
 def to_source(states: np.ndarray, readings: Readings, mapping: np.ndarray | int, mean: np.ndarray) -> np.ndarray:
-    """Return target states as mappings have them in the source, unit coordinates, shape (n, n_source_variables).
-
-    :param mapping: the number of each state's mapping, shape (n,), or of that of all
-    :param mean: of the source's instances, for variables that read nothing
-    """
+    """Return target states as mappings (one, or one of each) have them in the source; what reads nothing is at ``mean``."""
     variable, sign = (np.broadcast_to(array[mapping], (len(states), len(mean))) for array in readings[:2])
     read = np.take_along_axis(states, np.maximum(variable, 0), axis=1)
     return np.where(variable == NOTHING, mean, np.where(sign < 0.0, 1.0 - read, read))
@@ -112,8 +98,7 @@ def loss(state: th.Tensor, action: th.Tensor, readings: Readings, data: FitData)
     by_mapping = th.from_numpy(np.ascontiguousarray(data.predicted.transpose(0, 2, 3, 1)).reshape(n * b * d, m))
     s, c = of_mapping.shape[:2]
     mixed = (by_mapping @ of_mapping.reshape(s * c, m).T).reshape(n, b, d, s, c)
-    chosen = of_action[:, :, th.from_numpy(data.action)]
-    mean = th.einsum("nbdsc,scnb->snd", mixed, chosen)
+    mean = th.einsum("nbdsc,scnb->snd", mixed, of_action[:, :, th.from_numpy(data.action)])
     error = (mean - th.from_numpy(data.effect)) / th.from_numpy(data.scale)
     squares = (state**2).sum(dim=(1, 2, 3)) + (action**2).sum(dim=(1, 2, 3))
     return (th.sqrt(1.0 + error**2) - 1.0).sum(dim=(1, 2)) + squares / (2.0 * LOGIT_DEVIATION**2)
@@ -164,21 +149,12 @@ def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int,
 
 
 class MixturePredictions:
-    """Predicts pairs of the target by the mean over a mixture.
-
-    The effect is the copies' sum; the reward, their mean; an end, the product; the weight of the source's data, the least.
-
-    :param mean: of the source's states, unit coordinates, shape (n_source_variables,)
-    :param sample: states that are asked for again and again, unit coordinates, shape (n_points, n_target_variables)
-    """
+    """Predicts by the mean over a mixture: of copies the sum of effects, mean reward, product of ends, least weight."""
 
     terms: Terms
 
     def __init__(self, model: SourceModel, readings: Readings, mean: np.ndarray, sample: np.ndarray):
-        self.model = model
-        self.readings = readings
-        self.mean = mean
-        self.sample = sample
+        self.model, self.readings, self.mean, self.sample = model, readings, mean, sample
         self._stored: dict[tuple[int, int], tuple[np.ndarray, SourcePredictions]] = {}
 
     def set_terms(self, terms: Terms) -> None:
@@ -207,9 +183,8 @@ class MixturePredictions:
         predicted = self.model.predict(to_source(states[row], self.readings, mapping, self.mean), terms.action[term])
         effects = share[:, None] * to_target(predicted.effect, self.readings, mapping, d)
         effect = np.column_stack([np.bincount(row, effects[:, v], n) for v in range(d)])
-        each = [
-            np.bincount(place, share * of_terms, n * self.n_copies).reshape(n, self.n_copies) for of_terms in predicted[1:]
-        ]
+        size = n * self.n_copies
+        each = [np.bincount(place, share * of_terms, size).reshape(n, self.n_copies) for of_terms in predicted[1:]]
         return _joined(effect, each[0], each[1], each[2])
 
     def _predict_sample(self, action: int) -> Predicted:

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
 N_ITERATIONS = 30
-# Noise of the standardised target triplets, as a variance, that the regression starts from.
-FIRST_NOISE = 0.1
+FIRST_NOISE = 0.1  # noise of the standardised target triplets, as a variance, that the regression starts from
 
 
 class Codes(NamedTuple):
@@ -41,8 +40,7 @@ def sparse_codes(source: np.ndarray, target: np.ndarray, n_atoms: int, sparsity:
         return np.asarray(sparse_encode(rows, dictionary, algorithm="lasso_cd", alpha=sparsity, max_iter=10_000))
 
     with warnings.catch_warnings():
-        # The dictionaries need not be the best there are.
-        warnings.simplefilter("ignore", ConvergenceWarning)
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the dictionaries need not be the best there are
         first = encode(source, learn(source, target.shape[1]))
         first = Standard.of(first).to(first)
         dictionary = learn(first, n_atoms)
@@ -58,8 +56,7 @@ def fit_regression(source: np.ndarray, target: np.ndarray, seed: int) -> Gaussia
     noise = WhiteKernel(FIRST_NOISE, (1e-6, 1e1))
     kernel = ConstantKernel(1.0, (1e-2, 1e3)) * RBF(np.sqrt(source.shape[1]), (1e-1, 1e3)) + noise
     with warnings.catch_warnings():
-        # A noise or a length at its bound is what it is.
-        warnings.simplefilter("ignore", ConvergenceWarning)
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a noise or a length at its bound is what it is
         return GaussianProcessRegressor(kernel, random_state=seed).fit(source, target)
 
 
@@ -106,8 +103,7 @@ class SparseCodingMapping(LearnedTranslation):
         check_positive("sparsity", self.sparsity)
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        assert self.task is not None
-        n_target, n_source = self.task.n_actions, self._source.n_actions
+        n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         seed = int(self.rng.integers(2**31))
         source_columns, target_columns = source.columns(n_source), target.columns(n_target)
         of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
@@ -124,8 +120,7 @@ class SparseCodingMapping(LearnedTranslation):
         return {**super().statistics(), "transfer/regression_error": self.regression_error}
 
     def get_state(self) -> dict[str, np.ndarray]:
-        error = np.nan_to_num(self.regression_error, nan=-1.0)
-        return {**super().get_state(), "regression_error": np.array([error])}
+        return {**super().get_state(), "regression_error": np.array([np.nan_to_num(self.regression_error, nan=-1.0)])}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         super().set_state(state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -59,27 +59,18 @@ class ThreeWayRBM(LearnedTranslation):
             check_count(name, getattr(self, name))
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        assert self.task is not None
-        n_target, n_source = self.task.n_actions, self._source.n_actions
+        n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         source_columns, target_columns = source.columns(n_source), target.columns(n_target)
         of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
-        machine = train(
-            of_source.to(source_columns),
-            of_target.to(target_columns),
-            n_hidden=self.n_hidden,
-            n_factors=self.n_factors,
-            n_updates=self.n_updates,
-            seed=int(self.rng.integers(2**63)),
-        )
+        sizes: dict[str, Any] = {"n_hidden": self.n_hidden, "n_factors": self.n_factors, "n_updates": self.n_updates}
+        seed = int(self.rng.integers(2**63))
+        machine = train(of_source.to(source_columns), of_target.to(target_columns), seed=seed, **sizes)
         found = reconstruct(machine, of_source.to(instances.columns(n_source)))
         return Triplets.of_columns(of_target.back(found), n_target)
 
 
 class Machine(NamedTuple):
-    """Parameters of a machine with source and target units that are real numbers and hidden units that are 0 or 1.
-
-    The weight of source unit i, hidden unit j and target unit k: sum over factors of ``source[i] * hidden[j] * target[k]``.
-    """
+    """Parameters; a weight is the sum over factors of ``source[i] * hidden[j] * target[k]``; hidden units are 0 or 1."""
 
     source: th.Tensor  # float64, shape (n_source, n_factors)
     hidden: th.Tensor  # shape (n_hidden, n_factors)
@@ -108,8 +99,7 @@ def contrastive_divergence(machine: Machine, source: th.Tensor, target: th.Tenso
     """Return what has CD-1's gradient: mean free energy of data less that of target units reconstructed from them."""
     with th.no_grad():
         on = th.sigmoid(hidden_input(machine, source, target))
-        drawn = (th.rand(on.shape, generator=generator, dtype=th.float64) < on).double()
-        again = target_mean(machine, source, drawn)
+        again = target_mean(machine, source, (th.rand(on.shape, generator=generator, dtype=th.float64) < on).double())
     return (free_energy(machine, source, target) - free_energy(machine, source, again)).mean()
 
 

@@ -16,7 +16,6 @@ from sb3_combrel.transfer.candidates import MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
-from sb3_combrel.transfer.prior.prior_sets import make_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
@@ -76,19 +75,10 @@ class TIMBREL(MappingTransfer):
         n_actions = parts.task.n_actions
         if n_given not in (1, n_actions):
             raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {n_given}")
-        given = parts.candidates.sets[0]
-        fixed = [parts.candidates.find(a, given[a if n_given > 1 else 0]) for a in range(n_actions)]
+        given = [parts.candidates.sets[0][a if n_given > 1 else 0] for a in range(n_actions)]
+        fixed = [parts.candidates.find(a, x.state_index, x.state_sign, x.action[a]) for a, x in enumerate(given)]
         return FixedSelector(parts, fixed=np.array(fixed, dtype=np.int64))
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         is_given = not isinstance(self.mapping, str)
-        return make_prior(
-            self.source,
-            self.mappings,
-            task,
-            breadth=float(self.source_breadth),
-            given=is_given,
-            drawn=None if is_given else self.rng,
-            max_transitions=0,
-            transfer_terminals=self.transfer_terminals,
-        )
+        return self._prior_of_set(task, given=is_given, drawn=None if is_given else self.rng, max_transitions=0)
