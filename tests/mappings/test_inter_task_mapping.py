@@ -64,10 +64,7 @@ class TestInterTaskMapping:
 
     def test_repr_with_names_shows_the_source_of_each_variable_and_action(self):
         mapping = InterTaskMapping((0, None, 1, None), (0, 1, 2, 0, 0), (1, 1, -1, 1)).with_names(
-            ["x", "v"],
-            ["x", "y", "vx", "vy"],
-            ["Neutral", "Left", "Right"],
-            ["Neutral", "West", "East", "South", "North"],
+            ["x", "v"], ["x", "y", "vx", "vy"], ["Neutral", "Left", "Right"], ["Neutral", "West", "East", "South", "North"]
         )
         assert repr(mapping) == (
             "InterTaskMapping(x<-x, vx<-(-v); Neutral<-Neutral, West<-Left, East<-Right, South<-Neutral, North<-Neutral)"

@@ -175,8 +175,7 @@ def neighbours_of(point, grid):
 
 
 @pytest.mark.parametrize(
-    ("resolution", "seed", "n", "periodic"),
-    [((4,), 0, 4, None), ((3, 3), 1, 14, None), ((3, 3), 1, 14, (False, True))],
+    ("resolution", "seed", "n", "periodic"), [((4,), 0, 4, None), ((3, 3), 1, 14, None), ((3, 3), 1, 14, (False, True))]
 )
 def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, seed, n, periodic):
     problem = Problem(resolution, 0, gamma=0.9, max_value=2.0, tolerance=1e-12, periodic=periodic)

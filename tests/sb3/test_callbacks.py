@@ -2,11 +2,7 @@
 
 import pytest
 from helpers.walk import Recorder, Walk, same_parameters, small
-from stable_baselines3.common.callbacks import (
-    CheckpointCallback,
-    EvalCallback,
-    StopTrainingOnMaxEpisodes,
-)
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_combrel import FittedRMax

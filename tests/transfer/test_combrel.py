@@ -280,7 +280,4 @@ def test_the_action_of_a_neighbor_decides_between_mappings_with_the_same_source_
         show(method, naive.Transition(np.array([0.5]), 1, -1.0, np.array([0.4])))
         chosen[neighbors] = [method.describe(c) if c >= 0 else None for c in choices_of(method)]
     assert chosen["action"] == [None, "a1<-a1 with s0<-s0"]
-    assert chosen["state_action"] == [
-        "a0<-a0 with s0<-s0, of the actions a0, a1",
-        "a1<-a1 with s0<-s0, of the actions a0, a1",
-    ]
+    assert chosen["state_action"] == ["a0<-a0 with s0<-s0, of the actions a0, a1", "a1<-a1 with s0<-s0, of the actions a0, a1"]

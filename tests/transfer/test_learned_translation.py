@@ -11,13 +11,7 @@ from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import random_source, target_task
 from helpers.ring import Ring
 
-from sb3_combrel import (
-    TIMBREL,
-    FittedRMax,
-    InterTaskMapping,
-    SparseCodingMapping,
-    ThreeWayRBM,
-)
+from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping, SparseCodingMapping, ThreeWayRBM
 from sb3_combrel.transfer.methods import three_way_rbm as machines
 from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
 from sb3_combrel.transfer.methods.sparse_coding import fit_regression, sparse_codes

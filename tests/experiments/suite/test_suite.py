@@ -231,10 +231,7 @@ def test_tables_of_hand_made_runs():
     steps = {"a": [100.0, 104.0, 102.0], "b": [50.0, 54.0, 52.0], "c": [103.0, 98.0, np.inf]}
     rows = [row(name, seed, n, -n) for name, own in steps.items() for seed, n in enumerate(own)]
     cells = cells_of(rows, [SMALL], list(steps), "a", "welch")
-    raw = [
-        stats.ttest_ind(steps["a"], steps["b"], equal_var=False).pvalue,
-        stats.mannwhitneyu(steps["a"], steps["c"]).pvalue,
-    ]
+    raw = [stats.ttest_ind(steps["a"], steps["b"], equal_var=False).pvalue, stats.mannwhitneyu(steps["a"], steps["c"]).pvalue]
     found = [cells["small", "steps_1_to_3", name].p_value for name in ("b", "c")]
     np.testing.assert_allclose(found, list(holm(dict(enumerate(raw))).values()))
     table = {(line[0], line[1]): line[2:] for line in task_table(cells, SMALL, list(steps), "p against a").rows}
