@@ -95,8 +95,7 @@ def test_names_and_flags_of_the_environment_are_kept():
 
 
 def test_other_pairs_of_a_known_environment_have_other_names():
-    wrapper = AngleObservation(gym.make("Acrobot-v1"), [(2, 3)])
-    assert wrapper.state_names == ("s0", "s1", "angle_s2", "s4", "s5")
+    assert AngleObservation(gym.make("Acrobot-v1"), [(2, 3)]).state_names == ("s0", "s1", "angle_s2", "s4", "s5")
     assert AngleObservation(gym.make("Acrobot-v1"), [[2, 3], [0, 1]]).state_names[0] == "theta1"
 
 

@@ -41,8 +41,7 @@ def test_a_difference_goes_the_short_way_around_a_period_of_1(a, b):
     assert -0.5 - 1e-12 <= found <= 0.5
     assert abs(found - (a - b) - np.rint(found - (a - b))) < 1e-12, "whole periods are left out, nothing else"
     assert difference_of(a, b, False) == a - b
-    both = differences(np.array([a, a]), np.array([b, b]), np.array([True, False]))
-    assert both.tolist() == [found, a - b]
+    assert differences(np.array([a, a]), np.array([b, b]), np.array([True, False])).tolist() == [found, a - b]
 
 
 def test_half_a_period_apart_and_tiny_differences():

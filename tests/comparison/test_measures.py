@@ -33,8 +33,7 @@ def learning_curves(draw):
     """Returns and steps of 2 to 5 runs of 3 to 8 episodes."""
     lengths = draw(st.lists(st.integers(3, 8), min_size=2, max_size=5))
     returns = [draw(st.lists(st.integers(-50, 50), min_size=n, max_size=n)) for n in lengths]
-    steps = [draw(st.lists(st.integers(1, 20), min_size=n, max_size=n)) for n in lengths]
-    return returns, steps
+    return returns, [draw(st.lists(st.integers(1, 20), min_size=n, max_size=n)) for n in lengths]
 
 
 def measures_of(first, second, **arguments):
@@ -45,8 +44,7 @@ def test_rows_of_different_lengths_are_filled_with_nan():
     np.testing.assert_array_equal(CURVES.returns[0], [-9.0, -5.0, -1.0, NAN, NAN])
     np.testing.assert_array_equal(CURVES.steps[2], [6.0, 3.0, 3.0, 4.0, NAN])
     assert CURVES.n_episodes.tolist() == [3, 5, 4] and CURVES.n_steps.tolist() == [15.0, 22.0, 16.0]
-    again = LearningCurves(CURVES.returns, CURVES.steps)
-    np.testing.assert_array_equal(again.returns, CURVES.returns)
+    np.testing.assert_array_equal(LearningCurves(CURVES.returns, CURVES.steps).returns, CURVES.returns)
     cut = CURVES.first_episodes()
     np.testing.assert_array_equal(cut.returns, [row[:3] for row in RETURNS])
     np.testing.assert_array_equal(cut.steps, [row[:3] for row in STEPS])

@@ -90,8 +90,7 @@ def test_a_permutation_test_of_many_runs_agrees_with_scipys():
 
 
 def test_a_permutation_test_never_says_that_chance_is_impossible():
-    far = p_value_of_difference(np.arange(20.0), np.arange(20.0) + 1e6, "permutation")
-    assert far == 1 / (N_PERMUTATIONS + 1)
+    assert p_value_of_difference(np.arange(20.0), np.arange(20.0) + 1e6, "permutation") == 1 / (N_PERMUTATIONS + 1)
     assert p_value_of_difference(np.ones(3), np.zeros(3), "permutation") == pytest.approx(2 / 20), "2 of 20 regroupings"
     assert p_value_of_difference(np.ones(3), np.ones(3), "permutation") == 1.0
     assert np.isnan(p_value_of_difference(np.ones(1), np.zeros(3), "permutation"))
@@ -204,8 +203,7 @@ def test_bounds_are_percentiles_of_all_pairs_of_draws():
 
 def test_medians_of_censored_steps():
     reached = np.array([10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0])
-    one_never = np.append(reached[:-1], INF)
-    value, low, high = bootstrap_difference(one_never, reached + 100.0, "median")
+    value, low, high = bootstrap_difference(np.append(reached[:-1], INF), reached + 100.0, "median")
     assert value == -100.0 and np.isfinite([low, high]).all()
     # Four of nine: the median is finite, yet in many draws it is not, so nothing bounds the difference from above.
     four_never = np.append(reached[:5], np.full(4, INF))

@@ -75,8 +75,7 @@ def weights_of(model):
 def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("sb3_contrib")
-    file = CONFIGURATIONS / {PLAIN: "dqn.yml", QUANTILE: "qrdqn.yml"}[name]
-    settings = yaml.safe_load(file.read_text())[env_id]
+    settings = yaml.safe_load((CONFIGURATIONS / {PLAIN: "dqn.yml", QUANTILE: "qrdqn.yml"}[name]).read_text())[env_id]
     assert settings.pop("n_timesteps") > 0
     assert settings.pop("policy") == "MlpPolicy"
     assert settings.pop("env_wrapper") == [{"gymnasium.wrappers.RescaleObservation": {"min_obs": -1.0, "max_obs": 1.0}}]
@@ -213,8 +212,7 @@ def test_combrels_translations_are_source_instances_seen_through_some_mapping(pr
     for first, second in permutations(range(4), 2):
         translated = np.zeros((len(effects), 4))
         translated[:, first], translated[:, second] = effects.T
-        predicted = np.clip(starts[:, None] + translated, 0.0, 1.0)
-        fits = np.abs(predicted - ends[:, None]).max(axis=2) < 1e-9
+        fits = np.abs(np.clip(starts[:, None] + translated, 0.0, 1.0) - ends[:, None]).max(axis=2) < 1e-9
         fits &= (found.rewards[:, None] == source.rewards) & (found.terminated[:, None] == source.terminated)
         explained |= fits.any(axis=1)
     assert explained.all()

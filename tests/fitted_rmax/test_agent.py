@@ -181,7 +181,6 @@ def test_statistics_are_those_of_model_and_planner(method, degree):
     assert figures["planner/corrections"] == len(agent.get_state()["corrections"])
     assert figures["planner/queued"] == agent.planner.n_queued
     assert all(np.isfinite(value) for value in figures.values())
-    of_transfer = {name for name in figures if name.startswith("transfer/")}
-    assert bool(of_transfer) == (method != "none")
+    assert bool({name for name in figures if name.startswith("transfer/")}) == (method != "none")
     if method != "none":
         assert figures["transfer/instances_used"] > 0

@@ -17,8 +17,7 @@ def _status_of(args, output, errors):
 def call(*args):
     """Exit status, standard output, and standard error of a call."""
     output, errors = io.StringIO(), io.StringIO()
-    status = _status_of(args, output, errors)
-    return status, output.getvalue(), errors.getvalue()
+    return _status_of(args, output, errors), output.getvalue(), errors.getvalue()
 
 
 def call_for_all_output(*args):

@@ -62,8 +62,7 @@ def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model
         exploration_threshold=threshold,
         max_instances=max_instances,
     )
-    mdp = FiniteMDP(make_grid(grid), N_ACTIONS, gamma)
-    return model_class(mdp, settings, transfer)
+    return model_class(FiniteMDP(make_grid(grid), N_ACTIONS, gamma), settings, transfer)
 
 
 def model_and_definition(grid, kernel, gamma=1.0, max_instances=None):
@@ -112,8 +111,7 @@ def without_staying(reward, successors, point, gamma):
     leave = 1.0 - gamma * successors.get(point, 0.0)
     if leave < 1e-9:
         return (0.0 if reward == 0.0 else float(np.sign(reward) * np.inf)), {}
-    others = {to: gamma * p / leave for to, p in successors.items() if to != point}
-    return reward / leave, others
+    return reward / leave, {to: gamma * p / leave for to, p in successors.items() if to != point}
 
 
 def assert_same_row(found, expected):

@@ -17,8 +17,7 @@ def expected_step(state, action):
         force[axis] = 0.001 if direction else -0.001
     v = np.clip(state[n:] + force - 0.0025 * np.cos(3.0 * state[:n]), -0.07, 0.07)
     x = np.clip(state[:n] + v, -1.2, 0.6)
-    into_wall = ((x == -1.2) & (v < 0)) | ((x == 0.6) & (v > 0))
-    return np.concatenate([x, np.where(into_wall, 0.0, v)])
+    return np.concatenate([x, np.where(((x == -1.2) & (v < 0)) | ((x == 0.6) & (v > 0)), 0.0, v)])
 
 
 def possible_states(n_axes):

@@ -22,8 +22,7 @@ class Ring(gym.Env):
         self.origin = origin
 
     def observe(self):
-        period = (self.at + self.origin + 0.5) % 1.0
-        return np.array([2.0 * np.pi * (period - 0.5), self.speed])
+        return np.array([2.0 * np.pi * (((self.at + self.origin + 0.5) % 1.0) - 0.5), self.speed])
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

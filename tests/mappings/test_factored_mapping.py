@@ -29,8 +29,7 @@ def test_without_names_its_repr_makes_it_again():
 def test_it_is_written_as_plain_data_and_read_again_and_made_of_dicts():
     mapping = FactoredMapping([FIRST, SECOND])
     assert from_plain(json.loads(json.dumps(to_plain(mapping)))) == mapping
-    dicts = [{"state": each.state, "action": each.action} for each in (FIRST, SECOND)]
-    assert FactoredMapping(dicts) == mapping
+    assert FactoredMapping([{"state": each.state, "action": each.action} for each in (FIRST, SECOND)]) == mapping
 
 
 @pytest.mark.parametrize(

@@ -88,8 +88,7 @@ class TestStateMappings:
 def test_copies_of_a_source_are_all_its_parts_each_once():
     rows = copies_of_source(2, 4)
     assert len(rows) == len({tuple(row) for row in rows.tolist()}) == 4 * 3 + 2 * 4
-    used = [sorted(row[row >= 0].tolist()) for row in rows]
-    assert used == [[0, 1]] * 12 + [[0]] * 4 + [[1]] * 4
+    assert [sorted(row[row >= 0].tolist()) for row in rows] == [[0, 1]] * 12 + [[0]] * 4 + [[1]] * 4
     # A source with more variables than the target gives as many as there is room for.
     assert copies_of_source(3, 1).tolist() == [[0], [1], [2]]
     with pytest.raises(ValueError, match="more than"):

@@ -127,8 +127,7 @@ def test_a_model_that_replaced_instances_is_restored_to_what_it_is_without_them(
             total += weights[i]
         np.testing.assert_array_equal(fresh.arrays.lists.entries(pair)[0], kept)
         assert fresh.own_weight[pair] == pytest.approx(total)
-        has_some = len(kept) > 0
-        assert fresh.known[pair] == (has_some and (model.known[pair] or fresh.own_weight[pair] >= 1.0))
+        assert fresh.known[pair] == ((len(kept) > 0) and (model.known[pair] or fresh.own_weight[pair] >= 1.0))
 
 
 def test_saved_weights_that_do_not_fit_the_instances_are_not_taken_over():

@@ -18,8 +18,7 @@ def model_with_prior(prior, grid=GRID, kernel=KERNEL, **kwargs):
 
 def test_what_an_exact_prior_claims_is_modelled_exactly_from_the_start_and_nothing_is_left_over():
     dynamics = LinearDynamics(1, 2)
-    prior = StubPrior(dynamics.effect)
-    model = model_with_prior(prior)
+    model = model_with_prior(StubPrior(dynamics.effect))
     points = model.grid.points()
     assert model.mdp.arrays.modelled.all() and not model.known.any()
     state = np.array([0.37, 0.81])

@@ -34,8 +34,7 @@ def test_a_default_grid_is_fine_enough_for_the_reach_of_the_kernel(n_variables, 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         grid = fitting_grid(n_variables, 2, None, breadth, 0.01)
-    diagonal = np.linalg.norm(0.5 ** np.array(grid.resolution))
-    assert diagonal <= breadth * np.sqrt(-np.log(0.01))
+    assert np.linalg.norm(0.5 ** np.array(grid.resolution)) <= breadth * np.sqrt(-np.log(0.01))
     assert grid.margin == (1 if n_variables <= 2 else 0)
 
 

@@ -121,8 +121,7 @@ def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, exp
 
 
 def test_the_stores_grow_and_keep_the_rows_that_were_written_before():
-    grid = ((4, 4), 0)
-    mdp, naive = make_mdp(grid)
+    mdp, naive = make_mdp(((4, 4), 0))
     rows, predecessors = len(mdp.arrays.rows.item), len(mdp.arrays.predecessors.item)
     rng = np.random.default_rng(0)
     pairs = np.arange(N_ACTIONS * mdp.grid.n_points)

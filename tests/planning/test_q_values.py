@@ -63,8 +63,7 @@ def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, g
     add_instances(naive, transitions)
     values = max_value - 5.0 * rng.random(naive.n_points)
     agent.planner.bounds = (max_value - 20.0, max_value)
-    states = [rng.random(n_variables) for _ in range(5)] + [t[0] for t in transitions[:5]]
-    for state in states:
+    for state in [rng.random(n_variables) for _ in range(5)] + [t[0] for t in transitions[:5]]:
         expected = naive.q_values(state, values, max_value - 20.0)
         found = agent.q_values(state, values)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
@@ -147,8 +146,7 @@ def test_q_does_not_depend_on_the_states_asked_for_before():
     """A search starts from what the last one found; wherever that was, the result is the same bit for bit."""
     rng = np.random.default_rng(3)
     agent, _ = agent_and_definition(2, 3, breadth=0.15, min_fraction=0.05)
-    states = np.round(rng.random((150, 2)) * 12) / 12
-    for state in states:
+    for state in np.round(rng.random((150, 2)) * 12) / 12:
         agent.model.add(state, int(rng.integers(N_ACTIONS)), -1.0, np.clip(state + 0.05, 0, 1), False)
     values = rng.normal(size=len(agent.planner.values)) - 5.0
     untouched = copy.deepcopy(agent)

@@ -55,8 +55,7 @@ def walk(seed, n, n_variables=2, goal=0.8, reward=lambda rng: -1.0):
     for _ in range(n):
         state = rng.random(n_variables)
         action = int(rng.integers(N_ACTIONS))
-        effect = rng.normal((0.12 if action else -0.12), 0.05, n_variables)
-        next_state = np.clip(state + effect, 0.0, 1.0)
+        next_state = np.clip(state + rng.normal((0.12 if action else -0.12), 0.05, n_variables), 0.0, 1.0)
         yield state, action, reward(rng), next_state, bool((next_state > goal).all())
 
 

@@ -19,8 +19,7 @@ def test_logs_have_the_groups_that_sb3_has_those_of_transfer_only_with_it_and_th
         # Every step costs 1.
         assert float(row["rollout/ep_rew_mean"]) == -float(row["rollout/ep_len_mean"])
         assert int(float(row["model/instances"])) == int(float(row["time/total_timesteps"]))
-        shares = [float(row[f"model/{name}"]) for name in ("known", "transferred", "optimistic")]
-        assert abs(sum(shares) - 1.0) < 1e-5
+        assert abs(sum([float(row[f"model/{name}"]) for name in ("known", "transferred", "optimistic")]) - 1.0) < 1e-5
 
 
 def test_without_a_log_interval_nothing_is_logged(tmp_path):

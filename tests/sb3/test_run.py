@@ -61,8 +61,7 @@ def test_learning_counts_steps_and_episodes(make):
 
 
 def test_the_learned_policy_walks_to_the_goal(make):
-    model = make().learn(400)
-    np.testing.assert_array_equal(model.predict(OBSERVATIONS[3:18], deterministic=True)[0], 1)
+    np.testing.assert_array_equal(make().learn(400).predict(OBSERVATIONS[3:18], deterministic=True)[0], 1)
 
 
 @pytest.mark.long

@@ -237,8 +237,7 @@ def test_a_file_is_no_larger_than_states_and_effects(tmp_path):
 
 
 def test_the_policys_own_file_contains_no_class_of_the_package(tmp_path):
-    model = small(Walk(), transfer=METHODS["COMBREL"]()).learn(20)
-    model.policy.save(tmp_path / "policy.pth")
+    small(Walk(), transfer=METHODS["COMBREL"]()).learn(20).policy.save(tmp_path / "policy.pth")
     pickled = b"".join(part for name, part in parts_of(tmp_path / "policy.pth").items() if name.endswith("data.pkl"))
     assert b"sb3_combrel.COMBREL" in pickled, "its name, as text"
     assert b"csb3_combrel" not in pickled, "no class to be imported"

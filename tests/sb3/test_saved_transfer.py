@@ -61,8 +61,7 @@ def test_two_halves_make_the_run_that_was_not_interrupted(name, n_episodes, tmp_
     """
     given = dict(planning_tolerance=1e-10, max_backups=20_000, model_breadth=0.05, exploration_threshold=2.0)
     whole = after_episodes(n_episodes + 6, BY_RELEVANCE[name](), Walk(start=-0.5), **given)
-    half = after_episodes(n_episodes, BY_RELEVANCE[name](), Walk(start=-0.5), **given)
-    half.save(tmp_path / "half")
+    after_episodes(n_episodes, BY_RELEVANCE[name](), Walk(start=-0.5), **given).save(tmp_path / "half")
     halves = FittedRMax.load(tmp_path / "half", env=Walk(start=-0.5))
     halves.learn(10**6, callback=StopTrainingOnMaxEpisodes(6), reset_num_timesteps=False)
     assert halves.num_timesteps == whole.num_timesteps > 60
@@ -167,8 +166,7 @@ class Pushy(Transfer):
 
 
 def test_a_method_of_the_users_own_is_saved_by_its_arguments(tmp_path, recwarn):
-    model = small(transfer=Pushy(np.float64(STRIDE / 2))).learn(30)
-    model.save(tmp_path / "model")
+    small(transfer=Pushy(np.float64(STRIDE / 2))).learn(30).save(tmp_path / "model")
     assert not [warning for warning in recwarn if "transfer" in str(warning.message)]
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert type(loaded.policy.transfer) is Pushy

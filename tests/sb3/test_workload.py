@@ -51,8 +51,7 @@ def test_a_grid_that_takes_no_time_is_not_announced(name):
 
 
 def test_with_verbose_the_size_of_the_grid_is_printed(capsys):
-    model = small(verbose=1)
-    n_points = model.agent.grid.n_points
+    n_points = small(verbose=1).agent.grid.n_points
     assert f"{n_points:,} grid points and {2 * n_points:,} state-action pairs" in capsys.readouterr().out
     small()
     assert "grid points" not in capsys.readouterr().out
@@ -63,8 +62,7 @@ def test_the_points_that_an_instance_reaches_are_those_within_the_kernels_reach(
     settings = ModelSettings(model_breadth=0.1, min_weight=0.01, min_fraction=0.1, exploration_threshold=1.0)
     for d, resolution in ((1, 9), (2, 7), (3, 5)):
         grid = StateGrid(d, resolution)
-        distance = np.linalg.norm(grid.points() - 0.5, axis=1)
-        counted = np.sum(np.exp(-((distance / 0.1) ** 2)) >= 0.01)
+        counted = np.sum(np.exp(-((np.linalg.norm(grid.points() - 0.5, axis=1) / 0.1) ** 2)) >= 0.01)
         found = workload(grid, 2, settings, transfers=False)
         whole = workload(grid, 2, ModelSettings(10.0, 0.01, 0.1, 1.0), transfers=False)
         assert found.step_seconds / whole.step_seconds * grid.n_points == pytest.approx(counted, rel=0.15)

@@ -81,8 +81,7 @@ class TestQLearning:
 
     def test_the_greedy_policy_is_near_the_optimum_of_103_steps(self):
         learner = QLearning(MOUNTAIN_CAR, seed=1).learn(15_000)
-        source = SourceInstances.record(learner, MOUNTAIN_CAR, 200, seed=5, deterministic=True)
-        assert source.terminated.any()
+        assert SourceInstances.record(learner, MOUNTAIN_CAR, 200, seed=5, deterministic=True).terminated.any()
 
     def test_the_seed_decides_everything(self):
         runs = [SourceInstances.from_q_learning("MountainCar-v0", 50, seed, total_timesteps=400) for seed in (0, 0, 1)]

@@ -65,8 +65,7 @@ def test_names_given_to_the_policy_come_before_those_of_the_environment(transfer
 
 
 def test_a_method_of_ones_own_has_a_report_and_a_picture(tmp_path):
-    report = explain(walker(transfer=Mine()).learn(60), tmp_path)
-    assert str(report).startswith("Mine()")
+    assert str(explain(walker(transfer=Mine()).learn(60), tmp_path)).startswith("Mine()")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.txt", "value_and_policy_place_height.png"]
 
 

@@ -60,8 +60,7 @@ def test_transferred_instances_reach_the_threshold_with_none_to_spare_or_there_a
         assert len(numbers) == 0
     if len(numbers):
         assert own + weights.sum() >= threshold - 1e-12 > own + weights[:-1].sum() - 2e-12
-        order = weights if relevances is None else relevances[numbers]
-        assert (np.diff(order) <= 0.0).all()
+        assert (np.diff(weights if relevances is None else relevances[numbers]) <= 0.0).all()
 
 
 MAPPINGS = MappingSet.all(2, 3, 2, 2, signs=True)

@@ -86,8 +86,7 @@ def test_by_name_and_by_number_are_the_same(method, source, tmp_path):
     assert same_parameters(ours, theirs)
     ours.save(tmp_path / "model")
     # Names of the target are not needed any more.
-    loaded = FittedRMax.load(tmp_path / "model", custom_objects={"_names": {}})
-    assert same_parameters(ours, loaded)
+    assert same_parameters(ours, FittedRMax.load(tmp_path / "model", custom_objects={"_names": {}}))
 
 
 @pytest.mark.parametrize("mapping", [AS_DICT, {"copies": [AS_DICT]}], ids=["mapping", "factored mapping"])

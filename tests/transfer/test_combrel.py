@@ -246,8 +246,7 @@ def test_every_state_gets_the_whole_mapping_with_the_highest_mean_compliance(n_n
     table = np.array([[naive.compliance(t, sources[k], mapping, BANDWIDTHS) for k, mapping in wholes] for t in seen])
     for point, state in enumerate(STATES):
         # The nearest transitions, whatever their action.
-        near = np.argsort([np.linalg.norm(t.state - state) for t in seen])[:n_neighbors]
-        expected = table[near].mean(axis=0)
+        expected = table[np.argsort([np.linalg.norm(t.state - state) for t in seen])[:n_neighbors]].mean(axis=0)
         best = expected.max()
         first = choices[:, point] - method.candidates.arrays.first[:-1]
         if best == 0.0:
@@ -265,8 +264,7 @@ def test_every_state_gets_the_whole_mapping_with_the_highest_mean_compliance(n_n
 
 def test_the_action_of_a_neighbor_decides_between_mappings_with_the_same_source_action():
     """Both mappings have source action 0 for target action 0; a transition with action 1 next to it tells them apart."""
-    rng = np.random.default_rng(0)
-    states = rng.random((200, 1))
+    states = np.random.default_rng(0).random((200, 1))
     actions = np.arange(200) % 2
     effects = np.where(actions == 0, 0.1, -0.1)[:, None]
     source = naive.SourceInstances(

@@ -277,8 +277,7 @@ def test_default_bandwidths_are_usable_whatever_the_source(source):
 @pytest.mark.parametrize("state", [(0, 0, None), (0, 1, 0), (0, 0, 1), (1, None, None), (0, 1, None)], ids=str)
 @pytest.mark.parametrize("given", [0.02, None])
 def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_number(state, given):
-    rng = np.random.default_rng(0)
-    source, n_mapped = naive.random_source(rng, 100, 2, 2), len(state) - state.count(None)
+    source, n_mapped = naive.random_source(np.random.default_rng(0), 100, 2, 2), len(state) - state.count(None)
     candidates = Candidates(source, [InterTaskMapping(state, [0])], naive.target_task(np.zeros((1, 3)), 1))
     usual = default_bandwidths(candidates.instances).start if given is None else given
     [found] = start_bandwidths(candidates, usual)

@@ -17,8 +17,7 @@ STEP = np.array([[0.05, 0.0], [0.0, -0.05]])
 
 def steady_source(direction=1.0, n=200, ends=False):
     """Action 0 moves along the first variable, action 1 along the second, the same everywhere."""
-    rng = np.random.default_rng(0)
-    states, actions = rng.uniform(0.1, 0.9, (n, 2)), np.arange(n) % 2
+    states, actions = np.random.default_rng(0).uniform(0.1, 0.9, (n, 2)), np.arange(n) % 2
     after = states + direction * STEP[actions]
     return SourceInstances(states, actions, np.full(n, -1.0), after, np.full(n, ends), [0.0, 0.0], [1.0, 1.0], 2)
 

@@ -77,8 +77,7 @@ def test_with_the_right_mapping_it_is_timbrel_with_that_mapping():
     effects[:2] = [[-0.5, -0.5], [0.5, 0.5]]
     observe(ours, (states, actions, effects))
     pairs, own = np.arange(45), np.linspace(0.0, 1.2, 45)
-    inside = np.flatnonzero((source.scaling.to_unit(source.next_states) <= 1.0).all(axis=1))
-    assert len(inside) > 150
+    assert len(np.flatnonzero((source.scaling.to_unit(source.next_states) <= 1.0).all(axis=1))) > 150
     one, other = (transferred_to_pairs(method, pairs, own) for method in (ours, theirs))
     np.testing.assert_array_equal(one.length, other.length)
     assert (one.length > 0).sum() > 20

@@ -28,8 +28,7 @@ def naive_error(source, mapping, transitions, predict):
     """Mean squared error of the effects that the source predicts through a mapping that uses all its variables."""
     errors = []
     for state, action, _, next_state in transitions:
-        seen = mapping.target_to_source(state, source.n_variables)
-        predicted = predict(tuple(seen), mapping.action[action])
+        predicted = predict(tuple(mapping.target_to_source(state, source.n_variables)), mapping.action[action])
         for moved, expected in zip(next_state - state, mapping.displacement_to_target(predicted), strict=True):
             errors.append((moved - expected) ** 2)
     return sum(errors) / len(errors)

@@ -43,8 +43,7 @@ def test_each_candidate_is_drawn_in_proportion_to_its_mean_compliance(seed, n_ca
     cache = random_cache(rng, 6, n_candidates, least)
     near = rng.permutation(6)[:3]
     near[rng.integers(1, 4) :] = -1
-    neighbors = near[near >= 0]
-    means = cache.compliance[neighbors, :n_candidates].mean(axis=0)
+    means = cache.compliance[near[near >= 0], :n_candidates].mean(axis=0)
     enough = np.where(means > least, means, 0.0)
     expected = np.append(enough / enough.sum(), 0.0) if enough.any() else np.eye(n_candidates + 1)[-1]
     np.testing.assert_allclose(shares(near, cache, n_candidates), expected, atol=1.5 / N_DRAWS)

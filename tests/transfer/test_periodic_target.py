@@ -68,8 +68,7 @@ def test_with_another_origin_the_same_is_transferred(method, cells=11):
     by_point = [length[: points.size].reshape(points.shape) for length in lengths]
     np.testing.assert_array_equal(by_point[1], np.roll(by_point[0], cells, axis=0))
     one, other = (bound_and_shown(method, each, (False, False)) for each in (0, cells))
-    without_the_flag = given_at(one, states) - given_at(other, shifted(states, cells, N_CELLS))
-    assert np.abs(without_the_flag).max() > 1e-3
+    assert np.abs(given_at(one, states) - given_at(other, shifted(states, cells, N_CELLS))).max() > 1e-3
 
 
 def test_effects_of_a_periodic_source_go_the_short_way():
@@ -101,8 +100,7 @@ def test_recorded_sources_have_the_flags_of_their_task():
     learner = dict(seed=0, resolution=3, model_breadth=0.15)
     of_rmax = SourceInstances.from_fitted_rmax(Ring(), 50, n_episodes=1, periodic=PERIODIC, **learner)
     recorded = SourceInstances.record(None, TellingRing(), 20, seed=0)
-    by_q_learning = SourceInstances.from_q_learning(TellingRing(), 20, seed=0, total_timesteps=30)
-    for source in (of_rmax, recorded, by_q_learning):
+    for source in (of_rmax, recorded, SourceInstances.from_q_learning(TellingRing(), 20, seed=0, total_timesteps=30)):
         assert source.periodic == tuple(PERIODIC)
     assert SourceInstances.record(None, Ring(), 20, seed=0).periodic == (False, False)
 

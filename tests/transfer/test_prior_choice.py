@@ -147,8 +147,7 @@ def test_compliances_are_those_of_the_equations():
 def test_with_whole_mappings_compliance_is_over_all_variables_those_unmapped_stay():
     _, copies, sums, (states, actions, effects) = measured(2, 25, noise=0.01, whole=True)
     scales = running_scales(effects)
-    predicted = np.nan_to_num(predicted_by(copies, 3, 1, states))
-    each = prediction_compliances(effects, predicted, scales)
+    each = prediction_compliances(effects, np.nan_to_num(predicted_by(copies, 3, 1, states)), scales)
     np.testing.assert_allclose(sums.compliance[3, :, 1], [each[actions == a].sum() for a in range(5)], rtol=1e-6)
 
 

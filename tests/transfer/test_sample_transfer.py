@@ -108,12 +108,10 @@ def test_drawn_are_as_many_of_each_action_as_can_be_and_none_twice_nor_of_those_
     relevances = rng.random((len(candidates), size.max())) * (rng.random((len(candidates), size.max())) < 0.7)
     drawn = draw_instances(candidates, compliances, relevances, 30, rng)
     assert len({tuple(row) for row in drawn.tolist()}) == len(drawn)
-    exists = np.arange(size.max()) < size[:, None]
-    possible = exists & (compliances[:, None] * relevances > 0.0)
+    possible = (np.arange(size.max()) < size[:, None]) & (compliances[:, None] * relevances > 0.0)
     assert possible[drawn[:, 0], drawn[:, 1]].all()
     for begin, end in itertools.pairwise(candidates.arrays.first):
-        n = int(((begin <= drawn[:, 0]) & (drawn[:, 0] < end)).sum())
-        assert n == min(30, int(possible[begin:end].sum()))
+        assert int(((begin <= drawn[:, 0]) & (drawn[:, 0] < end)).sum()) == min(30, int(possible[begin:end].sum()))
 
 
 def test_one_is_drawn_in_proportion_to_compliance_and_of_a_candidate_to_relevance():

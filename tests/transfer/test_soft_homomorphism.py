@@ -285,8 +285,7 @@ def test_the_most_probable_parts_come_first_and_add_up_to_one(max_terms, mass):
 
 def mixture(sample, n_target=3):
     """The predictions of a random mixture, and what they are made of."""
-    source = f.oscillator_source(200, rewards=lambda states: states[:, 0])
-    model = SourceModel(stacked_instances([source]))
+    model = SourceModel(stacked_instances([f.oscillator_source(200, rewards=lambda states: states[:, 0])]))
     rng = np.random.default_rng(0)
     readings = soft.all_readings(2, n_target, True)
     logits = soft.Logits(rng.normal(size=(2, 2, 2 * n_target)), rng.normal(size=(2, 4, 3)))
@@ -319,6 +318,5 @@ def test_predictions_are_means_over_the_mixture(at_sample):
             actions[-1] = (action + 1) % 4
         found = predictions.predict(sample, actions)
         for i in range(12):
-            expected = naive_mixture(predictions, sample[i], actions[i])
-            for ours, theirs in zip(found, expected, strict=True):
+            for ours, theirs in zip(found, naive_mixture(predictions, sample[i], actions[i]), strict=True):
                 np.testing.assert_allclose(ours[i], theirs, rtol=1e-7, atol=1e-10)

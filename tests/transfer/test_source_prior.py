@@ -87,8 +87,7 @@ def test_before_any_transition_a_mapping_that_is_given_or_drawn_predicts_and_cla
 
 @pytest.mark.parametrize(("n_copies", "seed"), [(2, 0), (3, 1)])
 def test_an_exact_source_is_found_and_claims_what_it_knows(n_copies, seed):
-    order = np.random.default_rng(seed).permutation(2 * n_copies).tolist()
-    mapping = f.copies_mapping(n_copies, order)
+    mapping = f.copies_mapping(n_copies, np.random.default_rng(seed).permutation(2 * n_copies).tolist())
     transfer = bound(COMBREL(f.oscillator_source(), "factored", use="prior"), 2 * n_copies, 2 * n_copies + 1, seed)
     versions = show(transfer, f.walk(mapping, 150 * n_copies, seed))
     states, actions = inside(300, 2 * n_copies, 2 * n_copies + 1)
@@ -98,8 +97,7 @@ def test_an_exact_source_is_found_and_claims_what_it_knows(n_copies, seed):
     assert (found.weight[found.end < 0.1] > 1.0).mean() > 0.95
     assert transfer.statistics()["transfer/prediction_error"] < 0.01
     # Ten times as many transitions change nothing any more.
-    again = show(transfer, f.walk(mapping, 300, seed + 100))
-    assert max(again) <= versions[-1] + 2
+    assert max(show(transfer, f.walk(mapping, 300, seed + 100))) <= versions[-1] + 2
     assert 1 <= versions[-1] <= 30
     assert not transfer.changed(np.zeros((2 * n_copies + 1, 3), dtype=bool))
     assert not transfer.transferred(states, actions, np.zeros(300)).length.any()

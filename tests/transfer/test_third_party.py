@@ -78,8 +78,7 @@ def test_a_source_must_bring_the_full_weight_when_the_model_has_lowered_its_thre
     def checked(self, states, actions, own_weight):
         found = transferred(self, states, actions, own_weight)
         weights = np.where(np.arange(found.weight.shape[1]) < found.length[:, None], found.weight, 0.0).sum(axis=1)
-        used = found.length[: len(own_weight)] > 0
-        reached.append((own_weight + weights[: len(own_weight)])[used])
+        reached.append((own_weight + weights[: len(own_weight)])[found.length[: len(own_weight)] > 0])
         return found
 
     transferred = method.transferred
@@ -164,8 +163,7 @@ def test_one_that_decides_nothing_leaves_learning_as_it_is_without_transfer(meth
 
 
 def test_each_environment_has_its_number():
-    model = small(make_vec_env(Walk, n_envs=3), transfer=Deciding()).learn(60)
-    method = model.policy.transfer
+    method = small(make_vec_env(Walk, n_envs=3), transfer=Deciding()).learn(60).policy.transfer
     assert [environment for environment, _ in method.asked] == [0, 1, 2] * 20
     assert [environment for environment, *_ in method.observed] == [0, 1, 2] * 20
     assert Deciding.environment == 0

@@ -120,12 +120,10 @@ ONTO_X = InterTaskMapping([0, None], [0])
 def test_a_method_has_room_for_all_that_a_pair_may_need(min_fraction):
     """Nearest first, ``min_fraction`` bounds the useful instances; nothing may be lost for lack of room below that."""
     reachable = min(list_room(min_fraction) - 3, 30)
-    points = np.array([[0.5]])
-    task = naive.target_task(points, 1, threshold=reachable - 0.5, min_fraction=min_fraction)
+    task = naive.target_task(np.array([[0.5]]), 1, threshold=reachable - 0.5, min_fraction=min_fraction)
     method = TIMBREL(row_of_instances([0.5] * 100), InterTaskMapping([0], [0]), breadth=0.1)
     method.bind(task, np.random.default_rng(0))
-    found = transferred_to_pairs(method, np.zeros(1, dtype=int), np.zeros(1))
-    assert found.length[0] == reachable
+    assert transferred_to_pairs(method, np.zeros(1, dtype=int), np.zeros(1)).length[0] == reachable
 
 
 def test_by_relevance_as_many_light_instances_are_transferred_as_it_takes():
@@ -138,5 +136,4 @@ def test_by_relevance_as_many_light_instances_are_transferred_as_it_takes():
         found = transferred_to_pairs(method, np.arange(2), np.zeros(2))
         assert found.length[:2].tolist() == [55, 55]
         assert found.weight[0, :55].sum() >= 1.0 > found.weight[0, :54].sum()
-    at = transferred_at(method, points[0], np.full(1, 0.5))
-    assert at.length[0] == 28
+    assert transferred_at(method, points[0], np.full(1, 0.5)).length[0] == 28

@@ -186,8 +186,7 @@ class TestChain:
 
     @pytest.mark.parametrize("program", ["sb3_combrel.zoo", "rl_zoo3.train"])
     def test_environments_in_processes_and_an_unmodified_zoo(self, tmp_path, program):
-        conf = write_config(tmp_path / "two.yml", n_envs=2)
-        args = train_args(tmp_path, "--vec-env", "subproc", conf=conf, n=100)
+        args = train_args(tmp_path, "--vec-env", "subproc", conf=write_config(tmp_path / "two.yml", n_envs=2), n=100)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(CONFIGS), os.environ.get("PYTHONPATH", "")])}
         command = [sys.executable, "-m", program, *(["train"] if program == "sb3_combrel.zoo" else []), *args]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)

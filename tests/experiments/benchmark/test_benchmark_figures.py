@@ -17,8 +17,7 @@ def curves():
     """Three runs of different numbers of episodes."""
     rng = np.random.default_rng(0)
     steps = [rng.integers(5, 40, size=n).tolist() for n in (4, 9, 15)]
-    returns = [rng.normal(size=len(row)).tolist() for row in steps]
-    return LearningCurves.from_rows(returns, steps)
+    return LearningCurves.from_rows([rng.normal(size=len(row)).tolist() for row in steps], steps)
 
 
 def test_over_steps_a_value_is_the_mean_of_the_last_episodes_that_have_ended(curves):

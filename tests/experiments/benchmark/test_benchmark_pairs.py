@@ -217,14 +217,12 @@ class TestStepsToAMapping:
 
 
 def test_a_budget_without_the_end_of_an_episode_is_an_error(sources):
-    pair = replace(PAIRS["mirrored-car"], n_steps=100)
-    found = carried_out(pair, METHODS["none"], sources)
+    found = carried_out(replace(PAIRS["mirrored-car"], n_steps=100), METHODS["none"], sources)
     assert "no episode has ended within n_steps=100" in found.error and "misfit" not in found.more
 
 
 def test_a_learner_that_cannot_be_made_is_no_misfit_of_the_method(sources):
-    pair = replace(PAIRS["mirrored-car"], learner={"model_breadth": -1.0})
-    found = carried_out(pair, METHODS["COMBREL"], sources)
+    found = carried_out(replace(PAIRS["mirrored-car"], learner={"model_breadth": -1.0}), METHODS["COMBREL"], sources)
     assert found.error.startswith("ValueError: model_breadth must") and "misfit" not in found.more
 
 

@@ -75,8 +75,7 @@ class TestPerformance:
         found = performances(pair, cells_of(pair, [method_of(name) for name in runs], outcomes, [0]))
         # The shortest has 45 steps in episodes that have ended.
         for name, (returns, steps) in runs.items():
-            by_step = np.repeat(returns, steps)[:45]
-            np.testing.assert_allclose(found[name], [by_step.mean()])
+            np.testing.assert_allclose(found[name], [np.repeat(returns, steps)[:45].mean()])
 
     @pytest.mark.parametrize("n_seeds", [3, 4, 7, 10])
     def test_the_estimate_is_the_interquartile_mean_within_its_interval(self, n_seeds):
@@ -112,8 +111,7 @@ class TestRanks:
         pair, methods = pair_of(), [method_of(NONE), method_of("b", same_as="c")]
         jobs = jobs_of([pair], methods, range(5), {pair.name: ()})
         assert [job.method for job in jobs[:2]] == [NONE, "b"]
-        outcomes = [job.result([1 + job.seed], [1.0], [True], 1) for job in jobs]
-        cells = cells_of(pair, methods, outcomes, range(5))
+        cells = cells_of(pair, methods, [job.result([1 + job.seed], [1.0], [True], 1) for job in jobs], range(5))
         assert len(cells["b"].outcomes) == 5 and note_of("b", cells["b"]) == ""
 
     def test_the_table_says_where_seeds_make_no_difference(self):
@@ -122,8 +120,7 @@ class TestRanks:
         differs = outcome(pair.name, "a", 3, [2.0, 1.0])
         notes = {}
         for runs in (same[:1], same, [*same, differs]):
-            cells = cells_of(pair, methods, runs, range(4))
-            notes[len(runs)] = note_of("a", cells["a"])
+            notes[len(runs)] = note_of("a", cells_of(pair, methods, runs, range(4))["a"])
         assert notes == {1: "", 3: "all runs alike", 4: ""}
 
     def test_mean_ranks_are_those_of_a_naive_computation(self):
@@ -147,8 +144,7 @@ class TestRanks:
         found = mean_ranks({"made-up": performance}, {"made-up": cells}, n_resamples=20_000)
         # All draws of four runs of each.
         draws = [np.array([naive_iqm(d) for d in itertools.product(performance[name], repeat=4)]) for name in "ab"]
-        worse = np.mean(draws[0][:, None] < draws[1])
-        assert 0.025 < worse < 0.975, "the example must be undecided"
+        assert 0.025 < np.mean(draws[0][:, None] < draws[1]) < 0.975, "the example must be undecided"
         assert (found["a"].low, found["a"].high) == (1.0, 2.0)
         sure = mean_ranks({"made-up": {"a": performance["a"] - 9.0, "b": performance["b"]}}, {"made-up": cells})
         assert (sure["a"].rank, sure["a"].low, sure["a"].high) == (2.0, 2.0, 2.0)
@@ -158,8 +154,7 @@ class TestRanks:
             "one": cells_by({"a": 0.0, "b": 10.0, "c": 20.0}, pair="one")[1],
             "two": cells_by({"a": 0.0, "b": 10.0}, pair="two")[1],
         }
-        performance = {name: performances(pair_of(name), cells[name]) for name in cells}
-        found = mean_ranks(performance, cells)
+        found = mean_ranks({name: performances(pair_of(name), cells[name]) for name in cells}, cells)
         assert {name: (each.rank, each.n_pairs) for name, each in found.items()} == {
             "a": (3.0, 2),
             "b": (1.5, 2),

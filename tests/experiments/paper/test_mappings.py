@@ -36,8 +36,7 @@ class TestMostFrequent:
 def of_the_source(states, actions):
     """The first action moves along the slope of the first variable, the second turns both."""
     first = np.stack([0.1 * states[:, 0], np.zeros(len(states))], axis=1)
-    second = np.stack([0.05 - 0.1 * states[:, 1], 0.08 * states[:, 0]], axis=1)
-    return np.where(actions[:, None] == 0, first, second)
+    return np.where(actions[:, None] == 0, first, np.stack([0.05 - 0.1 * states[:, 1], 0.08 * states[:, 0]], axis=1))
 
 
 def seen_through(mapping, n, seed):

@@ -122,8 +122,7 @@ def test_one_random_mapping_with_a_prior_is_drawn_by_the_seed(sources):
 class TestTargets:
     def test_the_jobs_are_those_of_each_seed_and_method(self, sources):
         (target,) = targets_of("fig2", PAPER)
-        methods = methods_of([target], MOUNTAIN_CAR, PAPER)
-        jobs = jobs_of(MOUNTAIN_CAR, PAPER, methods, sources["mountain_car"], 3, 7)
+        jobs = jobs_of(MOUNTAIN_CAR, PAPER, methods_of([target], MOUNTAIN_CAR, PAPER), sources["mountain_car"], 3, 7)
         assert Counter(job.method for job in jobs) == Counter(dict.fromkeys(target.methods["mountain_car"], 3) | {m.ORACLE: 0})
         assert {(job.seed, job.n_episodes) for job in jobs} == {(seed, 7) for seed in (5000, 5001, 5002)}
         assert len({job.name for job in jobs}) == len(jobs)

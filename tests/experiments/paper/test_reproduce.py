@@ -21,8 +21,7 @@ TABLES = {"table2": 3, "table4": 2, "table5": 1, "table6": 4, "measures": 2}
 def reproduce(target, **given):
     """The files made, and what was written meanwhile."""
     console = quiet()
-    made = command.reproduce(target, console=console, **{**TINY, **given})
-    return made, console.file.getvalue()
+    return command.reproduce(target, console=console, **{**TINY, **given}), console.file.getvalue()
 
 
 def files_in(folder):

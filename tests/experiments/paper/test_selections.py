@@ -159,8 +159,7 @@ class TestDependence:
     def test_a_dependence_on_the_action_is_found(self):
         rng = np.random.default_rng(2)
         action = rng.choice(["West", "East"], size=2000)
-        follows = rng.random(2000) < 0.7
-        mapping = np.where(follows == (action == "West"), "one", "two")
+        mapping = np.where((rng.random(2000) < 0.7) == (action == "West"), "one", "two")
         cells = cells_of(selection_of(rng, 2000, mapping, action))
         assert 0.3 < float(cells["target action"][1]) < 0.5 and float(cells["target action"][2]) < 1e-10
         assert float(cells["x"][2]) > 0.05 and float(cells["vx"][2]) > 0.05
@@ -176,8 +175,7 @@ class TestDependence:
     def test_the_thinned_test_sees_several_actions_where_every_step_has_one_selection_of_each(self):
         rng = np.random.default_rng(4)
         action = np.tile(np.array(list("abcde")), 400)
-        mapping = np.where(np.isin(action, ["a", "b"]), "one", "two")
-        selection = selection_of(rng, 2000, mapping, action)
+        selection = selection_of(rng, 2000, np.where(np.isin(action, ["a", "b"]), "one", "two"), action)
         assert float(cells_of(selection)["target action"][5]) < 1e-6
 
     def test_rare_mappings_and_a_variable_that_never_changes_have_no_say(self):
