@@ -2,17 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import (
-    GRIDS,
-    KERNELS,
-    N_ACTIONS,
-    PERIODIC_GRIDS,
-    assert_same_row,
-    learn,
-    make_model,
-    random_transitions,
-    row_of,
-)
+from helpers import kernel_models
 from helpers.naive_fitted_rmax import Instance, kept_instances
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -84,8 +74,10 @@ class SomeInstances:
 
 
 problems = st.tuples(
-    st.sampled_from([grid for grid in GRIDS if grid not in (((3, 2), 0), ((1, 1, 1), 1), PERIODIC_GRIDS[0])]),
-    st.sampled_from([kernel for kernel in KERNELS if kernel["min_fraction"] > 0.02]),
+    st.sampled_from(
+        [grid for grid in kernel_models.GRIDS if grid not in (((3, 2), 0), ((1, 1, 1), 1), kernel_models.PERIODIC_GRIDS[0])]
+    ),
+    st.sampled_from([kernel for kernel in kernel_models.KERNELS if kernel["min_fraction"] > 0.02]),
     st.integers(0, 10**6),
     st.integers(0, 20),
     st.sampled_from([1.0, 0.9]),
@@ -98,10 +90,10 @@ def both(problem):
     grid, kernel, seed, n, gamma, transfers = problem
     made = []
     for model_class in (KernelAverage, NaiveKernelAverage):
-        model = make_model(grid, kernel, gamma, model_class=model_class)
+        model = kernel_models.make_model(grid, kernel, gamma, model_class=model_class)
         if transfers:
             model.transfer = SomeInstances(model.grid.points(), 1.0)
-        transitions = random_transitions(seed, len(grid[0]), n)
+        transitions = kernel_models.random_transitions(seed, len(grid[0]), n)
         if model_class is NaiveKernelAverage:
             for transition in transitions:
                 pairs = model.add(*transition)
@@ -109,7 +101,7 @@ def both(problem):
                 # As update_rows would, at each step.
                 model.known[pairs] |= model.predict(model.grid.points(), np.full(len(pairs), transition[1])).weight >= 1.0
         else:
-            learn(model, transitions)
+            kernel_models.learn(model, transitions)
         model.update_all_rows()
         made.append(model)
     return made
@@ -124,9 +116,11 @@ def test_rows_and_predictions_by_the_base_class_agree_with_those_of_the_kernel_a
     np.testing.assert_array_equal(naive.mdp.arrays.modelled, model.mdp.arrays.modelled)
     np.testing.assert_array_equal(naive.mdp.arrays.n_optimistic, model.mdp.arrays.n_optimistic)
     np.testing.assert_allclose(naive.mdp.arrays.reward, model.mdp.arrays.reward, rtol=1e-9, atol=1e-9)
-    for action in range(N_ACTIONS):
+    for action in range(kernel_models.N_ACTIONS):
         for point in range(model.grid.n_points):
-            assert_same_row(row_of(naive.mdp, point, action), row_of(model.mdp, point, action))
+            kernel_models.assert_same_row(
+                kernel_models.row_of(naive.mdp, point, action), kernel_models.row_of(model.mdp, point, action)
+            )
     if problem[-1]:
         assert (model.mdp.arrays.modelled & ~model.known).any(), "some pairs are modelled with transferred instances"
     for state in np.random.default_rng(seed).random((4, len(problem[0][0]))):
@@ -164,7 +158,7 @@ class TooLong(SomeInstances):
 
 @pytest.mark.parametrize("model_class", [KernelAverage, NaiveKernelAverage])
 def test_a_model_refuses_transferred_instances_that_break_the_contract(model_class):
-    model = make_model(GRIDS[1], KERNELS[0], model_class=model_class)
+    model = kernel_models.make_model(kernel_models.GRIDS[1], kernel_models.KERNELS[0], model_class=model_class)
     model.transfer = TooLong(model.grid.points(), 1.0)
     with pytest.raises(ValueError, match="TooLong returned length=5 for row 0"):
         model.update_rows(np.arange(3))

@@ -2,24 +2,8 @@
 
 import numpy as np
 import pytest
+from helpers import linear_models
 from helpers.kernel_models import N_ACTIONS, random_transitions
-from helpers.linear_models import (
-    LINEAR_KERNELS,
-    SMALL_GRIDS,
-    CurvedDynamics,
-    StubPrior,
-    assert_same_fits,
-    assert_same_prediction,
-    assert_same_sums,
-    finish_episode,
-    learn_linear,
-    left_half,
-    linear_model_and_definition,
-    make_linear_model,
-    nothing,
-    renew,
-    small_steps,
-)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,21 +12,23 @@ from sb3_combrel.models.linear_fits import TOLERANCE
 
 slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=8)
 problems = st.tuples(
-    st.sampled_from(SMALL_GRIDS),
-    st.sampled_from(LINEAR_KERNELS),
+    st.sampled_from(linear_models.SMALL_GRIDS),
+    st.sampled_from(linear_models.LINEAR_KERNELS),
     st.integers(0, 10**6),
     st.integers(1, 16),
     st.sampled_from([0.3, 1.0, 4.0]),
 )
 # What a prior claims, by and by; without any there is no prior.
-all_claims = st.lists(st.sampled_from([left_half, lambda state, action: action == 0, nothing]), max_size=2)
+all_claims = st.lists(
+    st.sampled_from([linear_models.left_half, lambda state, action: action == 0, linear_models.nothing]), max_size=2
+)
 
 
 def with_some_prior(problem, claims, **kwargs):
     grid, kernel, seed, _, threshold = problem
-    effect = CurvedDynamics(seed, len(grid[0])).effect
-    prior = StubPrior(effect, claims[0], reward=0.7, end=0.0 if seed % 2 else 0.2) if claims else None
-    model, naive = linear_model_and_definition(grid, kernel, threshold=threshold, prior=prior, **kwargs)
+    effect = linear_models.CurvedDynamics(seed, len(grid[0])).effect
+    prior = linear_models.StubPrior(effect, claims[0], reward=0.7, end=0.0 if seed % 2 else 0.2) if claims else None
+    model, naive = linear_models.linear_model_and_definition(grid, kernel, threshold=threshold, prior=prior, **kwargs)
     return model, naive, prior
 
 
@@ -51,11 +37,11 @@ def with_some_prior(problem, claims, **kwargs):
 def test_the_prediction_at_any_state_is_that_of_the_definition(problem, claims, at):
     model, naive, prior = with_some_prior(problem, claims)
     if prior is not None:
-        renew(model, prior)
+        linear_models.renew(model, prior)
     d = len(problem[0][0])
-    learn_linear(model, naive, random_transitions(problem[2], d, problem[3]))
+    linear_models.learn_linear(model, naive, random_transitions(problem[2], d, problem[3]))
     for state in np.array([at[:d], model.instances.state[0, 0] if model.instances.size[0] else at[:d]]):
-        assert_same_prediction(model, naive, state)
+        linear_models.assert_same_prediction(model, naive, state)
         predictions = model.predict(np.array([state] * N_ACTIONS), np.arange(N_ACTIONS))
         prediction, given_ = model.predict_at(state)
         assert given_ is None, "instances are asked of no prior"
@@ -67,14 +53,14 @@ def test_the_prediction_at_any_state_is_that_of_the_definition(problem, claims, 
 
 
 def test_what_was_asked_for_before_does_not_change_a_prediction():
-    grid, kernel = ((2, 2), 1, (True, False)), LINEAR_KERNELS[0]
+    grid, kernel = ((2, 2), 1, (True, False)), linear_models.LINEAR_KERNELS[0]
     rng, states = np.random.default_rng(0), []
-    model = make_linear_model(grid, kernel)
+    model = linear_models.make_linear_model(grid, kernel)
     for transition in random_transitions(5, 2, 90):
         model.add(*transition)
         states.append(rng.random(2))
         model.predict_at(states[-1])
-    fresh = make_linear_model(grid, kernel)
+    fresh = linear_models.make_linear_model(grid, kernel)
     for transition in random_transitions(5, 2, 90):
         fresh.add(*transition)
     for state in states[::-10]:
@@ -87,23 +73,23 @@ def test_what_was_asked_for_before_does_not_change_a_prediction():
 def test_what_is_known_sums_fits_and_rows_are_those_of_the_definition(problem, claims, gamma, max_model_steps, small):
     model, naive, prior = with_some_prior(problem, claims, gamma=gamma, max_model_steps=max_model_steps)
     d, seed, n = len(problem[0][0]), problem[2], problem[3]
-    transitions = small_steps(seed, d, n, ends=bool(seed % 3)) if small else random_transitions(seed, d, n)
+    transitions = linear_models.small_steps(seed, d, n, ends=bool(seed % 3)) if small else random_transitions(seed, d, n)
     for part, some in enumerate((transitions[: n // 2], transitions[n // 2 :])):
         if prior is not None:
-            prior.claims, prior.effect = claims[part % len(claims)], CurvedDynamics(seed + part, d).effect
-            renew(model, prior)
+            prior.claims, prior.effect = claims[part % len(claims)], linear_models.CurvedDynamics(seed + part, d).effect
+            linear_models.renew(model, prior)
         for transition in some:
             before = model.fits.reach.copy(), model.fits.limit.copy(), model.fits.n_counted.copy()
-            learn_linear(model, naive, [transition])
+            linear_models.learn_linear(model, naive, [transition])
             np.testing.assert_array_equal(model.known.reshape(N_ACTIONS, -1), naive.known)
             narrower = np.flatnonzero(model.fits.reach != before[0])
             assert (before[2][narrower] + 1 > before[1][narrower]).all(), "kernels narrow when the limit is exceeded"
             assert (model.fits.n_counted <= model.fits.limit)[model.known].all()
         np.testing.assert_allclose(model.own_weight.reshape(N_ACTIONS, -1), naive.total, rtol=1e-9)
         np.testing.assert_array_equal(model.fits.limit.reshape(N_ACTIONS, -1), naive.limit)
-        assert_same_sums(model, naive)
-        finish_episode(model)
-        assert_same_fits(model, naive, gamma)
+        linear_models.assert_same_sums(model, naive)
+        linear_models.finish_episode(model)
+        linear_models.assert_same_fits(model, naive, gamma)
         assert (model.fits.unexplained[model.known] == 0.0).all()
     modelled = (model.known | model.fits.claimed).reshape(N_ACTIONS, -1)
     np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
@@ -112,20 +98,20 @@ def test_what_is_known_sums_fits_and_rows_are_those_of_the_definition(problem, c
 
 @pytest.mark.parametrize("grid", [((3,), 0), ((2, 2), 0, (True, False))], ids=str)
 def test_sums_and_rows_are_right_after_arrays_have_grown(grid):
-    model, naive = linear_model_and_definition(grid, LINEAR_KERNELS[1])
+    model, naive = linear_models.linear_model_and_definition(grid, linear_models.LINEAR_KERNELS[1])
     capacity = model.instances.capacity
-    learn_linear(model, naive, random_transitions(2, len(grid[0]), 150))
+    linear_models.learn_linear(model, naive, random_transitions(2, len(grid[0]), 150))
     assert model.instances.capacity > capacity
-    finish_episode(model)
-    assert_same_sums(model, naive)
-    assert assert_same_fits(model, naive) > 10
+    linear_models.finish_episode(model)
+    linear_models.assert_same_sums(model, naive)
+    assert linear_models.assert_same_fits(model, naive) > 10
 
 
 @slow_and_repeatable
 @given(problems, st.floats(0.05, 0.9))
 def test_a_lower_threshold_and_what_is_accepted_make_pairs_known(problem, threshold):
     model, naive, _ = with_some_prior(problem, [])
-    learn_linear(model, naive, random_transitions(problem[2], len(problem[0][0]), problem[3]))
+    linear_models.learn_linear(model, naive, random_transitions(problem[2], len(problem[0][0]), problem[3]))
     before = model.known.copy()
     newly_known = model.lower_threshold(threshold)
     naive.lower_threshold(threshold)
@@ -136,8 +122,8 @@ def test_a_lower_threshold_and_what_is_accepted_make_pairs_known(problem, thresh
     np.testing.assert_array_equal(accepted, [p for p in asked if not naive.known.flat[p] and naive.total.flat[p] > 0.0])
     model.update_rows(accepted)
     naive.known.flat[accepted] = True
-    finish_episode(model)
-    assert_same_fits(model, naive)
+    linear_models.finish_episode(model)
+    linear_models.assert_same_fits(model, naive)
 
 
 @slow_and_repeatable
@@ -147,7 +133,7 @@ def test_within_an_episode_pairs_are_fitted_again_before_too_much_is_left_unexpl
     fits, d = model.fits, len(problem[0][0])
     for transition in random_transitions(problem[2], d, problem[3]):
         known_before, unexplained_before = model.known.copy(), fits.unexplained.copy()
-        learn_linear(model, naive, [transition])
+        linear_models.learn_linear(model, naive, [transition])
         assert (fits.unexplained[model.known] <= MAX_UNEXPLAINED).all()
         gained = (fits.unexplained != unexplained_before) & model.known
         for pair in np.flatnonzero(gained & (fits.unexplained == 0.0)):
@@ -161,7 +147,7 @@ def test_within_an_episode_pairs_are_fitted_again_before_too_much_is_left_unexpl
 
 
 def test_most_instances_that_agree_with_the_fit_change_no_row():
-    model = make_linear_model(((3, 3), 0), LINEAR_KERNELS[0], n_actions=1)
+    model = linear_models.make_linear_model(((3, 3), 0), linear_models.LINEAR_KERNELS[0], n_actions=1)
     rng = np.random.default_rng(0)
     n_changed = []
     for state in rng.random((400, 2)):

@@ -2,38 +2,23 @@
 
 import numpy as np
 import pytest
+from helpers import linear_models
 from helpers.kernel_models import N_ACTIONS, learn, random_transitions
-from helpers.linear_models import (
-    LINEAR_KERNELS,
-    SMALL_GRIDS,
-    LinearDynamics,
-    StubPrior,
-    assert_restored,
-    assert_same_fits,
-    assert_same_sums,
-    finish_episode,
-    learn_linear,
-    left_half,
-    linear_model_and_definition,
-    make_linear_model,
-    renew,
-    small_steps,
-)
 from helpers.naive_local_linear import NaiveReplacement
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 
 def assert_same_as_definition(model, naive):
-    assert_same_sums(model, naive)
-    finish_episode(model)
-    return assert_same_fits(model, naive)
+    linear_models.assert_same_sums(model, naive)
+    linear_models.finish_episode(model)
+    return linear_models.assert_same_fits(model, naive)
 
 
 @settings(deadline=None, derandomize=True, max_examples=5)
 @given(
-    st.sampled_from(SMALL_GRIDS),
-    st.sampled_from(LINEAR_KERNELS),
+    st.sampled_from(linear_models.SMALL_GRIDS),
+    st.sampled_from(linear_models.LINEAR_KERNELS),
     st.integers(0, 10**6),
     st.integers(1, 8),
     st.sampled_from([0.3, 1.0]),
@@ -41,10 +26,10 @@ def assert_same_as_definition(model, naive):
 def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_everywhere(
     grid, kernel, seed, max_instances, threshold
 ):
-    model, naive = linear_model_and_definition(grid, kernel, max_instances=max_instances, threshold=threshold)
+    model, naive = linear_models.linear_model_and_definition(grid, kernel, max_instances=max_instances, threshold=threshold)
     expected = NaiveReplacement(naive, max_instances)
     for transition in random_transitions(seed, len(grid[0]), 3 * max_instances + 8):
-        learn_linear(model, expected, [transition])
+        linear_models.learn_linear(model, expected, [transition])
         np.testing.assert_array_equal(model.known.reshape(N_ACTIONS, -1), naive.known)
         np.testing.assert_array_equal(model.mdp.arrays.modelled, model.known)
         assert model.instances.size.tolist() == [len(some) for some in naive.instances]
@@ -57,25 +42,27 @@ def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_eve
 
 @pytest.mark.parametrize("grid", [((3,), 1), ((2, 2), 0, (False, True))], ids=str)
 def test_sums_and_rows_stay_right_over_many_replacements(grid):
-    model, naive = linear_model_and_definition(grid, LINEAR_KERNELS[1], max_instances=12)
-    learn_linear(model, NaiveReplacement(naive, 12), random_transitions(4, len(grid[0]), 150))
+    model, naive = linear_models.linear_model_and_definition(grid, linear_models.LINEAR_KERNELS[1], max_instances=12)
+    linear_models.learn_linear(model, NaiveReplacement(naive, 12), random_transitions(4, len(grid[0]), 150))
     assert assert_same_as_definition(model, naive) > 0
 
 
 def test_sums_and_rows_stay_right_where_many_instances_have_the_same_state():
     rng = np.random.default_rng(1)
     states = rng.random((3, 2))
-    model, naive = linear_model_and_definition(((2, 2), 0), LINEAR_KERNELS[1], max_instances=20)
+    model, naive = linear_models.linear_model_and_definition(((2, 2), 0), linear_models.LINEAR_KERNELS[1], max_instances=20)
     expected = NaiveReplacement(naive, 20)
     for _ in range(120):
         state = states[rng.integers(3)]
-        learn_linear(model, expected, [(state, 0, rng.normal(), state + 0.1 * rng.normal(size=2), rng.random() < 0.2)])
+        linear_models.learn_linear(
+            model, expected, [(state, 0, rng.normal(), state + 0.1 * rng.normal(size=2), rng.random() < 0.2)]
+        )
     assert assert_same_as_definition(model, naive) > 0
 
 
 def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_again():
     kernel = dict(breadth=0.1, min_weight=0.05, n_neighbors=2, outcome_breadth=0.05)
-    model = make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
+    model = linear_models.make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
     point = 4  # at 0.5
 
     def add(at, terminated=False):
@@ -99,10 +86,10 @@ def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_aga
 
 def test_rewards_are_those_of_the_instances_left_however_little_these_weigh():
     kernel = dict(breadth=0.5, min_weight=0.01, n_neighbors=8, outcome_breadth=0.05)
-    model, naive = linear_model_and_definition(((2,), 0), kernel, max_instances=2, n_actions=1)
+    model, naive = linear_models.linear_model_and_definition(((2,), 0), kernel, max_instances=2, n_actions=1)
     expected, point = NaiveReplacement(naive, 2), 2  # at 0.5
     for at, reward in ((0.5, 100.0), (0.0, -3.0), (0.6, 50.0), (0.7, 20.0), (0.85, 10.0), (0.98, -1.0)):
-        learn_linear(model, expected, [(np.array([at]), 0, reward, np.array([at + 0.05]), False)])
+        linear_models.learn_linear(model, expected, [(np.array([at]), 0, reward, np.array([at + 0.05]), False)])
     assert_same_as_definition(model, naive)
     assert model.fits.row[point, 1] == pytest.approx(-1.0, abs=0.01), "0.98 is a little nearer than 0"
 
@@ -110,9 +97,9 @@ def test_rewards_are_those_of_the_instances_left_however_little_these_weigh():
 @pytest.mark.parametrize("outcome_breadth", [1e-3, 1e-2])
 def test_rewards_far_from_all_instances_are_numbers_however_narrow_their_kernel_is(outcome_breadth):
     kernel = dict(breadth=0.5, min_weight=0.05, n_neighbors=8, outcome_breadth=outcome_breadth)
-    model = make_linear_model(((3,), 0), kernel, n_actions=1)
+    model = linear_models.make_linear_model(((3,), 0), kernel, n_actions=1)
     learn(model, [(np.array([0.0]), 0, reward, np.array([0.05]), False) for reward in (-1.0, -2.0, -3.0)])
-    finish_episode(model)
+    linear_models.finish_episode(model)
     assert model.known[4]
     np.testing.assert_allclose(model.fits.row[model.known], [[0.05, -2.0, 0.0]] * model.known.sum(), atol=1e-12)
     assert model.predict_at(np.array([0.5]))[0].reward[0] == pytest.approx(-2.0)
@@ -120,8 +107,8 @@ def test_rewards_far_from_all_instances_are_numbers_however_narrow_their_kernel_
 
 @settings(deadline=None, derandomize=True, max_examples=8)
 @given(
-    st.sampled_from(SMALL_GRIDS),
-    st.sampled_from(LINEAR_KERNELS),
+    st.sampled_from(linear_models.SMALL_GRIDS),
+    st.sampled_from(linear_models.LINEAR_KERNELS),
     st.integers(0, 10**6),
     st.integers(1, 60),
     st.booleans(),
@@ -129,26 +116,28 @@ def test_rewards_far_from_all_instances_are_numbers_however_narrow_their_kernel_
 )
 def test_what_is_restored_at_an_episodes_end_is_and_learns_the_same_to_the_last_bit(grid, kernel, seed, n, small, informed):
     d = len(grid[0])
-    prior = StubPrior(LinearDynamics(0, d).effect, left_half) if informed else None
-    model, restored = (make_linear_model(grid, kernel, prior=prior, max_model_steps=50 if small else 1) for _ in range(2))
+    prior = linear_models.StubPrior(linear_models.LinearDynamics(0, d).effect, linear_models.left_half) if informed else None
+    model, restored = (
+        linear_models.make_linear_model(grid, kernel, prior=prior, max_model_steps=50 if small else 1) for _ in range(2)
+    )
     if informed:
-        renew(model, prior)
+        linear_models.renew(model, prior)
     transitions = random_transitions(seed, d, n + 30)
-    learn(model, small_steps(seed, d, n, ends=True) if small else transitions[: n // 2])
-    finish_episode(model)
+    learn(model, linear_models.small_steps(seed, d, n, ends=True) if small else transitions[: n // 2])
+    linear_models.finish_episode(model)
     # A larger effect far away widens the range that effects are kept within, and nothing else.
     learn(model, transitions[n // 2 : n])
     accepted = model.accept(np.arange(0, len(model.known), 5))
     model.update_rows(accepted)
-    assert_restored(model, restored, transitions[n:])
+    linear_models.assert_restored(model, restored, transitions[n:])
     assert restored.known[accepted].all()
 
 
 def test_what_is_restored_is_right_after_instances_were_replaced():
-    model = make_linear_model(((2, 2), 1, (True, False)), LINEAR_KERNELS[1], max_instances=15)
+    model = linear_models.make_linear_model(((2, 2), 1, (True, False)), linear_models.LINEAR_KERNELS[1], max_instances=15)
     learn(model, random_transitions(9, 2, 200))
-    finish_episode(model)
-    restored = make_linear_model(((2, 2), 1, (True, False)), LINEAR_KERNELS[1], max_instances=15)
+    linear_models.finish_episode(model)
+    restored = linear_models.make_linear_model(((2, 2), 1, (True, False)), linear_models.LINEAR_KERNELS[1], max_instances=15)
     restored.set_state(model.get_state())
     # Sums from which others were subtracted are the same but for rounding.
     for name in ("sums", "outcome", "reach", "limit", "known", "total"):

@@ -2,22 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers import linear_models
 from helpers.kernel_models import N_ACTIONS, learn
-from helpers.linear_models import (
-    LINEAR_KERNELS,
-    assert_restored,
-    assert_same_fits,
-    assert_same_sums,
-    finish_episode,
-    learn_linear,
-    linear_model_and_definition,
-    make_linear_model,
-)
 from helpers.naive_local_linear import NaiveReplacement
 
 from sb3_combrel.models.local_linear import CHECKED_EVERY
 
-GRID, KERNEL, THRESHOLD = ((3,), 0), LINEAR_KERNELS[0], 3.0
+GRID, KERNEL, THRESHOLD = ((3,), 0), linear_models.LINEAR_KERNELS[0], 3.0
 AN_END, ANOTHER_REWARD = (-1.0, True), (-2.0, False)
 
 
@@ -48,37 +39,37 @@ def assert_same_knowledge(model, naive):
 )
 def test_what_is_known_is_that_of_the_definition_before_and_after_the_first_outcome(threshold, outcome, max_instances):
     # At 25 there are 50 instances for ever, at 10 never so many: transitions count, not instances.
-    model, naive = linear_model_and_definition(GRID, KERNEL, threshold=threshold, max_instances=max_instances)
+    model, naive = linear_models.linear_model_and_definition(GRID, KERNEL, threshold=threshold, max_instances=max_instances)
     learner = naive if max_instances is None else NaiveReplacement(naive, max_instances)
     highest = 1.0
     for transition in [*uninformative(2, 120), outcome_at(0.5, *outcome), *uninformative(3, 20)]:
-        learn_linear(model, learner, [transition])
+        linear_models.learn_linear(model, learner, [transition])
         assert_same_knowledge(model, naive)
         highest = max(highest, naive.narrowing)
     assert 2.0 <= highest <= 64.0 and naive.narrowing == 1.0
-    assert_same_sums(model, naive)
-    finish_episode(model)
-    assert assert_same_fits(model, naive) > 0
+    linear_models.assert_same_sums(model, naive)
+    linear_models.finish_episode(model)
+    assert linear_models.assert_same_fits(model, naive) > 0
 
 
 @pytest.mark.parametrize("n", [CHECKED_EVERY - 5, CHECKED_EVERY + 5, 2 * CHECKED_EVERY + 30])
 def test_how_narrow_it_is_is_saved_and_restored(n):
-    model, restored = (make_linear_model(GRID, KERNEL, threshold=THRESHOLD) for _ in range(2))
+    model, restored = (linear_models.make_linear_model(GRID, KERNEL, threshold=THRESHOLD) for _ in range(2))
     learn(model, uninformative(4, n))
     narrowing = narrowing_of(model)
     assert (narrowing > 1.0) == (n > CHECKED_EVERY)
-    assert_restored(model, restored, [])
+    linear_models.assert_restored(model, restored, [])
     assert narrowing_of(restored) == narrowing
     # Transitions after which it is looked at again, and the first outcome.
-    assert_restored(model, restored, [*uninformative(5, CHECKED_EVERY), outcome_at(0.5, *AN_END)])
+    linear_models.assert_restored(model, restored, [*uninformative(5, CHECKED_EVERY), outcome_at(0.5, *AN_END)])
     assert narrowing_of(model) == narrowing_of(restored) == 1.0
 
 
 def test_an_outcome_whose_instance_has_been_replaced_is_remembered_after_loading():
-    model, restored = (make_linear_model(GRID, KERNEL, threshold=THRESHOLD, max_instances=5) for _ in range(2))
+    model, restored = (linear_models.make_linear_model(GRID, KERNEL, threshold=THRESHOLD, max_instances=5) for _ in range(2))
     learn(model, [outcome_at(0.5, *AN_END), *uninformative(6, 90)])
     assert not model.instances.terminated[:, :5].any()
-    finish_episode(model)
+    linear_models.finish_episode(model)
     restored.set_state(model.get_state())
     for transition in uninformative(7, 2 * CHECKED_EVERY):
         model.update_rows(model.add(*transition))

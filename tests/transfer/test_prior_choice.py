@@ -10,15 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel.transfer.equations import division_score, prediction_compliances, running_scales
+from sb3_combrel.transfer.prior import prior_choice
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.prior.prior_choice import (
-    MIN_GAIN,
-    best_division,
-    choose_factored,
-    choose_mapping,
-    draw_factored,
-    draw_mapping,
-)
 
 
 def all_divisions(members):
@@ -41,7 +34,7 @@ def test_the_best_division_is_the_best_of_all(seed, n_variables, n_copies):
         left = ~members[list(chosen)].any(axis=0) if chosen else np.ones(n_variables, dtype=bool)
         return scores[list(chosen)].sum() + stays[left].sum()
 
-    found = best_division(members, scores, stays)
+    found = prior_choice.best_division(members, scores, stays)
     assert (members[found].sum(axis=0) <= 1).all()
     assert total(tuple(found)) == pytest.approx(max(map(total, all_divisions(members))))
 
@@ -65,9 +58,11 @@ def test_the_division_found_has_the_highest_score_of_all():
 
     def score(chosen):
         left = [v for v in range(4) if not (copies.state[list(chosen), v] >= 0).any()]
-        return division_score([*(parts[c] for c in chosen), *(stays[v] for v in left)], actions, 4 - len(left), MIN_GAIN)
+        return division_score(
+            [*(parts[c] for c in chosen), *(stays[v] for v in left)], actions, 4 - len(left), prior_choice.MIN_GAIN
+        )
 
-    found = choose_factored(copies, sums)
+    found = prior_choice.choose_factored(copies, sums)
     chosen = tuple(sorted({c for c in found.copies[0].tolist() if c >= 0}))
     assert score(chosen) == pytest.approx(max(score(d) for d in all_divisions(copies.state >= 0)), rel=1e-6)
 
@@ -75,7 +70,7 @@ def test_the_division_found_has_the_highest_score_of_all():
 @pytest.mark.parametrize(("n_copies", "order"), [(1, None), (2, (0, 2, 1, 3)), (2, (3, 0, 2, 1)), (3, (4, 1, 0, 5, 3, 2))])
 def test_copies_of_exact_dynamics_are_found_with_their_actions(n_copies, order):
     mapping, copies, sums, _ = f.measured(n_copies, 100 * n_copies, order=order)
-    choice = choose_factored(copies, sums)
+    choice = prior_choice.choose_factored(copies, sums)
     chosen = {tuple(copies.state[c].tolist()): u.tolist() for c, u in zip(choice.copies[0], choice.actions.T, strict=True)}
     assert chosen == {tuple(copy.state_index.tolist()): list(copy.action) for copy in mapping.copies}
 
@@ -86,10 +81,10 @@ def test_an_action_that_was_never_taken_has_no_source_action():
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         if action != 3:
             copies.measure(state, action, effect, fresh, False)
-    choice = choose_factored(copies, fresh)
+    choice = prior_choice.choose_factored(copies, fresh)
     assert (choice.actions[3] == -1).all() and (np.delete(choice.actions, 3, axis=0) >= 0).all()
     assert copies.uses(*choice).complete.tolist() == [True, True, True, False, True]
-    single = choose_mapping(copies, fresh, np.ones((len(copies), 5, 3), dtype=bool))
+    single = prior_choice.choose_mapping(copies, fresh, np.ones((len(copies), 5, 3), dtype=bool))
     assert (single.copies[3], single.actions[3]) == (-1, -1)
 
 
@@ -98,7 +93,7 @@ def test_one_mapping_for_each_action_is_the_best_that_is_allowed():
     rng = np.random.default_rng(0)
     for _ in range(20):
         allowed = rng.random((len(copies), 5, 3)) < 0.2
-        choice = choose_mapping(copies, sums, allowed)
+        choice = prior_choice.choose_mapping(copies, sums, allowed)
         mean = np.where(allowed, sums.compliance / sums.n[:, None], -1.0)
         for a, (copy, u) in enumerate(zip(choice.copies[:, 0], choice.actions[:, 0], strict=True)):
             assert mean[copy, a, u] == mean[:, a].max()
@@ -109,13 +104,13 @@ def test_what_is_drawn_is_allowed_and_of_every_kind():
     allowed = np.zeros((len(copies), 5, 3), dtype=bool)
     allowed[[2, 4], :, 1] = allowed[4, 2] = True
     rng = np.random.default_rng(0)
-    drawn = [draw_mapping(copies, allowed, rng) for _ in range(50)]
+    drawn = [prior_choice.draw_mapping(copies, allowed, rng) for _ in range(50)]
     assert {(int(c), int(u)) for each in drawn for c, u in zip(each.copies[2], each.actions[2], strict=True)} == {
         *((2, 1), (4, 0), (4, 1), (4, 2))
     }
     seen = set()
     for _ in range(150):
-        choice = draw_factored(copies, 5, rng)
+        choice = prior_choice.draw_factored(copies, 5, rng)
         assert choice.copies.shape == choice.actions.shape == (5, 2)
         assert ((copies.state[choice.copies[0]] >= 0).sum(axis=0) == 1).all()
         seen.add(frozenset(choice.copies[0].tolist()))

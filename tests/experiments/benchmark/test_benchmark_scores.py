@@ -7,16 +7,9 @@ import pytest
 from rich.console import Console
 
 from sb3_combrel.comparison.statistics import holm
+from sb3_combrel.experiments.benchmark import report
 from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
-from sb3_combrel.experiments.benchmark.report import (
-    estimate_text,
-    note_of,
-    pair_table,
-    performance_table,
-    rank_table,
-    write_report,
-)
 from sb3_combrel.experiments.benchmark.runs import jobs_of
 from sb3_combrel.experiments.benchmark.scores import cells_of, compare, interquartile, mean_ranks, performances, ranks
 from sb3_combrel.experiments.suite.tasks import Source
@@ -87,7 +80,7 @@ class TestPerformance:
     def test_fewer_than_three_runs_have_no_interval(self):
         found = interquartile(np.array([1.0, 2.0]))
         assert found.mean == 1.5 and np.isnan(found.low) and np.isnan(found.high)
-        assert estimate_text(found) == "1.5"
+        assert report.estimate_text(found) == "1.5"
 
 
 class TestRanks:
@@ -104,7 +97,7 @@ class TestRanks:
         assert [each.seed for each in cells_of(pair, methods, cells["a"].outcomes, [1, 3])["a"].outcomes] == [1, 3]
         assert ranks(performances(pair, cells), cells) == {"a": 2.0, "b": 1.0, "c": 1.0, "d": 3.0}
         compared = compare(pair, cells)
-        assert note_of("b", cells["b"]) == "the same as c"
+        assert report.note_of("b", cells["b"]) == "the same as c"
         np.testing.assert_array_equal(compared["b"].performance, compared["c"].performance)
 
     def test_a_method_is_run_by_itself_where_the_one_that_makes_the_same_is_not_chosen(self):
@@ -112,7 +105,7 @@ class TestRanks:
         jobs = jobs_of([pair], methods, range(5), {pair.name: ()})
         assert [job.method for job in jobs[:2]] == [NONE, "b"]
         cells = cells_of(pair, methods, [job.result([1 + job.seed], [1.0], [True], 1) for job in jobs], range(5))
-        assert len(cells["b"].outcomes) == 5 and note_of("b", cells["b"]) == ""
+        assert len(cells["b"].outcomes) == 5 and report.note_of("b", cells["b"]) == ""
 
     def test_the_table_says_where_seeds_make_no_difference(self):
         pair, methods = pair_of(), [method_of(NONE), method_of("a")]
@@ -120,7 +113,7 @@ class TestRanks:
         differs = outcome(pair.name, "a", 3, [2.0, 1.0])
         notes = {}
         for runs in (same[:1], same, [*same, differs]):
-            notes[len(runs)] = note_of("a", cells_of(pair, methods, runs, range(4))["a"])
+            notes[len(runs)] = report.note_of("a", cells_of(pair, methods, runs, range(4))["a"])
         assert notes == {1: "", 3: "all runs alike", 4: ""}
 
     def test_mean_ranks_are_those_of_a_naive_computation(self):
@@ -234,7 +227,7 @@ class TestTables:
 
     def test_a_row_for_each_method(self, found):
         pair, cells, compared, _ = found
-        table = pair_table(pair, cells, compared)
+        table = report.pair_table(pair, cells, compared)
         rows = {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
         assert [rows[name]["runs"] for name in (NONE, "a", "b", "c")] == ["5", "5", "", "4"]
         assert [rows[name]["rank"] for name in (NONE, "a", "c")] == ["2", "1", "3"]
@@ -244,13 +237,13 @@ class TestTables:
 
     def test_better_and_worse_than_none_are_counted(self, found):
         pair, cells, compared, _ = found
-        table = rank_table(self.METHODS, {pair.name: cells}, {pair.name: compared})
+        table = report.rank_table(self.METHODS, {pair.name: cells}, {pair.name: compared})
         assert [row[0] for row in table.rows] == ["a", NONE, "c", "b"]
         assert [row[-2:] for row in table.rows] == [("1", "0"), ("-", "-"), ("0", "1"), ("", "")]
 
     def test_performance_of_all_pairs(self, found):
         pair, cells, compared, _ = found
-        table = performance_table([pair], self.METHODS, {pair.name: cells}, {pair.name: compared})
+        table = report.performance_table([pair], self.METHODS, {pair.name: cells}, {pair.name: compared})
         assert [row[1].endswith(end) for row, end in zip(table.rows, (" (2)", "* (1)", "", "* (3)"), strict=True)] == [
             True
         ] * 4
@@ -259,7 +252,7 @@ class TestTables:
     def test_a_report_without_any_run(self, tmp_path):
         pair = pair_of()
         outcomes = [outcome("made-up", each.name, 0, [], error="RuntimeError: never") for each in self.METHODS]
-        made = write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], Console(quiet=True))
+        made = report.write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], Console(quiet=True))
         assert all(path.exists() for path in made) and "RuntimeError: never" in (tmp_path / "made-up.md").read_text()
 
 

@@ -13,16 +13,8 @@ from scipy import stats
 from sb3_combrel import SourceInstances
 from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.suite import command as suite
-from sb3_combrel.experiments.suite.measures import (
-    failures,
-    mean_return_in,
-    mean_steps_in,
-    steps_in,
-    steps_until_always,
-    steps_until_median,
-    summary_of_evaluation,
-    summary_of_learning,
-)
+from sb3_combrel.experiments.suite import measures
+from sb3_combrel.experiments.suite.measures import failures
 from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
 from sb3_combrel.experiments.suite.runs import Variant
 from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Source, Task, tasks_of
@@ -32,7 +24,9 @@ from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.episodes import Episodes
 from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
-SMALL = Task("small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(steps_in(1, 3),), headline="steps_1_to_3")
+SMALL = Task(
+    "small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(measures.steps_in(1, 3),), headline="steps_1_to_3"
+)
 SHORT = Task("short", partial(make_point_robot, 2), n_steps=500)
 VARIANTS = [Variant("default"), Variant("narrow", {"model_breadth": 0.05})]
 
@@ -176,22 +170,22 @@ def test_every_task_can_be_learnt_and_has_its_headline(name):
 def test_measures_of_hand_made_episodes():
     steps = [100, 40, 30, 60, 20, 25, 27, 26, 20]
     episodes = Episodes.from_rows([(n, -float(n), True) for n in steps])
-    assert steps_in(1, 3).of(episodes) == 170
-    assert mean_steps_in(4, 5).of(episodes) == 40
-    assert np.isnan(steps_in(1, 10).of(episodes))
-    assert mean_return_in(1, 3).of(episodes._replace(returns=np.arange(9.0) ** 2)) == pytest.approx(5 / 3)
-    assert np.isnan(mean_return_in(1, 10).of(episodes)) and mean_return_in(1, 1).higher_is_better
-    assert steps_until_always(27).of(episodes) == 230
-    assert steps_until_always(59).of(episodes) == 230
-    assert steps_until_always(60).of(episodes) == 100
-    assert steps_until_always(100).of(episodes) == 0
-    assert steps_until_always(26).of(episodes) == np.inf, "only two episodes follow the one of 27 steps"
-    assert steps_until_always(10).of(episodes) == np.inf
+    assert measures.steps_in(1, 3).of(episodes) == 170
+    assert measures.mean_steps_in(4, 5).of(episodes) == 40
+    assert np.isnan(measures.steps_in(1, 10).of(episodes))
+    assert measures.mean_return_in(1, 3).of(episodes._replace(returns=np.arange(9.0) ** 2)) == pytest.approx(5 / 3)
+    assert np.isnan(measures.mean_return_in(1, 10).of(episodes)) and measures.mean_return_in(1, 1).higher_is_better
+    assert measures.steps_until_always(27).of(episodes) == 230
+    assert measures.steps_until_always(59).of(episodes) == 230
+    assert measures.steps_until_always(60).of(episodes) == 100
+    assert measures.steps_until_always(100).of(episodes) == 0
+    assert measures.steps_until_always(26).of(episodes) == np.inf, "only two episodes follow the one of 27 steps"
+    assert measures.steps_until_always(10).of(episodes) == np.inf
     # The medians of five: 40, 30, 27, 26, 25.
-    assert steps_until_median(30).of(episodes) == sum(steps[:6])
-    assert steps_until_median(24).of(episodes) == np.inf
+    assert measures.steps_until_median(30).of(episodes) == sum(steps[:6])
+    assert measures.steps_until_median(24).of(episodes) == np.inf
     none = Episodes.from_rows([])
-    assert steps_until_always(27).of(none) == np.inf and steps_until_median(27).of(none) == np.inf
+    assert measures.steps_until_always(27).of(none) == np.inf and measures.steps_until_median(27).of(none) == np.inf
 
 
 def test_failures_and_summaries_of_hand_made_episodes():
@@ -199,14 +193,14 @@ def test_failures_and_summaries_of_hand_made_episodes():
     np.testing.assert_array_equal(failures(episodes, None), [True, *[False] * 8, True, False])
     np.testing.assert_array_equal(failures(episodes, -60.0), [True, *[False] * 9, True])
     # The first of the eleven episodes is not among the last ten.
-    assert summary_of_learning(episodes, None) == {"last10_return": (8 * -50 + 499 - 60) / 10, "last10_failed": 0.1}
-    assert np.isnan(summary_of_learning(Episodes.from_rows([]), None)["last10_return"])
+    assert measures.summary_of_learning(episodes, None) == {"last10_return": (8 * -50 + 499 - 60) / 10, "last10_failed": 0.1}
+    assert np.isnan(measures.summary_of_learning(Episodes.from_rows([]), None)["last10_return"])
     played = Episodes.from_rows([(100, -100.0, True), (110, -110.0, True)])
-    summary = summary_of_evaluation(played, None, -100.0)
+    summary = measures.summary_of_evaluation(played, None, -100.0)
     assert summary == {"mean": -105.0, "worst": -110.0, "failures": 0, "as_good": 1.0}
-    assert summary_of_evaluation(played, None, -99.0)["as_good"] == 0.0
-    assert summary_of_evaluation(played, -110.0, -100.0)["as_good"] == 0.0, "one has failed"
-    assert summary_of_evaluation(played, None, np.nan)["as_good"] == 0.0, "there is nothing to compare with"
+    assert measures.summary_of_evaluation(played, None, -99.0)["as_good"] == 0.0
+    assert measures.summary_of_evaluation(played, -110.0, -100.0)["as_good"] == 0.0, "one has failed"
+    assert measures.summary_of_evaluation(played, None, np.nan)["as_good"] == 0.0, "there is nothing to compare with"
 
 
 def test_noisy_actions_are_drawn_by_the_environments_seed():

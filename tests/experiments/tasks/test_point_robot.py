@@ -12,15 +12,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from sb3_combrel import FittedRMax
 from sb3_combrel.experiments.suite.tasks import TASKS
-from sb3_combrel.experiments.tasks.point_robot import (
-    MAX_EPISODE_STEPS,
-    STEP,
-    WALLS,
-    PointRobotEnv,
-    make_point_robot,
-    move,
-    slab,
-)
+from sb3_combrel.experiments.tasks import point_robot
 from sb3_combrel.runs.episodes import EpisodeRecorder
 
 
@@ -28,8 +20,8 @@ from sb3_combrel.runs.episodes import EpisodeRecorder
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("n_variables", [2, 3])
 def test_environment_checkers_accept_it(n_variables, noise, start):
-    check_env(PointRobotEnv(n_variables, noise, start), skip_render_check=True)
-    check_env_for_sb3(PointRobotEnv(n_variables, noise, start))
+    check_env(point_robot.PointRobotEnv(n_variables, noise, start), skip_render_check=True)
+    check_env_for_sb3(point_robot.PointRobotEnv(n_variables, noise, start))
 
 
 def move_in_tiny_steps(position, displacement, walls, n=500):
@@ -50,13 +42,13 @@ def move_in_tiny_steps(position, displacement, walls, n=500):
 def test_a_move_ends_at_the_first_wall_or_boundary_in_its_way(seed, n_variables):
     rng = np.random.default_rng(seed)
     position = rng.random(n_variables)
-    walls = WALLS[n_variables]
+    walls = point_robot.WALLS[n_variables]
     # A start in a wall is moved beside one, where something is to be seen.
     if any(wall.contains(position) for wall in walls):
         position[0] = rng.choice([0.29, 0.37, 0.63, 0.71])
     displacement = rng.uniform(-0.5, 0.5, n_variables)
     expected = move_in_tiny_steps(position, displacement, walls)
-    found = move(position, displacement, walls)
+    found = point_robot.move(position, displacement, walls)
     np.testing.assert_allclose(found, expected, atol=np.abs(displacement).max() / 500 + 1e-9)
     assert not any(wall.contains(found) for wall in walls)
 
@@ -67,7 +59,7 @@ def test_a_slab_is_all_of_a_layer_but_its_gap(seed, n_variables):
     rng = np.random.default_rng(seed)
     axis = int(rng.integers(n_variables))
     gap = [(low, high) if rng.random() < 0.7 else (0.0, 1.0) for low, high in np.sort(rng.random((n_variables - 1, 2)))]
-    walls = slab(axis, 0.4, 0.5, gap)
+    walls = point_robot.slab(axis, 0.4, 0.5, gap)
     others = [other for other in range(n_variables) if other != axis]
     for position in rng.random((60, n_variables)):
         position[axis] = rng.choice([position[axis], 0.45])
@@ -77,19 +69,19 @@ def test_a_slab_is_all_of_a_layer_but_its_gap(seed, n_variables):
 
 
 def test_starts_rewards_and_ends():
-    fixed = make_point_robot(3)
+    fixed = point_robot.make_point_robot(3)
     first, _ = fixed.reset(seed=0)
     second, _ = fixed.reset(seed=1)
     np.testing.assert_array_equal(first, second)
-    env = PointRobotEnv(2, start="random")
+    env = point_robot.PointRobotEnv(2, start="random")
     starts = np.array([env.reset(seed=0 if n == 0 else None)[0] for n in range(300)])
     assert len(np.unique(starts, axis=0)) == 300
     assert not any(wall.contains(start) for wall in env.walls for start in starts)
     assert not (starts >= env.goal.low.astype(np.float32)).all(axis=1).any()
     # Down, into the corner, 400 times; then the same without walls, up, to the goal.
-    outcomes = [fixed.step(0)[1:4] for _ in range(MAX_EPISODE_STEPS)]
-    assert outcomes == [(-1.0, False, False)] * (MAX_EPISODE_STEPS - 1) + [(-1.0, False, True)]
-    env = PointRobotEnv(2)
+    outcomes = [fixed.step(0)[1:4] for _ in range(point_robot.MAX_EPISODE_STEPS)]
+    assert outcomes == [(-1.0, False, False)] * (point_robot.MAX_EPISODE_STEPS - 1) + [(-1.0, False, True)]
+    env = point_robot.PointRobotEnv(2)
     env.walls = ()
     env.reset(seed=0)
     outcomes = [env.step(action) for action in [1] * 13 + [3] * 13]
@@ -100,7 +92,7 @@ def test_starts_rewards_and_ends():
 
 def test_noise_is_the_seeds_and_of_the_size_that_was_asked_for():
     def walk(seed):
-        env = PointRobotEnv(3, noise=0.01)
+        env = point_robot.PointRobotEnv(3, noise=0.01)
         positions = [env.reset(seed=seed)[0]]
         positions += [env.step(action)[0] for action in [1, 0] * 200]
         return np.diff(positions, axis=0)
@@ -108,18 +100,18 @@ def test_noise_is_the_seeds_and_of_the_size_that_was_asked_for():
     np.testing.assert_array_equal(walk(3), walk(3))
     moves = walk(3)
     assert (moves != walk(4)).any()
-    free = moves[:, 0] - STEP * np.tile([1, -1], 200)
+    free = moves[:, 0] - point_robot.STEP * np.tile([1, -1], 200)
     assert np.std(free[np.abs(free) < 0.05]) == pytest.approx(0.01, rel=0.15)
 
 
 @pytest.mark.parametrize("argument", [dict(n_variables=4), dict(noise=-0.1), dict(noise=np.nan), dict(start="middle")])
 def test_bad_input_is_refused(argument):
     with pytest.raises(ValueError, match=next(iter(argument))):
-        PointRobotEnv(**argument)
+        point_robot.PointRobotEnv(**argument)
 
 
 def test_bad_actions_and_steps_before_reset_are_refused():
-    env = PointRobotEnv(2)
+    env = point_robot.PointRobotEnv(2)
     with pytest.raises(gym.error.ResetNeeded):
         env.step(0)
     env.reset(seed=0)
