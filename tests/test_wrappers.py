@@ -109,17 +109,10 @@ def test_the_wrapper_is_made_again_from_its_specification_and_pickled():
 @pytest.mark.parametrize(
     ("pairs", "message"),
     [
-        (None, "not known"),
-        ([], r"got \[\]"),
-        ([(0, 0)], r"got \[\(0, 0\)\]"),
-        ([(0, 1), (1, 2)], "each index once"),
-        ([(0, 5)], "whole number from 0 to 4, got 5"),
-        ([(0, -1)], "got -1"),
-        ([(0, 1.0)], "got 1.0"),
-        ([0, 1], r"got \[0, 1\]"),
-        ("01", "got '01'"),
-        ([(0, 1, 2)], r"got \[\(0, 1, 2\)\]"),
-        ([(0, 2)], "variable 2 is from -8 to 8"),
+        *[(None, "not known"), ([], r"got \[\]"), ([(0, 0)], r"got \[\(0, 0\)\]")],
+        *[([(0, 1), (1, 2)], "each index once"), ([(0, 5)], "whole number from 0 to 4, got 5"), ([(0, -1)], "got -1")],
+        *[([(0, 1.0)], "got 1.0"), ([0, 1], r"got \[0, 1\]"), ("01", "got '01'")],
+        *[([(0, 1, 2)], r"got \[\(0, 1, 2\)\]"), ([(0, 2)], "variable 2 is from -8 to 8")],
     ],
 )
 def test_wrong_pairs_are_named(pairs, message):

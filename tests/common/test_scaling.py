@@ -61,14 +61,9 @@ def test_a_space_that_is_unbounded_or_as_large_as_the_largest_float_needs_bounds
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        (7, "got bounds=7"),
-        ((0,), r"got bounds=\(0,\)"),
-        (([0, 1, 2], 3), r"low of shape \(3,\)"),
-        ((0, 0), "low=0.0 and high=0.0 for variable 0"),
-        (([0, 2], [1, 1]), "low=2.0 and high=1.0 for variable 1"),
-        ((np.nan, 1), "low of nan"),
-        ((0, np.inf), "high of inf"),
-        (([0, "a"], 3), "got bounds="),
+        *[(7, "got bounds=7"), ((0,), r"got bounds=\(0,\)"), (([0, 1, 2], 3), r"low of shape \(3,\)")],
+        *[((0, 0), "low=0.0 and high=0.0 for variable 0"), (([0, 2], [1, 1]), "low=2.0 and high=1.0 for variable 1")],
+        *[((np.nan, 1), "low of nan"), ((0, np.inf), "high of inf"), (([0, "a"], 3), "got bounds=")],
     ],
 )
 def test_wrong_bounds_are_named_with_their_value(bounds, message):
@@ -95,13 +90,9 @@ def test_other_spaces_are_refused(space, message):
 @pytest.mark.parametrize(
     ("low", "high", "message"),
     [
-        ([0, 0], [1], "same length"),
-        ([], [], "at least one"),
-        ([[0]], [[1]], "one-dimensional"),
-        ([np.nan], [1], "low must hold finite"),
-        ([1], [0], "below its upper bound"),
-        ([-1.5e308], [1.5e308], "overflows"),
-        ("ab", [1], "low must be"),
+        *[([0, 0], [1], "same length"), ([], [], "at least one"), ([[0]], [[1]], "one-dimensional")],
+        *[([np.nan], [1], "low must hold finite"), ([1], [0], "below its upper bound")],
+        *[([-1.5e308], [1.5e308], "overflows"), ("ab", [1], "low must be")],
     ],
 )
 @pytest.mark.filterwarnings("ignore:overflow")

@@ -19,16 +19,9 @@ def there_and_back(value):
 @pytest.mark.parametrize(
     ("value", "comes_back"),
     [
-        (None, None),
-        (True, True),
-        (3, 3),
-        (0.1 + 0.2, 0.1 + 0.2),
-        ("injective", "injective"),
-        (np.float64(0.1), 0.1),
-        (np.int32(7), 7),
-        (np.bool_(True), True),
-        (np.array([[1.5, 2.0], [3.0, 4.0]]), [[1.5, 2.0], [3.0, 4.0]]),
-        ((1, None, "x"), [1, None, "x"]),
+        *[(None, None), (True, True), (3, 3), (0.1 + 0.2, 0.1 + 0.2), ("injective", "injective")],
+        *[(np.float64(0.1), 0.1), (np.int32(7), 7), (np.bool_(True), True)],
+        *[(np.array([[1.5, 2.0], [3.0, 4.0]]), [[1.5, 2.0], [3.0, 4.0]]), ((1, None, "x"), [1, None, "x"])],
         (pathlib.PurePosixPath("a/b.npz"), "a/b.npz"),
         ({"state": (0, None), "action": [1, 0]}, {"state": [0, None], "action": [1, 0]}),
     ],
@@ -61,12 +54,7 @@ class SecretiveSet(MappingSet):
 @pytest.mark.parametrize(
     "value",
     [
-        object(),
-        {1: "one"},
-        b"bytes",
-        [[lambda n: n]],
-        np.array([object()]),
-        {KIND: "InterTaskMapping"},
+        *[object(), {1: "one"}, b"bytes", [[lambda n: n]], np.array([object()]), {KIND: "InterTaskMapping"}],
         SecretiveSet([[0, 1]], AllActionMappings(2, 2)),
     ],
     ids=["object", "number as key", "bytes", "function inside", "objects", "reserved key", "subclass"],

@@ -76,9 +76,7 @@ def test_infinite_observation_bounds_need_the_bounds_argument():
 @pytest.mark.parametrize(
     ("bounds", "expected"),
     [
-        (([-1.0, 0.0], [1.0]), "2"),
-        (("low", "high"), "bounds"),
-        ((False, True), "bounds must be"),
+        *[(([-1.0, 0.0], [1.0]), "2"), (("low", "high"), "bounds"), ((False, True), "bounds must be")],
         (([-1.0, False], [1.0, 2.0]), "bounds must be"),
     ],
 )

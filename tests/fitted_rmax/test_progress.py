@@ -26,11 +26,8 @@ def shown(watch, episodes, explores=True):
 @pytest.mark.parametrize(
     ("max_value", "gamma", "rewards", "terminated", "observed"),
     [
-        (3.0, 1.0, [1.0] * 4, False, "4"),
-        (2.9, 0.5, [-9.0, 2.0, 2.0], True, "3"),
-        (2.9, 0.5, [-9.0, 2.0, 2.0], False, None),
-        (4.0, 1.0, [1.0] * 4, True, None),
-        (0.0, 1.0, [-1.0], True, None),
+        *[(3.0, 1.0, [1.0] * 4, False, "4"), (2.9, 0.5, [-9.0, 2.0, 2.0], True, "3")],
+        *[(2.9, 0.5, [-9.0, 2.0, 2.0], False, None), (4.0, 1.0, [1.0] * 4, True, None), (0.0, 1.0, [-1.0], True, None)],
     ],
 )
 def test_returns_above_max_value_give_one_warning(max_value, gamma, rewards, terminated, observed):

@@ -13,10 +13,7 @@ N_ACTIONS = 2
 # (resolution by variable, margin), and which variables are periodic where some are: a few hundred points at most, as the
 # naive loops are slow.
 PERIODIC_GRIDS = [
-    ((3,), 1, (True,)),
-    ((2, 2), 1, (True, False)),
-    ((2, 3), 0, (False, True)),
-    ((1, 2, 1), 1, (True, False, True)),
+    *[((3,), 1, (True,)), ((2, 2), 1, (True, False)), ((2, 3), 0, (False, True)), ((1, 2, 1), 1, (True, False, True))],
 ]
 GRIDS = [((3,), 1), ((4,), 0), ((2, 2), 1), ((3, 2), 0), ((2, 1), 1), ((1, 2, 1), 0), ((1, 1, 1), 1), *PERIODIC_GRIDS]
 
@@ -28,10 +25,8 @@ def make_grid(grid):
 
 
 KERNELS = [
-    dict(breadth=0.3, min_weight=0.01, min_fraction=0.13),
-    dict(breadth=0.15, min_weight=0.01, min_fraction=0.02),
-    dict(breadth=0.5, min_weight=0.1, min_fraction=0.37),
-    dict(breadth=0.8, min_weight=0.3, min_fraction=0.9),
+    *[dict(breadth=0.3, min_weight=0.01, min_fraction=0.13), dict(breadth=0.15, min_weight=0.01, min_fraction=0.02)],
+    *[dict(breadth=0.5, min_weight=0.1, min_fraction=0.37), dict(breadth=0.8, min_weight=0.3, min_fraction=0.9)],
 ]
 
 

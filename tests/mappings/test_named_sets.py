@@ -33,9 +33,7 @@ class TestPaperSets:
             assert action[0] % 2 == 1
         # Table 4, columns T1- T1+ ... T4+.
         table = [
-            "S1+ S1- S2+ S2- S2- S2+ S1+ S1-",
-            "S1+ S1- S2+ S2- S2+ S2- S1+ S1-",
-            "S1+ S1- S2+ S2- S1- S1+ S2+ S2-",
+            *("S1+ S1- S2+ S2- S2- S2+ S1+ S1-", "S1+ S1- S2+ S2- S2+ S2- S1+ S1-", "S1+ S1- S2+ S2- S1- S1+ S2+ S2-"),
             "S1+ S1- S1+ S1- S2- S2+ S2+ S2-",
         ]
         code = {"S1-": 0, "S1+": 1, "S2-": 2, "S2+": 3}

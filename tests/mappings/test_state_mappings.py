@@ -56,10 +56,8 @@ class TestStateMappings:
     @pytest.mark.parametrize(
         ("name", "sizes", "message"),
         [
-            ("injective", (9, 9), "362,880"),
-            ("signed_all", (20, 40), ""),
-            ("surjective", (50, 100), r"about 10\^166"),
-            ("signed_surjective", (1, 70), r"about 10\^21"),
+            *[("injective", (9, 9), "362,880"), ("signed_all", (20, 40), "")],
+            *[("surjective", (50, 100), r"about 10\^166"), ("signed_surjective", (1, 70), r"about 10\^21")],
         ],
     )
     def test_too_many_state_mappings_are_refused_before_they_are_built(self, name, sizes, message):

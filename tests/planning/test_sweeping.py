@@ -62,9 +62,7 @@ def walk(seed, n, n_variables=2, goal=0.8, reward=lambda rng: -1.0):
 @pytest.mark.parametrize(
     ("resolution", "margin", "gamma", "max_value", "periodic"),
     [
-        ((4,), 0, 0.97, 10.0, None),
-        ((1, 2, 1), 0, 0.8, 3.0, None),
-        ((2, 2), 1, 1.0, 0.0, None),
+        *[((4,), 0, 0.97, 10.0, None), ((1, 2, 1), 0, 0.8, 3.0, None), ((2, 2), 1, 1.0, 0.0, None)],
         ((2, 3), 0, 0.9, 5.0, (False, True)),
     ],
 )

@@ -68,15 +68,10 @@ def test_no_damage_escapes_as_another_error(data):
 @pytest.mark.parametrize(
     "change",
     [
-        {"header": np.array("not json")},
-        {"header": {"format": "other"}},
-        {"header": {"version": 99}},
-        {"header": {"n_actions": 2.5}},
-        {"header": {"state_names": None}},
-        {"header": np.array([{"pickled": "object"}], dtype=object)},
-        {"states": None},
-        {"rewards": np.full(5, np.nan)},
-        {"actions": np.full((5, 1), 2**63, dtype=np.uint64)},
+        *[{"header": np.array("not json")}, {"header": {"format": "other"}}, {"header": {"version": 99}}],
+        *[{"header": {"n_actions": 2.5}}, {"header": {"state_names": None}}],
+        *[{"header": np.array([{"pickled": "object"}], dtype=object)}, {"states": None}],
+        *[{"rewards": np.full(5, np.nan)}, {"actions": np.full((5, 1), 2**63, dtype=np.uint64)}],
     ],
 )
 def test_archives_with_other_contents_are_reported(change):

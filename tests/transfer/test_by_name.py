@@ -161,11 +161,8 @@ def test_arguments_of_both_and_defaults_leave_it_open():
 @pytest.mark.parametrize(
     ("mappings", "use"),
     [
-        ("injective", "instances"),
-        ("signed_all", "instances"),
-        ({"state": [0, 1], "action": [0, 1]}, "instances"),
-        ("factored", "prior"),
-        ("signed_factored", "prior"),
+        *[("injective", "instances"), ("signed_all", "instances"), ({"state": [0, 1], "action": [0, 1]}, "instances")],
+        *[("factored", "prior"), ("signed_factored", "prior")],
         (FactoredMapping([{"state": [0, 1], "action": [0, 1]}]), "prior"),
     ],
     ids=str,

@@ -129,9 +129,7 @@ class TestChain:
         checkpoints = {f"rl_model_{steps}_steps.zip" for steps in (200, 400, 600)}
         assert {path.name for path in folder.glob("*.zip")} == {"best_model.zip", f"{IN_LOGS}.zip", *checkpoints}
         for which, file in (
-            ((), IN_LOGS),
-            (("--load-best",), "best_model"),
-            (("--load-checkpoint", 200), "rl_model_200"),
+            *[((), IN_LOGS), (("--load-best",), "best_model"), (("--load-checkpoint", 200), "rl_model_200")],
             (("--load-last-checkpoint",), "rl_model_600"),
         ):
             assert enjoy(logs, *which) == 0 and file in capsys.readouterr().out

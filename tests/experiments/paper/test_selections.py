@@ -43,10 +43,8 @@ class TestTables:
         table = action_mapping_table(results, ACTIONS)
         assert table.header == ("mapping", *ACTIONS, "all")
         assert table.rows == [
-            ("NLR", "-", "80.0", "25.0", "64.3"),
-            ("NRL", "-", "20.0", "75.0", "35.7"),
-            ("0 others", "-", "0.0", "0.0", "0.0"),
-            ("selections", "0", "10", "4", "14"),
+            *[("NLR", "-", "80.0", "25.0", "64.3"), ("NRL", "-", "20.0", "75.0", "35.7")],
+            *[("0 others", "-", "0.0", "0.0", "0.0"), ("selections", "0", "10", "4", "14")],
         ]
 
     def test_rare_action_mappings_are_counted_together(self):

@@ -139,11 +139,8 @@ def test_seeds_and_tasks_are_read_from_text():
 @pytest.mark.parametrize(
     "change",
     [
-        dict(jobs=0),
-        dict(variants=[]),
-        dict(variants=[Variant("a"), Variant("a", {"resolution": 3})]),
-        dict(reference="other"),
-        dict(test="t"),
+        *[dict(jobs=0), dict(variants=[]), dict(variants=[Variant("a"), Variant("a", {"resolution": 3})])],
+        *[dict(reference="other"), dict(test="t")],
     ],
 )
 def test_bad_input_is_refused(tmp_path, change):

@@ -62,10 +62,7 @@ def test_the_right_mapping_undoes_the_order():
 @pytest.mark.parametrize(
     "arguments",
     [
-        dict(half_length=0.0),
-        dict(half_length=np.nan),
-        dict(order=(0, 1, 2)),
-        dict(order=(0, 1, 2, 2)),
+        *[dict(half_length=0.0), dict(half_length=np.nan), dict(order=(0, 1, 2)), dict(order=(0, 1, 2, 2))],
         dict(order=(1, 2, 3, 4)),
     ],
 )
