@@ -16,8 +16,7 @@ class TestRecord:
         status, written = call_for_all_output("record", *self.SHORT, "--output", tmp_path / "car", "--seed", "3")
         assert status == 0
         source = SourceInstances.load(tmp_path / "car.npz")
-        assert len(source) == 20
-        assert source.state_names == ("x", "v")
+        assert len(source) == 20 and source.state_names == ("x", "v")
         assert str(tmp_path / "car.npz") in written
 
     def test_a_file_is_overwritten_only_when_asked(self, tmp_path):
@@ -37,8 +36,7 @@ class TestRecord:
     def test_a_task_that_cannot_be_learned_is_named_without_a_traceback(self, tmp_path, env_id, message):
         status, written = call_for_all_output("record", env_id, "--output", tmp_path / "none.npz")
         assert status == 1
-        assert message in written
-        assert "Traceback" not in written
+        assert message in written and "Traceback" not in written
         assert not list(tmp_path.iterdir())
 
 

@@ -48,8 +48,7 @@ def test_every_folder_with_modules_is_a_package_that_is_listed():
 
 def test_versions_agree():
     version = sb3_combrel.__version__
-    assert re.fullmatch(r"\d+\.\d+\.\d+\w*", version)
-    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert re.fullmatch(r"\d+\.\d+\.\d+\w*", version) and f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"\n## [{version}] - 20" in (ROOT / "CHANGELOG.md").read_text()
 
 

@@ -103,8 +103,7 @@ def test_as_count_refuses_what_is_no_count_and_names_it(value):
 def test_as_count_converts_whole_floats(number):
     for written in (number, float(number), np.int64(number), np.float64(number)):
         count = as_count("n_things", written)
-        assert count == number
-        assert type(count) is int
+        assert count == number and type(count) is int
 
 
 @pytest.mark.parametrize("value", [*NO_COUNTS[:-3], 3.0], ids=str)

@@ -36,8 +36,7 @@ def test_each_variable_is_divided_by_its_range():
 def test_scalings_of_equal_bounds_are_equal_and_cannot_be_changed():
     low = np.array([-1.2, -0.07])
     scaling = StateScaling(low, [0.6, 0.07])
-    assert scaling == StateScaling.from_space(BOX)
-    assert hash(scaling) == hash(StateScaling.from_space(BOX))
+    assert scaling == StateScaling.from_space(BOX) and hash(scaling) == hash(StateScaling.from_space(BOX))
     assert scaling != StateScaling(low, [0.6, 0.08])
     low[0] = 5.0
     assert scaling.low[0] == -1.2

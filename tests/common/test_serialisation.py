@@ -29,8 +29,7 @@ def there_and_back(value):
 )
 def test_plain_values_and_arrays_come_back_as_plain_values(value, comes_back):
     back = there_and_back(value)
-    assert back == comes_back
-    assert type(back) is type(comes_back)
+    assert back == comes_back and type(back) is type(comes_back)
 
 
 SETS = {

@@ -141,8 +141,7 @@ def test_ratios_of_negative_returns_are_of_areas_above_a_floor():
     worse = LearningCurves(np.array([[-10.0, -6.0, -4.0], [-8.0, -8.0, -4.0]]), np.full((2, 3), 2))
     measures = measures_of(better, worse)
     # Sums -8 and -10 against -20 and -20; above -10 they are 22 and 20 against 10 and 10.
-    assert measures.floor == -10.0
-    assert measures.transfer_ratio.effect == pytest.approx(1.1)
+    assert measures.floor == -10.0 and measures.transfer_ratio.effect == pytest.approx(1.1)
     assert measures.transfer_ratio.with_transfer.tolist() == [22.0, 20.0]
     assert measures.transfer_ratio_by_steps.effect == pytest.approx(1.1)
     # Above -20 they are 52 and 50 against 40 and 40.

@@ -47,8 +47,7 @@ def test_the_interval_of_a_mean_is_students():
 @pytest.mark.parametrize(("without", "with_transfer"), [([60.0], [50.0]), ([60.0, 60.0], [50.0, 50.0])])
 def test_runs_that_allow_no_test_still_have_a_difference(without, with_transfer):
     saved = saving(np.array(without), np.array(with_transfer))
-    assert saved.steps == 10.0
-    assert np.isnan([saved.low, saved.high, saved.p_value]).all()
+    assert saved.steps == 10.0 and np.isnan([saved.low, saved.high, saved.p_value]).all()
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
@@ -267,8 +266,7 @@ def test_bad_input_is_refused(call, message):
 def test_cliffs_delta_counts_pairs(first, second):
     pairs = [1 if a > b else -1 if a < b else 0 for a in first for b in second]
     delta = cliffs_delta(first, second)
-    assert delta == pytest.approx(np.mean(pairs))
-    assert cliffs_delta(second, first) == pytest.approx(-delta)
+    assert delta == pytest.approx(np.mean(pairs)) and cliffs_delta(second, first) == pytest.approx(-delta)
     assert cliffs_delta(np.arctan(first), np.arctan(second)) == pytest.approx(delta), "any increasing function keeps it"
 
 

@@ -107,8 +107,7 @@ class TestStarts:
         env, other = gymnasium.make(env_id, start=start), gymnasium.make(env_id, start=start)
         first = [env.reset(seed=7)[0], env.reset()[0]]
         assert np.array_equal(first, [other.reset(seed=7)[0], other.reset()[0]])
-        assert not np.array_equal(first[0], first[1])
-        assert not np.array_equal(first[0], env.reset(seed=8)[0])
+        assert not np.array_equal(first[0], first[1]) and not np.array_equal(first[0], env.reset(seed=8)[0])
 
         def starts(seed):
             environment = combrel_envs.load("mountain_car", EXPECTED[env_id].task[1], {"random": seed, "start": start})
@@ -208,8 +207,7 @@ class TestPhysics:
         environment = combrel_envs.load(
             "mountain_car", "climb_4d", {"start": "fixed"}, {"flat_observation": True, "n_sub_steps": 2}
         )
-        assert environment.reset().observation["observations"].shape == (4,)
-        assert environment.control_timestep() == 2
+        assert environment.reset().observation["observations"].shape == (4,) and environment.control_timestep() == 2
         expected = expected_step(expected_step([BOTTOM, BOTTOM, 0, 0], 2), 2)
         np.testing.assert_allclose(environment.step(2).observation["observations"], expected, rtol=0, atol=1e-15)
 
@@ -222,8 +220,7 @@ class TestPhysics:
         physics.step(10)
         assert physics.push().tolist() == [1.0, 0.0] and physics.time() == 10
         physics.set_state(state)
-        assert physics.car_position().tolist() == [0.1, -0.2]
-        assert physics.car_velocity().tolist() == [0.03, 0.04]
+        assert physics.car_position().tolist() == [0.1, -0.2] and physics.car_velocity().tolist() == [0.03, 0.04]
 
     def test_the_drawn_car_stands_on_the_hill(self):
         physics = combrel_envs.load("mountain_car", "climb_4d").physics
@@ -321,8 +318,7 @@ class TestICub:
         env.close()
         assert before.shape == (240, 320, 3) and before.dtype == np.uint8
         assert 90 < before.mean() < 190 and before.std() > 25
-        assert np.mean(before > 250) < 0.05 and np.mean(before < 10) < 0.02
-        assert 0.01 < changed(before, after) < 0.3
+        assert np.mean(before > 250) < 0.05 and np.mean(before < 10) < 0.02 and 0.01 < changed(before, after) < 0.3
         # Neither drawing nor the look changes an episode.
         assert seen == observations(TORSO, plan_of(TORSO))
 

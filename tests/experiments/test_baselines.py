@@ -62,8 +62,7 @@ def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     settings = yaml.safe_load(
         (CONFIGURATIONS / {baselines.PLAIN: "dqn.yml", baselines.QUANTILE: "qrdqn.yml"}[name]).read_text()
     )[env_id]
-    assert settings.pop("n_timesteps") > 0
-    assert settings.pop("policy") == "MlpPolicy"
+    assert settings.pop("n_timesteps") > 0 and settings.pop("policy") == "MlpPolicy"
     assert settings.pop("env_wrapper") == [{"gymnasium.wrappers.RescaleObservation": {"min_obs": -1.0, "max_obs": 1.0}}]
     first_rate = float(settings.pop("learning_rate").removeprefix("lin_"))
     network = eval(settings.pop("policy_kwargs"))
@@ -74,8 +73,7 @@ def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     assert np.all(env.observation_space.low == -1.0) and np.all(env.observation_space.high == 1.0)
     model = make_model(job, env)
     frequency = settings.pop("train_freq")
-    assert model.train_freq.frequency == frequency
-    assert {key: getattr(model, key) for key in settings} == settings
+    assert model.train_freq.frequency == frequency and {key: getattr(model, key) for key in settings} == settings
     assert [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([first_rate, first_rate / 2, 0.0])
     assert model.policy.net_arch == network.pop("net_arch")
     assert {key: getattr(model.policy, key) for key in network} == network
@@ -254,8 +252,7 @@ def test_each_is_learnt_from_on_its_own():
     assert model.replay_buffer.size() == 50
     # Rewards are their numbers.
     rows = batch.rewards.numpy()[:, 0].astype(int)
-    assert len(set(rows)) == 50
-    assert np.array_equal(batch.dones.numpy()[:, 0], terminated[rows])
+    assert len(set(rows)) == 50 and np.array_equal(batch.dones.numpy()[:, 0], terminated[rows])
     assert np.array_equal(batch.actions.numpy()[:, 0], given.actions[rows])
     np.testing.assert_allclose(batch.discounts.numpy(), 0.99, atol=1e-6)
     np.testing.assert_allclose(batch.next_observations.numpy(), (2.0 * (ends - low) / (high - low) - 1.0)[rows], atol=1e-6)
@@ -286,8 +283,7 @@ def test_evaluations_are_evenly_spaced_on_a_logarithmic_axis(total):
     steps = evaluation_steps(total)
     assert steps[-1] == total and steps == sorted(set(steps)) and steps[0] >= 1
     if total > 10_000:
-        assert len(steps) == 10
-        assert np.ptp(np.diff(np.log(steps))) < 1e-3
+        assert len(steps) == 10 and np.ptp(np.diff(np.log(steps))) < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,7 @@ def test_explore_is_the_setting_of_the_zoo():
     assert learner.pop("policy") == "FittedRMaxPolicy" and learner.pop("n_timesteps") > 0
     # Nothing of the file is left out, and nothing is added.
     explore = ICUB.settings[EXPLORE]
-    assert explore.learner == learner
-    assert {"mappings": explore.mappings, **explore.combrel} == arguments
+    assert explore.learner == learner and {"mappings": explore.mappings, **explore.combrel} == arguments
     assert explore.timbrel == {key: explore.combrel[key] for key in explore.timbrel}
 
 

@@ -11,8 +11,7 @@ MARKS = "<!-- table: results/t.md, {} -->\n{}<!-- end of table -->"
 
 
 def test_tables_are_found_without_their_titles():
-    assert tables_in(TABLES) == [FIRST, SECOND]
-    assert tables_in("no table | here") == []
+    assert tables_in(TABLES) == [FIRST, SECOND] and tables_in("no table | here") == []
 
 
 def test_tables_are_filled_in_and_what_is_around_stays(tmp_path):

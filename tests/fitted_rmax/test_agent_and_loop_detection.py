@@ -43,10 +43,8 @@ def degree(case):
 def test_the_agent_learns_the_shortest_plan(degree):
     agent = square_agent(degree=degree)
     lengths = [len(actions) for actions in learn(agent, 25)]
-    assert lengths[0] > FEWEST_STEPS
-    assert lengths[-3:] == [FEWEST_STEPS] * 3
-    assert evaluate(agent) == FEWEST_STEPS
-    assert agent.q_values(START).max() == pytest.approx(-FEWEST_STEPS, abs=2.0)
+    assert lengths[0] > FEWEST_STEPS and lengths[-3:] == [FEWEST_STEPS] * 3
+    assert evaluate(agent) == FEWEST_STEPS and agent.q_values(START).max() == pytest.approx(-FEWEST_STEPS, abs=2.0)
 
 
 def test_transfer_from_the_task_itself_saves_the_agent_most_of_the_exploration():
@@ -132,8 +130,7 @@ def test_predictions_in_between_change_nothing_that_is_learned_bit_for_bit(metho
     assert learn(interrupted, 4, before_each=predict) == learn(agent, 4)
     assert_same_state(interrupted, agent)
     assert interrupted.rng.bit_generator.state == agent.rng.bit_generator.state
-    assert interrupted.n_backups == agent.n_backups
-    assert interrupted.statistics() == agent.statistics()
+    assert interrupted.n_backups == agent.n_backups and interrupted.statistics() == agent.statistics()
 
 
 @DEGREES
@@ -178,14 +175,11 @@ def test_statistics_are_those_of_model_and_planner(method, degree):
     n_steps = sum(map(len, learn(agent, 3)))
     figures = agent.statistics()
     known, modelled = agent.model.known, agent.mdp.arrays.modelled
-    assert figures["model/instances"] == n_steps
-    assert figures["model/known"] == known.mean() > 0.0
+    assert figures["model/instances"] == n_steps and figures["model/known"] == known.mean() > 0.0
     assert figures["model/transferred"] == pytest.approx((modelled & ~known).mean())
-    assert figures["model/optimistic"] == pytest.approx((~modelled).mean())
-    assert figures["model/threshold"] == 1.0
+    assert figures["model/optimistic"] == pytest.approx((~modelled).mean()) and figures["model/threshold"] == 1.0
     assert figures["planner/corrections"] == len(agent.get_state()["corrections"])
-    assert figures["planner/queued"] == agent.planner.n_queued
-    assert all(np.isfinite(value) for value in figures.values())
+    assert figures["planner/queued"] == agent.planner.n_queued and all(np.isfinite(value) for value in figures.values())
     assert bool({name for name in figures if name.startswith("transfer/")}) == (method != "none")
     if method != "none":
         assert figures["transfer/instances_used"] > 0

@@ -107,8 +107,7 @@ def test_observations_outside_the_bounds_count_as_the_boundary_with_one_warning(
         model.learn(40)
     assert sum("outside the bounds" in str(w.message) for w in caught) == 1
     states, effects = states_and_effects(model)
-    assert len(states) == 40
-    assert ((states >= 0.0) & (states <= 1.0)).all()
+    assert len(states) == 40 and ((states >= 0.0) & (states <= 1.0)).all()
     assert (np.abs(states + effects - 0.5) <= 0.5 + 1e-12).all()
 
 
@@ -373,5 +372,4 @@ def test_a_plane_shows_each_point_of_a_periodic_variable_once(across, up):
 def test_a_plane_through_the_end_of_a_periodic_variable_goes_through_its_beginning():
     grid, scaling = StateGrid(3, 2, 0, (True, False, False)), StateScaling([0.0] * 3, [1.0] * 3)
     plane = plane_through(grid, scaling, ("a", "b", "c"), (1, 2), at=[0.99, 0.5, 0.5])
-    assert plane.held == "a = 0"
-    assert (grid.states_of(plane.points.ravel())[:, 0] == 0.0).all()
+    assert plane.held == "a = 0" and (grid.states_of(plane.points.ravel())[:, 0] == 0.0).all()

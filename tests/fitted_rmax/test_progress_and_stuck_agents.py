@@ -66,8 +66,7 @@ def test_equal_returns_give_one_warning_while_exploration_goes_on():
     alike = ([-1.0, -1.0], False)
     watch = ProgressWatch(7.0, 0.95, 1e-3)
     [(number, message)] = shown(watch, [([-1.0], True), *[alike] * 3, ([-1.0], False), *[alike] * 60])
-    assert number == 5 + EQUAL_RETURNS
-    assert f"the last {EQUAL_RETURNS} returns are all -2" in message
+    assert number == 5 + EQUAL_RETURNS and f"the last {EQUAL_RETURNS} returns are all -2" in message
     assert "max_value=7" in message and "model_breadth" in message
 
 

@@ -26,8 +26,7 @@ def check_against_members(mapping_set, n_source_actions):
         states, source_actions = mapping_set.candidates(a)
         assert states.dtype == source_actions.dtype == np.int64
         found = [(rows[s], b) for s, b in zip(states.tolist(), source_actions.tolist(), strict=True)]
-        assert len(found) == len(expected)
-        assert set(found) == expected
+        assert len(found) == len(expected) and set(found) == expected
         assert mapping_set.source_actions_for(a).tolist() == sorted({b for _, b in expected})
         for s, row in enumerate(rows):
             for b in range(n_source_actions):
@@ -99,8 +98,7 @@ class TestMappingSet:
 
     def test_sets_of_any_size_have_members_by_number(self):
         mapping_set, balanced = MappingSet.injective(1, 1, 10, 30), MappingSet.balanced(2, 4, 8, 16)
-        assert mapping_set.n_mappings == 10**30
-        assert mapping_set[10**30 - 1].action == (9,) * 30
+        assert mapping_set.n_mappings == 10**30 and mapping_set[10**30 - 1].action == (9,) * 30
         assert repr(mapping_set) == "<about 10^30 mappings: 1 state mappings x about 10^30 action mappings>"
         assert len(balanced) == 12 * 81_729_648_000
         assert balanced[-1].action == tuple(b for b in range(7, -1, -1) for _ in range(2))
@@ -193,8 +191,7 @@ class TestInterTaskMapping:
 
     def test_arrays_for_compiled_loops(self):
         mapping = InterTaskMapping((0, None, 1, None), (0,), (1, 1, -1, -1))
-        assert mapping.state_index.dtype == np.int64
-        assert mapping.state_index.tolist() == [0, -1, 1, -1]
+        assert mapping.state_index.dtype == np.int64 and mapping.state_index.tolist() == [0, -1, 1, -1]
         # The sign of an unmapped variable has no effect, so it does not make mappings differ either.
         assert mapping.state_sign.tolist() == [1.0, 1.0, -1.0, 1.0]
         assert mapping == InterTaskMapping([0, None, np.int64(1), None], [0], np.array([1, 1, -1, 1]))

@@ -33,8 +33,7 @@ BY_NAME = {
 @pytest.mark.parametrize("name", BY_NAME)
 def test_names_stand_for_numbers_once_both_tasks_are_known(name):
     mapping = BY_NAME[name]
-    assert mapping.has_names and not BY_NUMBER.has_names
-    assert mapping.with_names(*CAR) == BY_NUMBER
+    assert mapping.has_names and not BY_NUMBER.has_names and mapping.with_names(*CAR) == BY_NUMBER
     assert mapping.with_names(*CAR).names == CAR
     assert InterTaskMapping(mapping.state, mapping.action, mapping.sign, names=CAR) == BY_NUMBER
 
@@ -169,8 +168,7 @@ def test_it_says_what_each_target_action_does_to_each_copy():
 
 def test_without_names_its_repr_makes_it_again():
     mapping = FactoredMapping([SECOND, FIRST])
-    assert eval(repr(mapping)) == mapping
-    assert mapping.copies == (FIRST, SECOND)
+    assert eval(repr(mapping)) == mapping and mapping.copies == (FIRST, SECOND)
 
 
 def test_it_is_written_as_plain_data_and_read_again_and_made_of_dicts():

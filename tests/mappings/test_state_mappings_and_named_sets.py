@@ -50,8 +50,7 @@ class TestStateMappings:
             for sign in itertools.product((1, -1), repeat=n_target)
         }
         found = list(MappingSet.all(n_source, n_target, 1, 1, signs=True))
-        assert found == list(MappingSet.from_name("signed_all", n_source, n_target, 1, 1))
-        assert set(found) == expected
+        assert found == list(MappingSet.from_name("signed_all", n_source, n_target, 1, 1)) and set(found) == expected
         assert len(found) == len(expected)
 
     @pytest.mark.parametrize(
@@ -100,8 +99,7 @@ class TestPaperSets:
     def test_the_papers_mountain_car_set_has_24_state_and_90_action_mappings(self):
         mapping_set = MappingSet.paper_mountain_car()
         assert (mapping_set.n_state_mappings, mapping_set.n_action_mappings, len(mapping_set)) == (24, 90, 2160)
-        assert len(set(mapping_set)) == 1080
-        assert set(mapping_set) == set(MappingSet.balanced(**MOUNTAIN_CAR))
+        assert len(set(mapping_set)) == 1080 and set(mapping_set) == set(MappingSet.balanced(**MOUNTAIN_CAR))
         assert len(mapping_set.candidates(0).state_index) == 12 * 3
         # Table 2: Left, Neutral, Right are source actions 1, 0, 2.
         table = "LLRNR LNRNR RNLRL RLLRN LNLRR NLRLR RNRLL LNRRN LNRRL".split()
@@ -116,10 +114,8 @@ class TestPaperSets:
         assert len(actions) == 48
         for action in actions:
             joints = [b // 2 for b in action]
-            assert joints[::2] == joints[1::2]
-            assert sorted(joints[::2]) == [0, 0, 1, 1]
-            assert all({action[2 * j] % 2, action[2 * j + 1] % 2} == {0, 1} for j in range(4))
-            assert action[0] % 2 == 1
+            assert joints[::2] == joints[1::2] and sorted(joints[::2]) == [0, 0, 1, 1]
+            assert all({action[2 * j] % 2, action[2 * j + 1] % 2} == {0, 1} for j in range(4)) and action[0] % 2 == 1
         # Table 4, columns T1- T1+ ... T4+.
         table = [
             *("S1+ S1- S2+ S2- S2- S2+ S1+ S1-", "S1+ S1- S2+ S2- S2+ S2- S1+ S1-", "S1+ S1- S2+ S2- S1- S1+ S2+ S2-"),

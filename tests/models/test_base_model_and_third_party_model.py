@@ -220,8 +220,7 @@ def test_a_third_party_model_learns_the_shortest_plan(transfer):
         mean, deviation = evaluate_policy(model, Monitor(Walk(start=start)), n_eval_episodes=2)
         assert mean == pytest.approx(-fewest, abs=1.0) and deviation == 0.0
     figures = model.agent.statistics()
-    assert figures["model/instances"] == 300
-    assert 0.0 < figures["model/known"] == model.agent.model.known.mean()
+    assert figures["model/instances"] == 300 and 0.0 < figures["model/known"] == model.agent.model.known.mean()
 
 
 def test_a_third_party_model_is_saved_loaded_and_learns_on_as_the_original(transfer, tmp_path):

@@ -129,8 +129,7 @@ def test_lists_rows_and_instances_are_complete_after_their_arrays_have_grown():
     capacity = model.instances.capacity
     transitions = kernel_models.random_transitions(3, 2, 500)
     kernel_models.learn(model, transitions)
-    assert len(model.arrays.lists.item) > lists
-    assert len(model.mdp.arrays.rows.item) > rows
+    assert len(model.arrays.lists.item) > lists and len(model.mdp.arrays.rows.item) > rows
     assert model.instances.capacity > capacity
     kernel_models.add_instances(naive, transitions)
     chosen = np.random.default_rng(0).choice(len(model.known), 12, replace=False)

@@ -115,5 +115,4 @@ def test_at_a_wall_visits_make_the_prediction_better():
     for _ in range(8):
         errors.append(abs(model.predict_at(at_wall)[0].effect[0, 0, 0]))
         learn(model, walk_to_the_wall(at_wall[None]))
-    assert errors[-1] < 0.25 * errors[0] and errors[-1] < 0.1 * STRIDE
-    assert (np.diff(errors) < 0.0).all()
+    assert errors[-1] < 0.25 * errors[0] and errors[-1] < 0.1 * STRIDE and (np.diff(errors) < 0.0).all()

@@ -95,8 +95,7 @@ def test_predecessors_include_every_point_that_a_row_leads_from_with_at_least_it
             for to, p in row_of(mdp, point, action).items():
                 leading[to][point] = max(p, leading[to].get(point, 0.0))
         for found, needed in zip(noted, leading, strict=True):
-            assert needed.keys() <= found.keys()
-            assert all(found[point] >= p for point, p in needed.items())
+            assert needed.keys() <= found.keys() and all(found[point] >= p for point, p in needed.items())
             if renewed:
                 assert needed.keys() == found.keys(), "those that no row needs any more are forgotten"
                 assert all(found[point] < 2 * p * (1 + 1e-12) for point, p in needed.items()), "the next power of two at most"
@@ -131,8 +130,7 @@ def test_the_stores_grow_and_keep_the_rows_that_were_written_before():
     probability, effect, reward = random_predictions(rng, len(pairs), 40, 2)
     for some in np.array_split(pairs, 7):
         write(mdp, some, probability[some], effect[some], reward[some])
-    assert len(mdp.arrays.rows.item) > rows
-    assert len(mdp.arrays.predecessors.item) > predecessors
+    assert len(mdp.arrays.rows.item) > rows and len(mdp.arrays.predecessors.item) > predecessors
     for pair in rng.choice(pairs, 60, replace=False).tolist():
         action, point = divmod(pair, mdp.grid.n_points)
         expected_reward, others = without_staying(

@@ -192,8 +192,7 @@ def test_an_evaluation_prefers_known_actions_to_transferred_ones_that_look_bette
     agent.prepare()
     learn_to_move(agent)
     best, second = agent.q_values(HERE)[::-1]
-    assert best > second and agent.act(HERE) == 1
-    assert agent.act(HERE, explore=False) == 0
+    assert best > second and agent.act(HERE) == 1 and agent.act(HERE, explore=False) == 0
     assert agent.act(ELSEWHERE, explore=False) == 1, "where nothing is known, the best of what was transferred"
     # A transferred end that is worth as much as optimism.
     agent = line_agent(ends_anywhere(0.0))
@@ -208,8 +207,7 @@ def test_an_evaluation_takes_a_known_end_that_is_worth_as_much_as_optimism(line_
     assert agent.act(HERE, explore=False) == 0, "action 1 is optimistic: where it leads is not known"
     for _ in range(3):
         agent.update(HERE, 1, 0.0, np.array([0.32]), True)
-    assert agent.q_values(HERE)[1] == 0.0 == agent.planner.bounds[1]
-    assert agent.act(HERE, explore=False) == 1
+    assert agent.q_values(HERE)[1] == 0.0 == agent.planner.bounds[1] and agent.act(HERE, explore=False) == 1
 
 
 # Visits where all is known end the optimism of grid points around them that nothing comes near to.

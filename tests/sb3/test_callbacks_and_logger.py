@@ -43,8 +43,7 @@ def test_an_interrupt_ends_the_training_and_leaves_a_model_that_saves_and_goes_o
     assert same_parameters(model, loaded)
     for resumed in (model, loaded):
         resumed.learn(20, reset_num_timesteps=False)
-        assert resumed.num_timesteps == 32
-        assert resumed.agent.model.n_instances == 32
+        assert resumed.num_timesteps == 32 and resumed.agent.model.n_instances == 32
 
 
 def test_learn_takes_a_progress_bar_and_a_function_as_callback():

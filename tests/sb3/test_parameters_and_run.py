@@ -129,8 +129,7 @@ def test_the_methods_take_what_those_of_sb3_take(name):
 )
 def test_environment_and_policy_come_in_either_order(make_it):
     model = make_it(Walk())
-    assert isinstance(model.policy, FittedRMaxPolicy)
-    assert model.n_envs == 1
+    assert isinstance(model.policy, FittedRMaxPolicy) and model.n_envs == 1
     model.learn(10)
 
 
@@ -146,8 +145,7 @@ def test_the_walk_of_these_tests_is_a_proper_environment():
 
 def test_learning_counts_steps_and_episodes(make):
     model = make().learn(70)
-    assert model.num_timesteps == model.agent.model.n_instances == 70
-    assert model._episode_num >= 2
+    assert model.num_timesteps == model.agent.model.n_instances == 70 and model._episode_num >= 2
     model.learn(30, reset_num_timesteps=False)
     assert model.num_timesteps == model.agent.model.n_instances == 100
     model.learn(30)

@@ -84,10 +84,8 @@ class AskingThread(threading.Thread):
 
 
 def assert_learned_the_same(one, other):
-    assert same_parameters(one, other)
-    assert one.agent.rng.bit_generator.state == other.agent.rng.bit_generator.state
-    assert one.agent.n_backups == other.agent.n_backups
-    assert one.agent.statistics() == other.agent.statistics()
+    assert same_parameters(one, other) and one.agent.rng.bit_generator.state == other.agent.rng.bit_generator.state
+    assert one.agent.n_backups == other.agent.n_backups and one.agent.statistics() == other.agent.statistics()
 
 
 def test_predictions_in_a_callback_or_in_between_do_not_change_what_is_learned(make):
@@ -149,8 +147,7 @@ def test_evaluate_policy_returns_the_fewest_steps(make):
         assert (mean, deviation) == (-fewest_steps(start), 0.0)
     arguments = dict(n_eval_episodes=6, deterministic=False, return_episode_rewards=True)
     rewards, lengths = evaluate_policy(model, VecMonitor(DummyVecEnv([Walk] * 2)), **arguments)
-    assert len(rewards) == len(lengths) == 6
-    assert rewards == [-float(n) for n in lengths]
+    assert len(rewards) == len(lengths) == 6 and rewards == [-float(n) for n in lengths]
     assert all(fewest_steps(0.0) <= n <= 30 for n in lengths)
     assert same_parameters(model, before)
 
@@ -160,8 +157,7 @@ def test_the_same_seed_gives_the_same_run_to_the_last_bit(make):
     seeded_later.set_random_seed(3)
     for model in (one, other, third, seeded_later):
         model.learn(100)
-    assert same_parameters(one, other) and same_parameters(one, seeded_later)
-    assert not same_parameters(one, third)
+    assert same_parameters(one, other) and same_parameters(one, seeded_later) and not same_parameters(one, third)
 
 
 def test_without_a_seed_numpys_own_generator_determines_the_run():
@@ -171,8 +167,7 @@ def test_without_a_seed_numpys_own_generator_determines_the_run():
         runs.append(small(seed=None))
         runs[-1].env.seed(0)
         runs[-1].learn(80)
-    assert same_parameters(runs[0], runs[1])
-    assert not all(same_parameters(runs[0], other) for other in runs[2:])
+    assert same_parameters(runs[0], runs[1]) and not all(same_parameters(runs[0], other) for other in runs[2:])
 
 
 # Saving and loading, as people who know SB3 type it.
@@ -183,8 +178,7 @@ def test_save_and_load_keep_everything(make, tmp_path):
     model = make(max_backups=3).learn(10**6, callback=StopTrainingOnMaxEpisodes(8))
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
-    assert same_parameters(model, loaded)
-    assert type(loaded.policy) is FittedRMaxPolicy
+    assert same_parameters(model, loaded) and type(loaded.policy) is FittedRMaxPolicy
     assert type(loaded.policy.transfer) is type(model.policy.transfer)
     for name in ARGUMENTS:
         assert getattr(loaded, name) == getattr(model, name)
@@ -220,8 +214,7 @@ def test_a_model_is_saved_to_and_loaded_from_open_files(tmp_path):
         model.save(file)
         assert not file.closed
     with (tmp_path / "open.zip").open("rb") as file:
-        assert same_parameters(FittedRMax.load(file), model)
-        assert not file.closed
+        assert same_parameters(FittedRMax.load(file), model) and not file.closed
         with pytest.raises(ValueError, match="writable"):
             model.save(file)
 
@@ -260,8 +253,7 @@ def test_a_grid_of_another_size_is_refused_in_a_sentence(tmp_path):
 def test_save_excludes_and_includes_attributes(tmp_path):
     model = small(verbose=1).learn(10)
     model.save(tmp_path / "less", exclude=["verbose"])
-    assert "verbose" not in load_from_zip_file(tmp_path / "less")[0]
-    assert FittedRMax.load(tmp_path / "less").verbose == 0
+    assert "verbose" not in load_from_zip_file(tmp_path / "less")[0] and FittedRMax.load(tmp_path / "less").verbose == 0
     model.save(tmp_path / "more", include=["_episode_numbers"])
     assert "_episode_numbers" in load_from_zip_file(tmp_path / "more")[0]
 
@@ -270,8 +262,7 @@ def test_saving_changes_nothing(make, tmp_path):
     model, other = make().learn(60), make().learn(60)
     before = dict(vars(model))
     model.save(tmp_path / "model")
-    assert vars(model).keys() == before.keys()
-    assert all(vars(model)[name] is value for name, value in before.items())
+    assert vars(model).keys() == before.keys() and all(vars(model)[name] is value for name, value in before.items())
     assert same_parameters(model.learn(60), other.learn(60))
 
 
@@ -310,8 +301,7 @@ def test_a_full_model_with_a_cap_on_instances_survives_saving(make, tmp_path):
 def test_a_saved_model_can_be_loaded_for_more_environments(tmp_path):
     small().learn(50).save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=DummyVecEnv([Walk, Walk])).learn(20)
-    assert loaded.n_envs == 2
-    assert loaded.agent.model.n_instances == 70
+    assert loaded.n_envs == 2 and loaded.agent.model.n_instances == 70
 
 
 def test_a_model_without_transfer_cannot_take_one_up_when_loaded(tmp_path):

@@ -29,8 +29,7 @@ def test_several_environments_feed_one_model(vec_env):
             env.close()
         runs.append(stored(model))
     np.testing.assert_array_equal(*runs)
-    assert model.num_timesteps == 63
-    assert model.agent.model.n_instances == 63
+    assert model.num_timesteps == 63 and model.agent.model.n_instances == 63
     assert recorder.shown[0]["new_obs"].shape == (3, 2)
 
 

@@ -39,8 +39,7 @@ class TestTileCoding:
     def test_a_state_lies_in_one_tile_of_each_grid(self, state, n_tilings, n_tiles):
         coding = TileCoding(2, n_tilings, n_tiles)
         tiles = coding.tiles(np.array(state))
-        assert (tiles // (n_tiles + 1) ** 2).tolist() == list(range(n_tilings))
-        assert tiles.max() < coding.n_features
+        assert (tiles // (n_tiles + 1) ** 2).tolist() == list(range(n_tilings)) and tiles.max() < coding.n_features
 
     @settings(max_examples=50)
     @given(st.lists(st.floats(0, 1), min_size=4, max_size=4))
@@ -66,10 +65,8 @@ class TestQLearning:
 
     def test_it_solves_mountain_car_and_its_experience_is_a_source(self):
         source = SourceInstances.from_q_learning(MOUNTAIN_CAR, n_instances=1000, seed=0, total_timesteps=10_000)
-        assert len(source) == 1000
-        assert source.state_names == ("x", "v")
-        assert source.action_names == ("Neutral", "Left", "Right")
-        assert source.origin["env"] == MOUNTAIN_CAR
+        assert len(source) == 1000 and source.state_names == ("x", "v")
+        assert source.action_names == ("Neutral", "Left", "Right") and source.origin["env"] == MOUNTAIN_CAR
         assert source.origin["recorder"] == "QLearning"
         # Terminal instances are those that reach the goal.
         np.testing.assert_array_equal(source.terminated, source.next_states[:, 0] >= 0.5)

@@ -157,8 +157,7 @@ def test_a_recipe_with_other_arguments_is_another_source():
 
 
 def test_specifications_of_tasks():
-    assert task_spec(WALK).id == WALK
-    assert task_spec("combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
+    assert task_spec(WALK).id == WALK and task_spec("combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("combrel_envs:combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("Nowhere-v0") is None and task_spec("source.npz") is None
     check_source("combrel/MountainCar2D-v0")

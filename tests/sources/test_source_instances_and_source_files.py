@@ -25,8 +25,7 @@ def arguments(**changes):
 class TestSourceInstances:
     def test_names_have_defaults_and_arrays_are_fixed(self):
         source = SourceInstances(**arguments())
-        assert source.state_names == ("s0", "s1")
-        assert source.action_names == ("a0", "a1", "a2")
+        assert source.state_names == ("s0", "s1") and source.action_names == ("a0", "a1", "a2")
         assert (len(source), source.n_variables) == (4, 2)
         np.testing.assert_array_equal(source.scaling.to_unit(source.states), source.states)
         with pytest.raises(ValueError, match="read-only"):
@@ -79,8 +78,7 @@ class TestSubset:
         source = some_source(40)
         subset = source.subset(n, method, seed)
         rows = [int(np.flatnonzero((source.states == state).all(axis=1))[0]) for state in subset.states]
-        assert rows == sorted(set(rows))
-        assert len(rows) == min(n, 40)
+        assert rows == sorted(set(rows)) and len(rows) == min(n, 40)
         np.testing.assert_array_equal(subset.rewards, source.rewards[rows])
         np.testing.assert_array_equal(subset.next_states, source.next_states[rows])
         assert subset.terminated.any()

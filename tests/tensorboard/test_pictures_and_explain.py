@@ -145,8 +145,7 @@ def test_history_stays_small_and_spread_over_the_run():
     history = ChoiceHistory()
     for step in range(5 * MAX_COLUMNS):
         history.note(step, np.array([0]))
-    assert len(history.steps) < MAX_COLUMNS
-    assert history.steps[0] == 0 and history.steps[-1] > 4.9 * MAX_COLUMNS
+    assert len(history.steps) < MAX_COLUMNS and history.steps[0] == 0 and history.steps[-1] > 4.9 * MAX_COLUMNS
     assert len(set(np.diff(history.steps))) == 1
 
 
@@ -230,9 +229,7 @@ def test_the_command_prints_the_report_and_writes_it_with_the_pictures(saved, tm
     text = str(model.transfer.report())
     assert call_for_all_output("explain", path) == (0, f"{text}\n")
     status, written = call_for_all_output("explain", path, "--output", tmp_path)
-    assert status == 0 and written.startswith(text)
-    assert (tmp_path / "report.txt").read_text() == f"{text}\n"
-    assert all(str(file) in written for file in tmp_path.iterdir())
-    assert len(list(tmp_path.glob("*.png"))) == 2
+    assert status == 0 and written.startswith(text) and (tmp_path / "report.txt").read_text() == f"{text}\n"
+    assert all(str(file) in written for file in tmp_path.iterdir()) and len(list(tmp_path.glob("*.png"))) == 2
     status, written = call_for_all_output("explain", tmp_path / "nowhere.zip")
     assert status == 1 and "there is no model file" in written and "Traceback" not in written

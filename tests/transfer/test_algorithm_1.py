@@ -37,11 +37,9 @@ def test_nearest_transitions_are_those_of_a_full_sort(seed, n_transitions, k, ac
 def test_best_mapping_has_the_highest_mean_compliance_of_the_neighbours():
     compliances = np.array([[0.9, 0.4, 0.5, 0.5], [0.0, 0.6, 0.5, 0.4]])
     assert equations.best_mapping(compliances) == 1, "of equal means the first"
-    assert equations.best_mapping(compliances[:1]) == 0
-    assert equations.best_mapping(compliances, baseline=0.49) == 1
+    assert equations.best_mapping(compliances[:1]) == 0 and equations.best_mapping(compliances, baseline=0.49) == 1
     assert equations.best_mapping(compliances, baseline=0.5) is None
-    assert equations.best_mapping(np.zeros((3, 4))) is None
-    assert equations.best_mapping(compliances[:0]) is None
+    assert equations.best_mapping(np.zeros((3, 4))) is None and equations.best_mapping(compliances[:0]) is None
 
 
 @settings(max_examples=25, deadline=None)

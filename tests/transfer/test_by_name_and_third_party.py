@@ -31,8 +31,7 @@ def test_a_dict_names_the_class_with_its_package_its_module_or_alone(path):
     arguments = {"mappings": "surjective", "n_random_steps": 7}
     for written in ("MASTER", "sb3_combrel.MASTER", f"{sb3_combrel.MASTER.__module__}.MASTER"):
         made = make_transfer({written: {"source": path, **arguments}})
-        assert type(made) is sb3_combrel.MASTER
-        assert {name: getattr(made, name) for name in arguments} == arguments
+        assert type(made) is sb3_combrel.MASTER and {name: getattr(made, name) for name in arguments} == arguments
 
 
 def test_a_method_of_ones_own_is_imported_from_where_the_name_says():
@@ -257,8 +256,7 @@ def test_a_source_must_bring_the_full_weight_when_the_model_has_lowered_its_thre
     monkeypatch.setattr(method, "transferred", checked)
     # Every episode is cut off before the goal, so the model lowers its threshold from the eleventh on.
     model = small(Walk(limit=3), transfer=make(), model_breadth=0.03, resolution=5).learn(60)
-    assert model.agent.statistics()["model/threshold"] < 0.9
-    assert model.policy.transfer.task.exploration_threshold == 1.0
+    assert model.agent.statistics()["model/threshold"] < 0.9 and model.policy.transfer.task.exploration_threshold == 1.0
     before = len(reached)
     model.learn(30, reset_num_timesteps=False)
     assert np.concatenate(reached[before:]).min() >= 1.0 - 1e-9

@@ -86,8 +86,7 @@ def test_choices_depend_on_what_was_seen_and_those_of_known_pairs_are_renewed_wh
         often.end_episode(False)
         each.append(asking.changed_pairs(often))
     at_once = asking.changed_pairs(once)
-    assert sorted(at_once) == np.flatnonzero(once.choices() >= 0).tolist()
-    assert set(at_once) <= set(np.concatenate(each))
+    assert sorted(at_once) == np.flatnonzero(once.choices() >= 0).tolist() and set(at_once) <= set(np.concatenate(each))
     np.testing.assert_array_equal(often.choices(), once.choices())
     assert sorted(asking.changed_pairs(lazy, known)) == sorted(set(at_once) - set(np.flatnonzero(known)))
     assert (lazy.choices()[known] == -1).all()
@@ -188,8 +187,7 @@ def test_each_action_of_the_larger_car_gets_the_axis_that_it_drives():
     fitting += [{(along_y, 1), (along_x, 0)}, {(along_y, 2), (along_x, 0)}]
     for action, row in enumerate(chosen):
         by_number = Counter((choice[1], choice[3]) for choice in row).most_common(2)
-        assert {way for way, _ in by_number} == fitting[action]
-        assert sum(n for _, n in by_number) > 0.6 * len(row)
+        assert {way for way, _ in by_number} == fitting[action] and sum(n for _, n in by_number) > 0.6 * len(row)
 
 
 def test_a_source_that_is_the_target_saves_the_exploration():

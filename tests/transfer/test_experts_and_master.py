@@ -89,8 +89,7 @@ def test_an_expert_does_what_is_best_in_the_source_seen_through_its_mapping():
     assert [expert.mapping for expert in method.experts] == [SAME, OPPOSITE, exchanged_and_mirrored]
     for at in (0.2, 0.5, 0.8):
         # The walk's goal is on the right: its action 1.
-        assert method.expert_action(1, np.array([at, 0.5])) == 1
-        assert method.expert_action(2, np.array([at, 0.5])) == 0
+        assert method.expert_action(1, np.array([at, 0.5])) == 1 and method.expert_action(2, np.array([at, 0.5])) == 0
         assert method.expert_action(3, np.array([0.5, at])) == 0
     # Far from all data of the source; where no target variable is mapped to a source variable, it is typical.
     assert method.expert_action(1, np.array([0.5, 0.0])) is None
@@ -185,13 +184,10 @@ def test_first_the_agent_then_each_expert_then_the_best():
 
 def test_an_expert_hands_over_when_it_has_taken_as_long_as_the_agent():
     method = bound(MappingExperts(walk_source(), [SAME, OPPOSITE], patience=1.5), TASK)
-    assert play(method, -1.0, steps=6) == (0, 0)
-    assert play(method, -1.0, steps=20) == (9, 1)
-    assert play(method, -1.0, steps=4) == (4, 2)
-    assert method.statistics()["transfer/expert_steps"] == 13
+    assert play(method, -1.0, steps=6) == (0, 0) and play(method, -1.0, steps=20) == (9, 1)
+    assert play(method, -1.0, steps=4) == (4, 2) and method.statistics()["transfer/expert_steps"] == 13
     endless = bound(MappingExperts(walk_source(), [SAME], patience=None), TASK)
-    assert play(endless, -1.0, steps=6) == (0, 0)
-    assert play(endless, -1.0, steps=50) == (50, 1)
+    assert play(endless, -1.0, steps=6) == (0, 0) and play(endless, -1.0, steps=50) == (50, 1)
 
 
 def test_steps_spent_on_finding_the_best_are_those_of_all_other_experts():
@@ -324,12 +320,10 @@ def test_nothing_is_transferred_before_and_then_what_timbrel_transfers_through_t
     source, task, transitions = source_of(), naive.target_task(POINTS, 2), transitions_of(12)
     method = bound(MASTER(source, n_random_steps=12, use="instances", breadth=0.4), task)
     show(method, transitions[:11])
-    assert method.chosen is None and (method.choices() == -1).all()
-    assert len(changed_pairs(method)) == 0
+    assert method.chosen is None and (method.choices() == -1).all() and len(changed_pairs(method)) == 0
     assert not transferred_to_pairs(method, pairs_of(task), np.zeros(len(pairs_of(task)))).length.any()
     show(method, transitions[11:])
-    assert changed_pairs(method).tolist() == pairs_of(task).tolist()
-    assert len(changed_pairs(method)) == 0
+    assert changed_pairs(method).tolist() == pairs_of(task).tolist() and len(changed_pairs(method)) == 0
     given = TIMBREL(source, InterTaskMapping(*parts(method.chosen)), breadth=0.4)
     assert transferred_to_all(method, task) == transferred_to_all(bound(given, task), task)
     assert any(weights for weights, *_ in transferred_to_all(method, task))
@@ -363,6 +357,5 @@ def test_the_first_actions_are_those_of_the_seeded_generator():
 def test_the_targets_model_decides_for_a_prior_unless_an_argument_is_one_of_instances():
     assert small(transfer=MASTER(walk_source(), breadth=0.2)).policy.transfer.use == "instances"
     undecided = MASTER(walk_source())
-    assert undecided.arguments()["use"] is None
-    assert small(transfer=undecided).policy.transfer.use == "prior"
+    assert undecided.arguments()["use"] is None and small(transfer=undecided).policy.transfer.use == "prior"
     assert small(transfer=undecided, degree=0).policy.transfer.use == "instances"

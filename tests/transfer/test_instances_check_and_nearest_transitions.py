@@ -144,8 +144,7 @@ def test_ends_that_never_come_contradict_a_source_whose_effects_are_right():
         visit_to_a_predicted_end(check)
     assert not check.end_episode(True)
     visit_to_a_predicted_end(check)
-    assert check.end_episode(True) and check.error() == 0.0
-    assert not check.end_episode(True)
+    assert check.end_episode(True) and check.error() == 0.0 and not check.end_episode(True)
 
 
 def test_ends_that_came_once_outweigh_those_that_did_not():

@@ -162,8 +162,7 @@ def same_as_in_learning(model):
 def test_a_frozen_policy_acts_on_bounded_values_as_in_learning_and_without_bounds_on_what_is_known():
     bounded = car_model(Bounded(), seed=0).learn(150)
     unbounded = car_model(Bounded(n_steps=1000), seed=0).learn(150)
-    assert same_as_in_learning(bounded) == 1.0
-    assert same_as_in_learning(unbounded) < 0.9
+    assert same_as_in_learning(bounded) == 1.0 and same_as_in_learning(unbounded) < 0.9
 
 
 # Transfer to a task with an angle: what is transferred does not depend on where the angle's origin is.

@@ -91,8 +91,7 @@ def test_where_the_target_contradicts_a_source_is_said_by_action_variable_and_ra
     assert {each.target_action for each in found} == {"a0", "a1", "a2"}
     # Twice the effect is missed.
     assert all(each.error == pytest.approx(4.0, rel=0.1) for each in found)
-    assert report.n_worse == pytest.approx(0.25 * report.n_compared, rel=0.3)
-    assert "s0 from 0.75 to 1" in str(report)
+    assert report.n_worse == pytest.approx(0.25 * report.n_compared, rel=0.3) and "s0 from 0.75 to 1" in str(report)
 
 
 def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
@@ -174,8 +173,7 @@ def test_the_confidence_of_combrel_is_that_of_its_choices_and_they_are_the_best(
     for action, each in enumerate(report.mappings):
         n = len(selector.task.sample_states)
         pairs = action * n + np.flatnonzero(selector.choices()[action * n : (action + 1) * n] >= 0)
-        assert 0 < len(pairs) <= 500
-        assert each.compliance == pytest.approx(selector.mean_compliance(pairs).mean())
+        assert 0 < len(pairs) <= 500 and each.compliance == pytest.approx(selector.mean_compliance(pairs).mean())
         # What does not exceed the no-change baseline is not chosen.
         assert each.compliance >= each.next_best_compliance and each.compliance > each.no_change_compliance
     assert report.mappings[1].target_action == "forth" and "place<-" in report.mappings[1].mapping

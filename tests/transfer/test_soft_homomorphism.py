@@ -102,8 +102,7 @@ def test_a_target_that_has_nothing_in_common_is_not_claimed_to_be_known():
     states, actions = rng.random((100, 2)), rng.integers(3, size=100)
     method = bound(SoftHomomorphism(f.oscillator_source(), n_starts=1), 2, 3)
     show(method, (states, actions, 0.1 * np.sin(40.0 * states[:, ::-1])))
-    assert method._claims.trust.tolist() == [0.0, 0.0, 0.0]
-    assert method.prior(*inside(50, 2, 3)).weight.max() == 0.0
+    assert method._claims.trust.tolist() == [0.0, 0.0, 0.0] and method.prior(*inside(50, 2, 3)).weight.max() == 0.0
 
 
 def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doubted():
@@ -114,8 +113,7 @@ def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doub
     assert method.prior(at_end, actions).end[0] > 0.5 and method.prior(at_end, actions).weight[0] == 0.0
     before, [after] = method.prior_version(), at_end + f.target_effects(SWAPPED, at_end, actions)
     method.observe(at_end[0], 0, -1.0, after, True)
-    assert method.prior_version() == before + 1
-    assert method.prior(at_end, actions).weight[0] > 0.0
+    assert method.prior_version() == before + 1 and method.prior(at_end, actions).weight[0] > 0.0
     for _ in range(2):
         # It stays for an episode where an end is predicted.
         method.observe(at_end[0], 0, -1.0, after, False)
@@ -181,8 +179,7 @@ def test_all_mappings_are_listed_once_and_counted(size):
         tuple(None if v < 0 else (v, int(s)) for v, s in zip(variable, sign, strict=True))
         for variable, sign in zip(readings.variable.tolist(), readings.sign.tolist(), strict=True)
     ]
-    assert sorted(rows, key=str) == sorted(naive_mappings(*size), key=str)
-    assert len(rows) == soft.count_mappings(*size)
+    assert sorted(rows, key=str) == sorted(naive_mappings(*size), key=str) and len(rows) == soft.count_mappings(*size)
     # Different readings have different logits, and the same one the same.
     means = set(zip(readings.number.ravel(), readings.variable.ravel(), readings.sign.ravel(), strict=True))
     assert sorted(number for number, _, _ in means) == list(range(1 + readings.number.max()))

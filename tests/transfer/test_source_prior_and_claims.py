@@ -99,8 +99,7 @@ def test_an_exact_source_is_found_and_claims_what_it_knows(n_copies, seed):
     assert (found.weight[found.end < 0.1] > 1.0).mean() > 0.95
     assert transfer.statistics()["transfer/prediction_error"] < 0.01
     # Ten times as many transitions change nothing any more.
-    assert max(show(transfer, f.walk(mapping, 300, seed + 100))) <= versions[-1] + 2
-    assert 1 <= versions[-1] <= 30
+    assert max(show(transfer, f.walk(mapping, 300, seed + 100))) <= versions[-1] + 2 and 1 <= versions[-1] <= 30
     assert not transfer.changed(np.zeros((2 * n_copies + 1, 3), dtype=bool))
     assert not transfer.transferred(states, actions, np.zeros(300)).length.any()
 
@@ -222,8 +221,7 @@ def test_of_two_sources_the_one_that_fits_is_found_and_it_says_which_copies_each
     assert transfer.candidate(first) == (3, "Wait + Down", "(s0, s2) + (s1, s3)", ())
     assert (transfer.selected(np.zeros((2, 4)), np.array([3, 3])) == first).all()
     assert transfer.describe(first) == "a3<-Wait + Down with (s0, s2) + (s1, s3)"
-    assert "Wait + Down" in transfer.source_action_names()
-    assert sum(transfer.uses().values()) > 250
+    assert "Wait + Down" in transfer.source_action_names() and sum(transfer.uses().values()) > 250
     assert set(transfer.source_prior.copies.source[transfer.source_prior.choice.copies].ravel().tolist()) == {1}
 
 
@@ -269,8 +267,7 @@ def test_far_from_all_instances_the_nearest_predict_with_next_to_no_weight():
     inside, far = np.array([[0.5, 0.5]]), np.array([[40.0, -30.0]])
     assert model.predict(inside, np.array([1])).weight[0] > 3.0
     found = model.predict(far, np.array([1]))
-    assert found.weight[0] < 1e-12
-    assert all(np.isfinite(array).all() for array in found)
+    assert found.weight[0] < 1e-12 and all(np.isfinite(array).all() for array in found)
     low, high = model.plain[1][:, 1]
     assert (low <= found.effect[0]).all() and (found.effect[0] <= high).all()
 

@@ -43,8 +43,7 @@ def assert_same(found, row, expected, transfer_terminals=True):
     for k, (weight, effect, reward, terminated) in enumerate(expected):
         assert found.weight[row, k] == pytest.approx(weight, rel=1e-9, abs=1e-12)
         np.testing.assert_allclose(found.effect[row, k], effect, atol=1e-12)
-        assert found.reward[row, k] == reward
-        assert found.terminated[row, k] == (terminated and transfer_terminals)
+        assert found.reward[row, k] == reward and found.terminated[row, k] == (terminated and transfer_terminals)
 
 
 @settings(max_examples=30, deadline=None)
@@ -134,6 +133,5 @@ def test_by_relevance_as_many_light_instances_are_transferred_as_it_takes():
     method = bound(TIMBREL(source, InterTaskMapping([0], [0]), breadth=0.1, relevance=True), task)
     for _ in range(2):
         found = transferred_to_pairs(method, np.arange(2), np.zeros(2))
-        assert found.length[:2].tolist() == [55, 55]
-        assert found.weight[0, :55].sum() >= 1.0 > found.weight[0, :54].sum()
+        assert found.length[:2].tolist() == [55, 55] and found.weight[0, :55].sum() >= 1.0 > found.weight[0, :54].sum()
     assert transferred_at(method, points[0], np.full(1, 0.5)).length[0] == 28

@@ -53,8 +53,7 @@ def transfer_of(domain, setting, method, sources, seed=5000):
 @pytest.mark.parametrize(("domain", "setting"), EXISTING)
 def test_the_methods_that_exist(domain, setting):
     found = m.methods_in(DOMAINS[domain], DOMAINS[domain].settings[setting])
-    assert set(found) == EXISTING[domain, setting]
-    assert found == [name for name in m.METHODS if name in found]
+    assert set(found) == EXISTING[domain, setting] and found == [name for name in m.METHODS if name in found]
 
 
 @pytest.mark.parametrize(("domain", "setting"), EXISTING)
@@ -104,8 +103,7 @@ def test_mappings_of_a_person_of_the_oracle_and_from_an_unrelated_source(sources
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_one_random_mapping_is_drawn_by_the_seed(domain, setting, sources):
     drawn, again = ([transfer_of(domain, setting, m.ONE_RANDOM, sources, seed).mapping for seed in range(20)] for _ in "ab")
-    assert drawn == again
-    assert len(set(drawn)) > 10
+    assert drawn == again and len(set(drawn)) > 10
     if setting == PAPER:
         # The other sets have too many to go through them all.
         assert set(drawn) <= set({"mountain_car": MappingSet.paper_mountain_car, "icub": MappingSet.paper_icub}[domain]())
@@ -117,8 +115,7 @@ def test_one_random_mapping_with_a_prior_is_drawn_by_the_seed(sources):
         with chosen_on_purpose():
             return FittedRMax(make_env(MOUNTAIN_CAR.target_id), transfer=transfer, seed=seed).agent.transfer.describe_prior()
 
-    assert drawn(0) == drawn(0)
-    assert len({drawn(seed) for seed in range(4)}) > 1
+    assert drawn(0) == drawn(0) and len({drawn(seed) for seed in range(4)}) > 1
 
 
 class TestTargets:
@@ -260,5 +257,4 @@ def test_the_jobs_of_the_diagnosis_differ_in_breadth_alone(short, sources):
         method, breadth = job.method.split(" at ")
         assert method in DIAGNOSED
         assert job.learner == {**car.settings[EXPLORE].learner, "model_breadth": float(breadth)}
-        assert (job.transfer is None) == (method == DIAGNOSED[0])
-        assert not job.records_selections
+        assert (job.transfer is None) == (method == DIAGNOSED[0]) and not job.records_selections

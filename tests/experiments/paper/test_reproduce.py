@@ -93,8 +93,7 @@ def test_everything_from_nothing(tmp_path):
         check_tables(tmp_path / "output", name, number)
     for name, n_methods in (("mountain_car", 10), ("icub", 8)):
         lines = (tmp_path / "output" / f"{name}.csv").read_text().splitlines()
-        assert len(lines) == 1 + 2 * n_methods
-        assert all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
+        assert len(lines) == 1 + 2 * n_methods and all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
     before = files_in(tmp_path / "output")
     _, again = run()
     assert ", seed 50" in written and ", seed 50" not in again

@@ -38,14 +38,12 @@ class TestVerdicts:
         found = verdict_of(np.array([[10, 20], [30, 40]]), np.array([[100, 100], [60, 140]]))
         assert (found.saved, found.delta) == (1 - 50 / 200, 1.0)
         # Of the six regroupings two have a difference as large.
-        assert found.p_value == pytest.approx(2 / 6)
-        assert found.verdict == NOT_HELD
+        assert found.p_value == pytest.approx(2 / 6) and found.verdict == NOT_HELD
 
     @pytest.mark.parametrize(("combrel", "none", "saved", "verdict"), [(200, 400, 0.5, HELD), (400, 200, -1.0, OPPOSITE)])
     def test_half_and_twice_the_steps(self, combrel, none, saved, verdict):
         found = verdict_of(runs(combrel), runs(none))
-        assert found.verdict == verdict
-        assert found.low < found.saved < found.high and abs(found.saved - saved) < 0.1
+        assert found.verdict == verdict and found.low < found.saved < found.high and abs(found.saved - saved) < 0.1
         assert found.delta == np.sign(saved) and found.p_value < 0.001
 
     def test_no_difference_does_not_hold(self):
@@ -60,8 +58,7 @@ class TestVerdicts:
     def test_all_rows_of_a_kind_with_all_methods(self):
         steps = {name: {method: runs(100 + 10 * k, 3) for k, method in enumerate(m.METHODS)} for name in DOMAINS}
         papers, controls = judge(steps, PAPERS), judge(steps, CONTROL)
-        assert [each.claim for each in (*papers, *controls)] == list(CLAIMS)
-        assert len(papers) == 8
+        assert [each.claim for each in (*papers, *controls)] == list(CLAIMS) and len(papers) == 8
         # Every control is beside the method of every claim: against each of them in both domains.
         assert {(each.claim.domain, each.claim.worse) for each in controls} >= {
             (name, other) for name in DOMAINS for other in (m.ONE_RANDOM, m.UNRELATED, m.NO_TRANSFER_BEST)
@@ -75,8 +72,7 @@ class TestVerdicts:
         found = judge({CAR: {m.COMBREL_PLAIN: better, m.NO_TRANSFER: better + 33, **others}}, PAPERS)
         expected = holm({each.claim: each.p_value for each in found})
         assert [each.corrected for each in found] == list(expected.values()) and len(expected) == 4
-        assert found[0].p_value == one.p_value < found[0].corrected
-        assert found[0].verdict == NOT_HELD
+        assert found[0].p_value == one.p_value < found[0].corrected and found[0].verdict == NOT_HELD
 
     def test_a_single_run_has_no_interval(self):
         (row,) = verdict_table([verdict_of(runs(100, n_runs=1), runs(200, n_runs=1))], "title").rows
@@ -85,8 +81,7 @@ class TestVerdicts:
     def test_the_threshold_is_the_domains_last(self):
         # All reach 250 steps at once with COMBREL, none without transfer, in as many steps.
         reach, never = np.full((6, 10), 240), np.full((6, 10), 260)
-        assert verdict_of(reach, never).p_threshold < 0.01
-        assert verdict_of(never + 10, never).p_threshold == 1.0
+        assert verdict_of(reach, never).p_threshold < 0.01 and verdict_of(never + 10, never).p_threshold == 1.0
         # Fewer episodes than the window of the median.
         assert verdict_of(reach[:, :2], never[:, :2]).p_threshold == 1.0
 
@@ -164,15 +159,13 @@ class TestMeasures:
     def test_p_values_are_corrected_over_the_column(self):
         alone = [result for result in learnt() if result.method != m.UNRELATED]
         # Exact: 2 of the 924 regroupings are as far apart, and no difference has 1.
-        assert measures_of(alone)["jumpstart"][1] == "0.002"
-        assert measures_of(learnt())["jumpstart"][1] == "0.004"
+        assert measures_of(alone)["jumpstart"][1] == "0.002" and measures_of(learnt())["jumpstart"][1] == "0.004"
         assert set(measures_of(learnt(), m.UNRELATED).values()) == {("+0", "1.00")}
 
     @pytest.mark.parametrize("n_episodes", [1, 4, 9])
     def test_trials_of_few_episodes(self, n_episodes):
         found = measures_of(learnt(n_episodes))
-        assert float(found["jumpstart"][0]) >= 0.0
-        assert (found["time to threshold"] == ("-",)) == (n_episodes < 5)
+        assert float(found["jumpstart"][0]) >= 0.0 and (found["time to threshold"] == ("-",)) == (n_episodes < 5)
 
     def test_what_has_no_effect_or_no_p_value(self):
         assert measures_of(learnt(n_runs=1))["jumpstart"] == ("+160", "-")
@@ -239,8 +232,7 @@ class TestDiagnosis:
         assert [row[0] for row in table.rows] == ["0.05", "0.1", "0.2", "0.3", "0.4"]
         assert "6 episodes, 8 runs" in table.title
         for row in table.rows:
-            assert row[1:4] == ("2,400", "50% (50% to 50%)", "25% (25% to 25%)")
-            assert float(row[4]) < 0.01
+            assert row[1:4] == ("2,400", "50% (50% to 50%)", "25% (25% to 25%)") and float(row[4]) < 0.01
         assert {row[2:] for row in tables.diagnosis_table(self.results(n_runs=1)[0]).rows} == {("50% (-)", "25% (-)", "-")}
 
     def test_p_values_are_corrected_over_the_breadths(self):

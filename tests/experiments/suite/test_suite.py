@@ -128,8 +128,7 @@ def test_seeds_and_tasks_are_read_from_text():
     for names in (["CartPole"], []):
         with pytest.raises(ValueError, match="tasks must be"):
             tasks_of(names)
-    assert suite.seeds_of("0-3") == [0, 1, 2, 3]
-    assert suite.seeds_of("4, 0-1,1") == [4, 0, 1]
+    assert suite.seeds_of("0-3") == [0, 1, 2, 3] and suite.seeds_of("4, 0-1,1") == [4, 0, 1]
     assert suite.seeds_of("0-2", 1000) == [1000, 1001, 1002]
     for text in ("", "3-1", "a", "1--2", "-1"):
         with pytest.raises(ValueError, match="seeds"):
@@ -167,15 +166,12 @@ def test_every_task_can_be_learnt_and_has_its_headline(name):
 def test_measures_of_hand_made_episodes():
     steps = [100, 40, 30, 60, 20, 25, 27, 26, 20]
     episodes = Episodes.from_rows([(n, -float(n), True) for n in steps])
-    assert measures.steps_in(1, 3).of(episodes) == 170
-    assert measures.mean_steps_in(4, 5).of(episodes) == 40
+    assert measures.steps_in(1, 3).of(episodes) == 170 and measures.mean_steps_in(4, 5).of(episodes) == 40
     assert np.isnan(measures.steps_in(1, 10).of(episodes))
     assert measures.mean_return_in(1, 3).of(episodes._replace(returns=np.arange(9.0) ** 2)) == pytest.approx(5 / 3)
     assert np.isnan(measures.mean_return_in(1, 10).of(episodes)) and measures.mean_return_in(1, 1).higher_is_better
-    assert measures.steps_until_always(27).of(episodes) == 230
-    assert measures.steps_until_always(59).of(episodes) == 230
-    assert measures.steps_until_always(60).of(episodes) == 100
-    assert measures.steps_until_always(100).of(episodes) == 0
+    assert measures.steps_until_always(27).of(episodes) == 230 and measures.steps_until_always(59).of(episodes) == 230
+    assert measures.steps_until_always(60).of(episodes) == 100 and measures.steps_until_always(100).of(episodes) == 0
     assert measures.steps_until_always(26).of(episodes) == np.inf, "only two episodes follow the one of 27 steps"
     assert measures.steps_until_always(10).of(episodes) == np.inf
     # The medians of five: 40, 30, 27, 26, 25.
@@ -209,8 +205,7 @@ def test_noisy_actions_are_drawn_by_the_environments_seed():
 
     assert taken(0) == taken(0) != taken(1)
     # A third of the replacements draws the action itself.
-    assert np.mean(np.array(taken(0)) != 2) == pytest.approx(0.2, abs=0.03)
-    assert set(taken(0)) == {0, 1, 2}
+    assert np.mean(np.array(taken(0)) != 2) == pytest.approx(0.2, abs=0.03) and set(taken(0)) == {0, 1, 2}
     with pytest.raises(ValueError, match="probability"):
         NoisyActions(env, 1.5)
 
@@ -245,7 +240,5 @@ def test_the_table_of_frozen_policies_counts_seeds():
         for seed, own in enumerate(numbers)
     ]
     (line,) = frozen_table(cells_of(rows, [SMALL], ["a", "b"], "a", "welch"), [SMALL], ["a", "b"]).rows
-    assert line[:3] == ("small", "a", "-55.0 ± 5.00")
-    assert line[3:6] == ("-56.0 ± 5.00", "-70.0", "2 of 2")
-    assert line[6:9] == ("-75.5 ± 14.5", "-400.0", "1 of 2")
-    assert line[9:] == ("1", "0.20 ± 0.10")
+    assert line[:3] == ("small", "a", "-55.0 ± 5.00") and line[3:6] == ("-56.0 ± 5.00", "-70.0", "2 of 2")
+    assert line[6:9] == ("-75.5 ± 14.5", "-400.0", "1 of 2") and line[9:] == ("1", "0.20 ± 0.10")
