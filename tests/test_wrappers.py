@@ -6,7 +6,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,10 +22,10 @@ class Given(gym.Env):
     :param low: of the observation space; ``high``: the same
     """
 
-    action_space = spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, low=(-1.0,) * 5, high=(1.0,) * 5, dtype=np.float64):
-        self.observation_space = spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+        self.observation_space = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
         self.next = np.zeros(len(low), dtype)
 
     def reset(self, *, seed=None, options=None):

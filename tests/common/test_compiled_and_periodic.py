@@ -95,8 +95,7 @@ def test_what_is_cached_is_not_announced(capsys, monkeypatch, tmp_path):
     (tmp_path / "loops.py").write_text("from numba import njit\n\n\n@njit(cache=True)\ndef plus(x):\n    return x + 1\n")
     for times in (1, 0):
         monkeypatch.setattr(compiled._announcement, "printed", False)
-        plus = runpy.run_path(str(tmp_path / "loops.py"), run_name="sb3_combrel.loops")["plus"]
-        assert EntryPoint(plus).call(1) == 2
+        assert EntryPoint(runpy.run_path(str(tmp_path / "loops.py"), run_name="sb3_combrel.loops")["plus"]).call(1) == 2
         assert capsys.readouterr().err.count(MESSAGE) == times
 
 

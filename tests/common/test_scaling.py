@@ -3,14 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sb3_combrel.common.scaling import StateScaling
 
-BOX = spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float64)
+BOX = gym.spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float64)
 
 finite = st.floats(-1e6, 1e6)
 
@@ -52,7 +51,7 @@ def test_bounds_replace_those_of_the_space_and_scalars_hold_for_all_variables():
 
 def test_a_space_that_is_unbounded_or_as_large_as_the_largest_float_needs_bounds():
     huge = np.finfo(np.float32).max
-    for space in (gym.make("CartPole-v1").observation_space, spaces.Box(-huge, huge, (2,), np.float32)):
+    for space in (gym.make("CartPole-v1").observation_space, gym.spaces.Box(-huge, huge, (2,), np.float32)):
         with pytest.raises(ValueError, match=r"no finite bounds .*1.*bounds=\(low, high\)"):
             StateScaling.from_space(space)
 
@@ -74,11 +73,11 @@ def test_wrong_bounds_are_named_with_their_value(bounds, message):
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Discrete(3), "one-dimensional Box of floating-point numbers, got Discrete"),
-        (spaces.Dict({"x": BOX}), "FlattenObservation"),
-        (spaces.Box(0, 255, (8, 8, 3), np.uint8), "images"),
-        (spaces.Box(0, 1, (2, 2)), r"shape \(2, 2\)"),
-        (spaces.Box(0, 9, (2,), np.int64), "dtype int64"),
+        (gym.spaces.Discrete(3), "one-dimensional Box of floating-point numbers, got Discrete"),
+        (gym.spaces.Dict({"x": BOX}), "FlattenObservation"),
+        (gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), "images"),
+        (gym.spaces.Box(0, 1, (2, 2)), r"shape \(2, 2\)"),
+        (gym.spaces.Box(0, 9, (2,), np.int64), "dtype int64"),
     ],
 )
 def test_other_spaces_are_refused(space, message):

@@ -147,8 +147,7 @@ def test_time_limits_lower_the_threshold_of_the_model_and_that_is_saved(degree):
     threshold = agent.statistics()["model/threshold"]
     assert threshold == pytest.approx(2.0 * THRESHOLD_DECAY**40)
     # What part of the weight at exact states a grid point needs (see models.local_linear).
-    part = (1.0, 0.5)[degree]
-    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= part * threshold))
+    np.testing.assert_array_equal(agent.model.known, known | (agent.model.own_weight >= (1.0, 0.5)[degree] * threshold))
     assert agent.model.known.sum() > known.sum()
     np.testing.assert_array_equal(agent.mdp.arrays.modelled, agent.model.known)
     restored = square_agent(degree=degree, exploration_threshold=2.0)

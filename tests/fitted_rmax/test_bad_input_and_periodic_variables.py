@@ -7,7 +7,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from helpers.agents import assert_same_state, make_agent
 from helpers.ring import PERIODIC, Ring, ring_transitions, shifted
 from helpers.walk import Walk, small
@@ -29,8 +28,8 @@ class Scripted(gym.Env):
     """
 
     def __init__(self, n_variables=2, spoil=None, spoilt_from=5, reward=-1.0, action_space=None, space=None):
-        self.observation_space = space or spaces.Box(-1.0, 1.0, (n_variables,), dtype=np.float64)
-        self.action_space = action_space or spaces.Discrete(2)
+        self.observation_space = space or gym.spaces.Box(-1.0, 1.0, (n_variables,), dtype=np.float64)
+        self.action_space = action_space or gym.spaces.Discrete(2)
         self.n_variables = n_variables
         self.spoil, self.spoilt_from, self.reward = spoil, spoilt_from, reward
 
@@ -52,21 +51,21 @@ class Scripted(gym.Env):
 # What is refused as a space or as bounds is tested in common/test_scaling.py; here that it is refused from here as well.
 def test_fitted_rmax_refuses_observations_that_are_no_vector_of_real_numbers():
     with pytest.raises(ValueError, match="images"):
-        FittedRMax(Scripted(space=spaces.Box(0, 255, (64, 64, 3), dtype=np.uint8)))
+        FittedRMax(Scripted(space=gym.spaces.Box(0, 255, (64, 64, 3), dtype=np.uint8)))
 
 
 @pytest.mark.parametrize(("n", "n_discrete"), [(1, 5), (2, 9)])
 def test_continuous_actions_are_refused_with_the_line_that_makes_them_discrete(n, n_discrete):
-    env = Scripted(action_space=spaces.Box(-2.0, 2.0, (n,)))
+    env = Scripted(action_space=gym.spaces.Box(-2.0, 2.0, (n,)))
     with pytest.raises(ValueError, match="needs Discrete actions, the environment has Box") as caught:
         FittedRMax(env)
     [line] = re.findall(r"env = (gymnasium\.wrappers\..*)$", str(caught.value))
     model = FittedRMax(eval(line, {"gymnasium": gym, "env": env}), resolution=2, model_breadth=0.3)
-    assert model.action_space == spaces.Discrete(n_discrete)
+    assert model.action_space == gym.spaces.Discrete(n_discrete)
 
 
 @pytest.mark.parametrize(
-    "actions", [spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2), spaces.Box(0.0, 1.0, (2, 2))], ids=str
+    "actions", [gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiBinary(2), gym.spaces.Box(0.0, 1.0, (2, 2))], ids=str
 )
 def test_other_actions_are_refused(actions):
     with pytest.raises(ValueError, match="needs Discrete actions, the environment has") as caught:
@@ -224,9 +223,9 @@ class Anywhere(Scripted):
 @pytest.mark.parametrize(
     ("space", "actions"),
     [
-        (spaces.Box(-2.0, 1.0, (2,), dtype=np.float32), spaces.Discrete(1)),
-        (spaces.Box(0.0, 5.0, (1,), dtype=np.float64), spaces.Discrete(4, start=-2)),
-        (spaces.Box(np.float32([0, -1, 5]), np.float32([1, 1, 500])), spaces.Discrete(3)),
+        (gym.spaces.Box(-2.0, 1.0, (2,), dtype=np.float32), gym.spaces.Discrete(1)),
+        (gym.spaces.Box(0.0, 5.0, (1,), dtype=np.float64), gym.spaces.Discrete(4, start=-2)),
+        (gym.spaces.Box(np.float32([0, -1, 5]), np.float32([1, 1, 500])), gym.spaces.Discrete(3)),
     ],
     ids=str,
 )
@@ -326,8 +325,7 @@ def test_the_ring_is_learned_wherever_its_origin_is_and_its_model_saved(origin, 
 def test_the_environment_may_say_which_variables_are_periodic(wrap):
     model = FittedRMax(wrap(TellingRing()), seed=0, resolution=4)
     assert model.agent.periodic == tuple(PERIODIC) and model.periodic == PERIODIC
-    overruled = FittedRMax(wrap(TellingRing()), seed=0, resolution=4, periodic=[False, False])
-    assert overruled.agent.periodic == (False, False)
+    assert FittedRMax(wrap(TellingRing()), seed=0, resolution=4, periodic=[False, False]).agent.periodic == (False, False)
     buffer = io.BytesIO()
     model.save(buffer)
     buffer.seek(0)

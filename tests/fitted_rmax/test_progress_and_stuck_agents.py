@@ -5,7 +5,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 import sb3_combrel.fitted_rmax.agent as agent
@@ -143,8 +142,8 @@ class TwoJoints(gym.Env):
     points inside the block stay optimistic for ever, and the states before it are interpolated as if they led through.
     """
 
-    observation_space = spaces.Box(0.0, 1.0, (2,), dtype=np.float64)
-    action_space = spaces.Discrete(4)
+    observation_space = gym.spaces.Box(0.0, 1.0, (2,), dtype=np.float64)
+    action_space = gym.spaces.Discrete(4)
 
     def __init__(self, step=0.05):
         self.step_length = step

@@ -23,8 +23,7 @@ def expected_step(state, action):
 def possible_states(n_axes):
     """All states of a task with so many axes."""
     positions = st.lists(st.floats(-1.2, 0.6), min_size=n_axes, max_size=n_axes)
-    velocities = st.lists(st.floats(-0.07, 0.07), min_size=n_axes, max_size=n_axes)
-    return st.builds(lambda x, v: x + v, positions, velocities)
+    return st.builds(lambda x, v: x + v, positions, st.lists(st.floats(-0.07, 0.07), min_size=n_axes, max_size=n_axes))
 
 
 def env_in(env_id, state, **kwargs):

@@ -2,7 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 PERIODIC = [True, False]
 
@@ -17,8 +16,8 @@ class Ring(gym.Env):
     action_names = ("back", "forth")
 
     def __init__(self, origin=0.0):
-        self.observation_space = spaces.Box(np.array([-np.pi, -1.0]), np.array([np.pi, 1.0]), dtype=np.float64)
-        self.action_space = spaces.Discrete(2)
+        self.observation_space = gym.spaces.Box(np.array([-np.pi, -1.0]), np.array([np.pi, 1.0]), dtype=np.float64)
+        self.action_space = gym.spaces.Discrete(2)
         self.origin = origin
 
     def observe(self):

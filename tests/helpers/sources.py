@@ -2,7 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_combrel import SourceInstances
 
@@ -10,8 +9,8 @@ from sb3_combrel import SourceInstances
 class Corridor(gym.Env):
     """A cart that is pushed along [0, 1]: ends at 1, and is cut off after ``limit`` steps. The second variable counts."""
 
-    observation_space = spaces.Box(np.float32([0, 0]), np.float32([1, 100]), dtype=np.float32)
-    action_space = spaces.Discrete(2, start=-1)
+    observation_space = gym.spaces.Box(np.float32([0, 0]), np.float32([1, 100]), dtype=np.float32)
+    action_space = gym.spaces.Discrete(2, start=-1)
     state_names = ("place", "time")
     action_names = ("back", "forth")
 

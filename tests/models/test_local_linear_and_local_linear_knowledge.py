@@ -137,12 +137,10 @@ def test_within_an_episode_pairs_are_fitted_again_before_too_much_is_left_unexpl
         known_before, unexplained_before = model.known.copy(), fits.unexplained.copy()
         linear_models.learn_linear(model, naive, [transition])
         assert (fits.unexplained[model.known] <= MAX_UNEXPLAINED).all()
-        gained = (fits.unexplained != unexplained_before) & model.known
-        for pair in np.flatnonzero(gained & (fits.unexplained == 0.0)):
+        for pair in np.flatnonzero(((fits.unexplained != unexplained_before) & model.known) & (fits.unexplained == 0.0)):
             action, point = divmod(int(pair), naive.n_points)
             expected = naive.at_pair(action, point)
-            apart = np.abs(fits.row[pair, :d] - expected.effect)
-            assert (apart <= TOLERANCE * fits.effect_scale[action] + 1e-8).all()
+            assert (np.abs(fits.row[pair, :d] - expected.effect) <= TOLERANCE * fits.effect_scale[action] + 1e-8).all()
             assert abs(fits.row[pair, d] - expected.reward) <= TOLERANCE * abs(expected.reward) + 1e-8
             assert abs(fits.row[pair, d + 1] - expected.end) <= TOLERANCE + 1e-8
         assert (fits.unexplained[model.known & ~known_before] == 0.0).all(), "the first fit is made at once"

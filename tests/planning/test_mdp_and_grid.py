@@ -19,8 +19,7 @@ def make_mdp(grid=((2,), 0), gamma=1.0):
 
 def write(mdp, pairs, probability, effect, reward, modelled=True):
     """Write rows of predictions given as lists; effects of one variable may be plain numbers."""
-    pairs = np.asarray(pairs, dtype=np.int64)
-    probability = np.asarray(probability, dtype=np.float64)
+    pairs, probability = np.asarray(pairs, dtype=np.int64), np.asarray(probability, dtype=np.float64)
     effect = np.asarray(effect, dtype=np.float64).reshape(*probability.shape, mdp.grid.n_variables)
     modelled = np.broadcast_to(modelled, len(pairs)).copy()
     mdp.write_rows(pairs, modelled, probability, effect, np.asarray(reward, dtype=np.float64))

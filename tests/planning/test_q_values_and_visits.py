@@ -182,8 +182,7 @@ def ends_anywhere(reward):
     at = np.linspace(0.0, 1.0, 201)
     states, ends = np.tile(at, 2)[:, None], np.append(np.clip(at + 0.1, 0.0, 1.0), at)[:, None]
     actions = np.repeat([0, 1], 201)
-    rewards = np.where(actions == 1, reward, -1.0)
-    source = SourceInstances(states, actions, rewards, ends, actions == 1, [0.0], [1.0], 2)
+    source = SourceInstances(states, actions, np.where(actions == 1, reward, -1.0), ends, actions == 1, [0.0], [1.0], 2)
     return TIMBREL(source, InterTaskMapping([0], [0, 1]))
 
 

@@ -5,7 +5,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from helpers.walk import METHODS, Recorder, Walk, small, stored
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -106,8 +105,8 @@ class Still(gym.Env):
     """Nothing happens, in so many state variables."""
 
     def __init__(self, d, n_actions):
-        self.observation_space = spaces.Box(0.0, 1.0, (d,))
-        self.action_space = spaces.Discrete(n_actions)
+        self.observation_space = gym.spaces.Box(0.0, 1.0, (d,))
+        self.action_space = gym.spaces.Discrete(n_actions)
 
     def reset(self, *, seed=None, options=None):
         return np.full(self.observation_space.shape, 0.5, dtype=np.float32), {}

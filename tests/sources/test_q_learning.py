@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from helpers.sources import assert_same
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,8 +16,8 @@ MOUNTAIN_CAR = "combrel/MountainCar2D-v0"
 class Chain(gym.Env):
     """Three places in a row; from each, action 0 ends the episode with -4 and action 1 goes on for -1, at last for +0."""
 
-    observation_space = spaces.Box(0.0, 1.0, (1,), np.float64)
-    action_space = spaces.Discrete(2, start=3)
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2, start=3)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from helpers.sources import Corridor, assert_same, check_corridor
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import EvalCallback
@@ -102,7 +101,7 @@ class TestRecord:
 class OneAction(gym.ActionWrapper):
     """DQN and PPO want actions from 0 on."""
 
-    action_space = spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
 
     def action(self, action):
         return int(action) - 1

@@ -7,7 +7,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from helpers.sources import Corridor, assert_same, some_source
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -65,9 +64,9 @@ class TestSourceInstances:
         with pytest.raises(ValueError, match="record them in this task"):
             source.check_spaces(Corridor.observation_space, Corridor.action_space)
         with pytest.raises(ValueError, match=r"states between \[-1.2"):
-            source.check_spaces(spaces.Box(0, 1, (2,)), task.action_space)
+            source.check_spaces(gym.spaces.Box(0, 1, (2,)), task.action_space)
         with pytest.raises(ValueError, match="action space must be Discrete"):
-            source.check_spaces(task.observation_space, spaces.Box(0, 1, (1,)))
+            source.check_spaces(task.observation_space, gym.spaces.Box(0, 1, (1,)))
 
 
 class TestSubset:

@@ -75,8 +75,7 @@ def test_compiled_compliance_has_a_start_bandwidth_for_each_state_mapping(seed, 
     tables = compiled_tables(sample, [source], [mappings], bandwidths, starts=starts)
     for number in rng.choice(len(mappings), 6):
         mapping, row = mappings[int(number)], int(number) // mappings.n_action_mappings
-        own = bandwidths._replace(start=starts[row])
-        expected = equations.sample_compliance(sample, instances, mapping, own, GUARD)
+        expected = equations.sample_compliance(sample, instances, mapping, bandwidths._replace(start=starts[row]), GUARD)
         found = tables[np.arange(len(transitions)), row, np.array(mapping.action)[sample.action]]
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
         assert equations.task_compliance(expected, prior=0.25) == pytest.approx(expected.mean() / 4)

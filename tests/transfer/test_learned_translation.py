@@ -30,8 +30,7 @@ class Swapping(LearnedTranslation):
 
     def learn_translation(self, source, target, instances):
         self.given = source, target
-        n = self.task.n_actions
-        return Triplets(instances.state[:, ::-1], n - 1 - instances.action, instances.effect[:, ::-1])
+        return Triplets(instances.state[:, ::-1], self.task.n_actions - 1 - instances.action, instances.effect[:, ::-1])
 
 
 def observe(method, transitions):

@@ -337,8 +337,7 @@ def test_what_is_unexplained_is_compared_with_what_the_target_moves_so_far_withi
     high = np.max([np.median(sizes[source.actions == u], axis=0) for u in range(3)], axis=0)
     for copy, u in ((0, 0), (3, 2), (11, 1), (12, 1), (19, 0)):
         v = int(np.flatnonzero(copies.state[copy] >= 0)[-1])
-        k = copies.state[copy, v]
-        predicted = predicted_by(copies, copy, u, states)[:, v]
+        k, predicted = copies.state[copy, v], predicted_by(copies, copy, u, states)[:, v]
         expected = np.zeros(5)
         for i, action in enumerate(actions.tolist()):
             seen = [np.abs(effects[: i + 1, v][actions[: i + 1] == a]) for a in range(5)]

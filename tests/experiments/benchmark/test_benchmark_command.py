@@ -113,8 +113,7 @@ def contents(folder):
 class TestThePage:
     def test_every_method_of_the_command_has_a_row_with_numbers(self, made):
         rows = rows_of(made[0] / "two-walks.csv")
-        names = [row["method"] for row in rows]
-        assert names == ["none", "oracle", "COMBREL-factored", "DrawnMappings", "wide_prior"]
+        assert [row["method"] for row in rows] == ["none", "oracle", "COMBREL-factored", "DrawnMappings", "wide_prior"]
         for row in rows:
             assert row["runs"] == "3" and row["note"] == ""
             assert re.fullmatch(r"-\d+\.\d \[-\d+\.\d, -\d+\.\d\]", row["performance"]) and float(row["seconds"]) >= 0.0

@@ -66,8 +66,7 @@ class TestBest:
     def test_a_target_that_is_the_source_seen_through_a_mapping_reveals_it(self, source, mapping, monkeypatch):
         # Predictions in several parts are those of all at once.
         monkeypatch.setattr(of_paper, "_CHUNK", 37)
-        target = seen_through(mapping, 600, 1)
-        found = best_mappings(source, target, MappingSet.from_name("signed_injective", 2, 3, 2, 3))
+        found = best_mappings(source, seen_through(mapping, 600, 1), MappingSet.from_name("signed_injective", 2, 3, 2, 3))
         assert len(found) == 3
         for action, one in enumerate(found):
             assert one.action[action] == mapping.action[action]
