@@ -59,8 +59,7 @@ def collecting(request):
 
 def test_garbage_collection_waits_during_the_first_call_of_an_entry_point_only(collecting):
     entry = EntryPoint(gc.isenabled)
-    assert entry.call() is False
-    assert gc.isenabled() == collecting and entry.call() == entry() == collecting
+    assert entry.call() is False and gc.isenabled() == collecting and entry.call() == entry() == collecting
 
 
 def fail(x):
