@@ -26,8 +26,7 @@ def test_each_variable_is_divided_by_its_range():
     scaling = StateScaling.from_space(BOX)
     units = scaling.to_unit([[-1.2, -0.07], [0.6, 0.07], [-0.3, 0.0]])
     np.testing.assert_allclose(units, [[0, 0], [1, 1], [0.5, 0.5]], atol=1e-15)
-    assert units.dtype == np.float64
-    assert scaling.n_variables == 2
+    assert units.dtype == np.float64 and scaling.n_variables == 2
     # One state alone, and one outside the box: neither reshaped nor clipped.
     np.testing.assert_allclose(scaling.to_unit([2.4, 0.21]), [2.0, 2.0])
 

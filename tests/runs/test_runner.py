@@ -75,8 +75,7 @@ def test_what_is_not_whole_is_done_again(tmp_path):
     for n_bytes in (0, 1, len(whole) // 2, len(whole) - 3):
         file.write_bytes(whole[:n_bytes])
         assert runner.run_missing(jobs, tmp_path / "out", HERE) == before
-    assert [job.attempts() for job in jobs] == [5, 1]
-    assert file.read_bytes() == whole
+    assert [job.attempts() for job in jobs] == [5, 1] and file.read_bytes() == whole
 
 
 def test_results_of_other_settings_and_other_files_are_neither_mixed_nor_overwritten(tmp_path):
@@ -186,8 +185,7 @@ def _check_backend(backend, folder):
     found = runner.run_missing(jobs, folder / "out", backend)
     assert [result.error.partition(":")[0] for result in found] == [""] * 5 + ["FileNotFoundError"]
     assert [result.steps for result in found[:5]] == [[0, 2], [1, 2], [2, 2], [3, 2], [0, 2]]
-    assert {result.more["threads"] for result in found[:5]} == {1}
-    assert jobs[4].attempts() == 2
+    assert {result.more["threads"] for result in found[:5]} == {1} and jobs[4].attempts() == 2
     # Those that kill every worker are given up, and the others go on.
     deadly = toys(folder, 1, method="deadly", does="die") + toys(folder, 2, method="d")
     found = runner.run_missing(deadly, None, backend)

@@ -14,8 +14,7 @@ from sb3_combrel import FittedRMax
 def test_callbacks_are_called_at_every_step_and_at_start_and_end(make):
     recorder = Recorder()
     model = make().learn(25, callback=recorder)
-    assert (recorder.started, recorder.ended, recorder.n_calls) == (1, 1, 25)
-    assert model.num_timesteps == 25
+    assert (recorder.started, recorder.ended, recorder.n_calls) == (1, 1, 25) and model.num_timesteps == 25
     for shown in recorder.shown:
         assert shown["new_obs"].shape == (1, 2)
         assert shown["actions"].shape == shown["rewards"].shape == shown["dones"].shape == (1,)
@@ -36,8 +35,7 @@ def test_an_interrupt_ends_the_training_and_leaves_a_model_that_saves_and_goes_o
     model = make()
     with pytest.raises(KeyboardInterrupt):
         model.learn(100, callback=recorder)
-    assert recorder.ended == 1
-    assert model.agent.model.n_instances == 12
+    assert recorder.ended == 1 and model.agent.model.n_instances == 12
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert same_parameters(model, loaded)

@@ -23,8 +23,7 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 def test_predict_takes_one_observation_or_a_batch(make, deterministic):
     model = make(DummyVecEnv([Walk] * 3)).learn(60)
     one, state = model.predict(OBSERVATIONS[3], deterministic=deterministic)
-    assert (state is None) == (not deterministic)
-    assert np.shape(one) == () and one in (0, 1)
+    assert (state is None) == (not deterministic) and np.shape(one) == () and one in (0, 1)
     batch, _ = model.predict(OBSERVATIONS, deterministic=deterministic)
     assert batch.shape == (21,) and set(batch) <= {0, 1}
     actions, _ = model.predict(model.get_env().reset(), deterministic=deterministic)
@@ -148,8 +147,7 @@ def test_evaluate_policy_returns_the_fewest_steps(make):
     arguments = dict(n_eval_episodes=6, deterministic=False, return_episode_rewards=True)
     rewards, lengths = evaluate_policy(model, VecMonitor(DummyVecEnv([Walk] * 2)), **arguments)
     assert len(rewards) == len(lengths) == 6 and rewards == [-float(n) for n in lengths]
-    assert all(fewest_steps(0.0) <= n <= 30 for n in lengths)
-    assert same_parameters(model, before)
+    assert all(fewest_steps(0.0) <= n <= 30 for n in lengths) and same_parameters(model, before)
 
 
 def test_the_same_seed_gives_the_same_run_to_the_last_bit(make):

@@ -205,8 +205,7 @@ def test_the_old_file_is_there_until_the_new_one_is(tmp_path, monkeypatch):
 
     monkeypatch.setattr("sb3_combrel.common.files.os.replace", spy)
     write_whole(path, b"new")
-    assert seen == [(b"old", b"new")]
-    assert path.read_bytes() == b"new"
+    assert seen == [(b"old", b"new")] and path.read_bytes() == b"new"
     umask = os.umask(0)
     os.umask(umask)
     assert path.stat().st_mode & 0o777 == 0o666 & ~umask

@@ -72,8 +72,7 @@ class TestQLearning:
         assert source.terminated.any()
         # Section 5.1: it covers the state space. Most of the cells that a car can be in at all hold some instance.
         cells = set(map(tuple, np.floor(source.scaling.to_unit(source.states) * 8).clip(0, 7).astype(int)))
-        assert len(cells) >= 40
-        assert np.bincount(source.actions).min() > 100
+        assert len(cells) >= 40 and np.bincount(source.actions).min() > 100
 
     def test_the_greedy_policy_is_near_the_optimum_of_103_steps(self):
         learner = QLearning(MOUNTAIN_CAR, seed=1).learn(15_000)

@@ -130,8 +130,7 @@ def test_the_targets_model_decides_and_the_decision_is_saved(degree, tmp_path):
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert decision(loaded.policy.transfer) == DECIDED[degree]
     arguments = loaded.policy.transfer.arguments()
-    assert (arguments["use"], arguments["mappings"]) == DECIDED[degree]
-    assert same_parameters(loaded, model)
+    assert (arguments["use"], arguments["mappings"]) == DECIDED[degree] and same_parameters(loaded, model)
 
 
 OF_INSTANCES = {
@@ -318,8 +317,7 @@ def test_it_is_asked_once_at_each_step_of_learning_with_the_state_that_is_observ
     for (_, asked), (_, state, *_) in zip(method.asked, method.observed, strict=True):
         np.testing.assert_array_equal(asked, state)
     assert {action for *_, action, _ in method.observed[1::2]} == {1}
-    assert {action for *_, action, _ in method.observed[::2]} == {0, 1}
-    assert model.agent.model.n_instances == 70
+    assert {action for *_, action, _ in method.observed[::2]} == {0, 1} and model.agent.model.n_instances == 70
     for deterministic in (True, False):
         model.predict(OBSERVATIONS, deterministic=deterministic)
     model.agent.q_values(np.array([0.5, 0.5]))
@@ -335,8 +333,7 @@ def test_one_that_decides_nothing_leaves_learning_as_it_is_without_transfer(meth
 def test_each_environment_has_its_number():
     method = small(make_vec_env(Walk, n_envs=3), transfer=Deciding()).learn(60).policy.transfer
     assert [environment for environment, _ in method.asked] == [0, 1, 2] * 20
-    assert [environment for environment, *_ in method.observed] == [0, 1, 2] * 20
-    assert Deciding.environment == 0
+    assert [environment for environment, *_ in method.observed] == [0, 1, 2] * 20 and Deciding.environment == 0
 
 
 @pytest.mark.parametrize("what", [-1, 3, 1.0, True, "left", [1]], ids=repr)

@@ -207,8 +207,7 @@ def test_relevance_is_1_for_perfect_compliance_and_for_instances_without_evidenc
     assert equations.source_relevances(instances, identity, 0, nothing, bandwidths, 0.5).tolist() == [1.0, 1.0]
     differs = instances._replace(state=np.array([[0.2], [0.21]]), effect=np.array([[0.5], [0.5]]))
     contradicted, far = equations.source_relevances(instances, identity, 0, differs, bandwidths, 0.5)
-    assert contradicted < 1e-6
-    assert far == 1.0
+    assert contradicted < 1e-6 and far == 1.0
     # Also where rounding makes the compliance of an instance that every transition repeats a little less than 1.
     repeated = Transitions(*(np.repeat(column[:1], 7, axis=0) for column in instances))
     assert equations.source_relevances(instances, identity, 0, repeated, Bandwidths(0.3, 0.1, 0.7), 0.5)[0] == 1.0

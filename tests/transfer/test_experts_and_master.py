@@ -350,8 +350,7 @@ def test_the_first_actions_are_those_of_the_seeded_generator():
     for each in transitions_of(15):
         taken.append(agent.act(each.state))
         agent.update(each.state, taken[-1], -1.0, np.clip(each.next_state, 0.0, 1.0), False)
-    assert taken == [int(rng.integers(2)) for _ in range(15)]
-    assert agent.transfer.action(np.full(3, 0.5)) is None
+    assert taken == [int(rng.integers(2)) for _ in range(15)] and agent.transfer.action(np.full(3, 0.5)) is None
 
 
 def test_the_targets_model_decides_for_a_prior_unless_an_argument_is_one_of_instances():

@@ -107,8 +107,7 @@ def test_environments_that_act_before_either_has_moved_are_told_apart():
 
 def test_a_right_source_keeps_its_breadth_and_one_of_the_other_direction_narrows_with_each_episode_that_reaches_its_limit():
     found, method = breadths(steady_source(), 8, lambda action, rng: STEP[action] + 0.01 * rng.normal(size=2))
-    assert found == [0.3] * len(found)
-    assert 0.0 < method.statistics()["transfer/prediction_error"] < 0.2
+    assert found == [0.3] * len(found) and 0.0 < method.statistics()["transfer/prediction_error"] < 0.2
     # Of a narrower kernel than the third's too few states get instances at all.
     found, method = breadths(steady_source(-1.0), 3, lambda action, rng: STEP[action])
     np.testing.assert_allclose(found, 0.3 * 0.5 ** np.arange(1, 4))

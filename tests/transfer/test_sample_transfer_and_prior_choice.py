@@ -177,8 +177,7 @@ def test_nothing_is_transferred_before_the_first_draw_and_draws_follow_growth():
             assert not transferred_to_pairs(method, pairs, np.zeros(len(pairs))).length[: len(pairs)].any()
         if len(changed_pairs(method)):
             drawn_at.append(i)
-    assert drawn_at == [20, 24, 29]
-    assert method.mapping_steps() == 20
+    assert drawn_at == [20, 24, 29] and method.mapping_steps() == 20
     figures = method.statistics()
     assert figures["transfer/draws"] == 3 and figures["transfer/instances_drawn"] == len(method.drawn) > 0
     assert sum(n for _, n in method.drawn_counts()) == len(method.drawn)
@@ -192,8 +191,7 @@ def test_most_of_what_is_drawn_by_compliance_alone_stays_when_there_are_a_few_mo
     for transition in transitions_of(20, seed=9):
         show(method, transition)
     after = {tuple(row) for row in method.drawn.tolist()}
-    assert method.statistics()["transfer/draws"] == 2
-    assert len(before & after) > 0.8 * len(after)
+    assert method.statistics()["transfer/draws"] == 2 and len(before & after) > 0.8 * len(after)
 
 
 # The sums by which copies are judged, and the division that is chosen by them, against the equations and a full search.

@@ -61,8 +61,7 @@ def test_a_mirrored_variable_and_renamed_actions_are_found():
     method = bound(SoftHomomorphism(f.oscillator_source(effects=pushed), n_starts=2), 2, 2)
     show(method, (states, actions, np.column_stack([-effects[:, 1], effects[:, 0]])))
     state, action = method.mixture()
-    assert state[0, 0, 0, 1] > 0.95 and state[0, 1, 1, 0] > 0.95
-    assert action[0, [0, 1], renamed].min() > 0.85
+    assert state[0, 0, 0, 1] > 0.95 and state[0, 1, 1, 0] > 0.95 and action[0, [0, 1], renamed].min() > 0.85
 
 
 def test_two_copies_of_the_source_are_told_apart():

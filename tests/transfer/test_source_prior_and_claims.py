@@ -149,8 +149,7 @@ def test_a_given_mapping_that_is_wrong_stops_predicting_and_a_warning_says_so():
     assert transfer.prior(states, actions).effect.any()
     with pytest.warns(UserWarning, match=r"Oscillator-v0 predicts the target worse .* is \d") as caught:
         show(transfer, f.walk(TWO, 600))
-    assert len(caught) == 1
-    assert transfer.statistics()["transfer/prediction_error"] > 1.0
+    assert len(caught) == 1 and transfer.statistics()["transfer/prediction_error"] > 1.0
     found = transfer.prior(states, actions)
     # By chance noise may explain some of one variable's effects.
     assert (found.effect == 0.0).mean() > 0.7 and not found.weight.any()

@@ -97,18 +97,15 @@ class TestByRLZoo:
         assert card.data.model_name == "FittedRMax" and result.dataset_name == BIG_CAR
 
     def test_what_is_missing_on_the_hub_or_untrusted_gives_a_sentence(self, hub, monkeypatch, capsys):
-        assert load() == 1
-        assert capsys.readouterr().err == f"sb3_combrel.zoo: 404: no repository {OF_RL_ZOO}\n"
+        assert load() == 1 and capsys.readouterr().err == f"sb3_combrel.zoo: 404: no repository {OF_RL_ZOO}\n"
         (hub.folder / OF_RL_ZOO).mkdir(parents=True)
-        assert load() == 1
-        assert "has no file combrel-combrel-MountainCar4D-v0.zip" in capsys.readouterr().err
+        assert load() == 1 and "has no file combrel-combrel-MountainCar4D-v0.zip" in capsys.readouterr().err
         for error in (LocalEntryNotFoundError, huggingface_hub.errors.HTTPError):
             monkeypatch.setattr(huggingface_hub, "hf_hub_download", raising(error("no connection")))
             assert load() == 1
             assert re.fullmatch(r"sb3_combrel\.zoo: .*no connection.*\n", capsys.readouterr().err)
         monkeypatch.delenv("TRUST_REMOTE_CODE")
-        assert load() == 1
-        assert "TRUST_REMOTE_CODE" in capsys.readouterr().err
+        assert load() == 1 and "TRUST_REMOTE_CODE" in capsys.readouterr().err
 
 
 @pytest.mark.long

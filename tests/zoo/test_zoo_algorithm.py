@@ -73,8 +73,7 @@ def test_a_drawn_grid_is_relative_to_the_one_that_suits_the_task_and_stays_withi
         return ZooFittedRMax("FittedRMaxPolicy", box(n_variables), resolution=drawn, **arguments).agent.grid.resolution
 
     drawn = [resolution(3, each, model_breadth=0.2) for each in (None, "coarser", "finer")]
-    assert drawn == [(4,) * 3, (3,) * 3, (5,) * 3]
-    assert resolution(5, "finer") == resolution(5, None)
+    assert drawn == [(4,) * 3, (3,) * 3, (5,) * 3] and resolution(5, "finer") == resolution(5, None)
 
 
 def with_combrel(**arguments):

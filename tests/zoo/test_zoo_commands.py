@@ -73,8 +73,7 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, capsys, entry, change, 
 
 
 def test_an_unknown_command_or_algorithm_is_refused(tmp_path, capsys):
-    assert call("dance") == 2
-    assert "train" in capsys.readouterr().out
+    assert call("dance") == 2 and "train" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         call("train", *train_args(tmp_path, algo="magic"))
     assert "magic" in capsys.readouterr().err
@@ -156,8 +155,7 @@ class TestChain:
         assert call("train", *train_args(tmp_path, "--eval-freq", 30, env=env, n=60)) == 0
         (model_file,) = tmp_path.glob(f"fitted_rmax/*/{env}.zip")
         model = FittedRMax.load(model_file)
-        assert any(model.agent.periodic) and model.action_space.n == n_actions
-        assert enjoy(tmp_path, env=env) == 0
+        assert any(model.agent.periodic) and model.action_space.n == n_actions and enjoy(tmp_path, env=env) == 0
 
     def test_processes_tune_transfer_too_in_one_database_and_a_trial_is_trained_with(self, tmp_path):
         optuna = pytest.importorskip("optuna")

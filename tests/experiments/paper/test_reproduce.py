@@ -37,8 +37,7 @@ def check_tables(folder, name, number):
     for file in files:
         header, first = file.read_text().splitlines()[:2]
         assert header.count(",") >= 1 and first
-    assert not list(folder.glob(f"{name}_{number + 1}.csv"))
-    assert "nan" not in text and "inf" not in text
+    assert not list(folder.glob(f"{name}_{number + 1}.csv")) and "nan" not in text and "inf" not in text
 
 
 @pytest.fixture(scope="module")
@@ -96,8 +95,7 @@ def test_everything_from_nothing(tmp_path):
         assert len(lines) == 1 + 2 * n_methods and all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
     before = files_in(tmp_path / "output")
     _, again = run()
-    assert ", seed 50" in written and ", seed 50" not in again
-    assert files_in(tmp_path / "output") == before
+    assert ", seed 50" in written and ", seed 50" not in again and files_in(tmp_path / "output") == before
 
 
 @pytest.mark.long
