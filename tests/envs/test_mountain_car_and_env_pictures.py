@@ -61,9 +61,7 @@ class TestDynamics:
     @pytest.mark.parametrize(
         ("state", "action", "expected"),
         [
-            ([-1.19, -0.05], 1, [-1.2, 0.0]),
-            ([0.0, -0.0699], 1, [-0.07, -0.07]),
-            ([-1.1, 0.0699], 2, [-1.03, 0.07]),
+            *[([-1.19, -0.05], 1, [-1.2, 0.0]), ([0.0, -0.0699], 1, [-0.07, -0.07]), ([-1.1, 0.0699], 2, [-1.03, 0.07])],
             # From rest at the left wall gravity and engine push it to the right.
             ([-1.2, 0.0], 2, [-1.2 + 0.001 - 0.0025 * math.cos(3.6), 0.001 - 0.0025 * math.cos(3.6)]),
         ],

@@ -32,19 +32,10 @@ def oscillator_source(n=600, seed=0, noise=0.0, effects=oscillate, rewards=None)
     rng = np.random.default_rng(seed)
     states, actions = rng.random((n, 2)), rng.integers(3, size=n)
     after = states + effects(states, actions) + noise * rng.normal(size=states.shape)
-    return SourceInstances(
-        LOW + RANGE * states,
-        actions,
-        -np.ones(n) if rewards is None else rewards(states),
-        LOW + RANGE * after,
-        ends(after),
-        LOW,
-        LOW + RANGE,
-        3,
-        ("x", "v"),
-        ("Wait", "Down", "Up"),
-        {"env": "Oscillator-v0"},
-    )
+    rewards = -np.ones(n) if rewards is None else rewards(states)
+    states, next_states = LOW + RANGE * states, LOW + RANGE * after
+    about = 3, ("x", "v"), ("Wait", "Down", "Up"), {"env": "Oscillator-v0"}
+    return SourceInstances(states, actions, rewards, next_states, ends(after), LOW, LOW + RANGE, *about)
 
 
 def copies_mapping(n_copies, order=None):

@@ -50,13 +50,8 @@ def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model
 
     :param grid: an entry of GRIDS, or another such
     """
-    settings = ModelSettings(
-        model_breadth=kernel["breadth"],
-        min_weight=kernel["min_weight"],
-        min_fraction=kernel["min_fraction"],
-        exploration_threshold=threshold,
-        max_instances=max_instances,
-    )
+    arguments = dict(min_fraction=kernel["min_fraction"], exploration_threshold=threshold, max_instances=max_instances)
+    settings = ModelSettings(model_breadth=kernel["breadth"], min_weight=kernel["min_weight"], **arguments)
     return model_class(FiniteMDP(make_grid(grid), N_ACTIONS, gamma), settings, transfer)
 
 

@@ -42,19 +42,10 @@ def check_corridor(source, step_size=0.25):
 
 def some_source(n=40, seed=0):
     rng = np.random.default_rng(seed)
-    return SourceInstances(
-        rng.random((n, 2)),
-        rng.integers(3, size=n),
-        -np.ones(n),
-        rng.random((n, 2)),
-        np.arange(n) % 10 == 9,
-        np.zeros(2),
-        np.ones(2),
-        3,
-        ("x", "v"),
-        ("Neutral", "Left", "Right"),
-        {"env": "Some-v0", "seed": seed},
-    )
+    states, actions, next_states = rng.random((n, 2)), rng.integers(3, size=n), rng.random((n, 2))
+    about = 3, ("x", "v"), ("Neutral", "Left", "Right"), {"env": "Some-v0", "seed": seed}
+    ends = np.arange(n) % 10 == 9
+    return SourceInstances(states, actions, -np.ones(n), next_states, ends, np.zeros(2), np.ones(2), *about)
 
 
 def assert_same(one, other):

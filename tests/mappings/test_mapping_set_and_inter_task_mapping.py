@@ -43,9 +43,7 @@ class TestMappingSet:
     @pytest.mark.parametrize(
         "mapping_set",
         [
-            MappingSet.injective(2, 3, 2, 3),
-            MappingSet.all(1, 2, 2, 2, signs=True),
-            MappingSet.balanced(2, 2, 2, 3),
+            *[MappingSet.injective(2, 3, 2, 3), MappingSet.all(1, 2, 2, 2, signs=True), MappingSet.balanced(2, 2, 2, 3)],
             # Equal state mappings in several rows, as in the paper's layings.
             MappingSet([[0, -1], [-1, 0], [0, -1]], [[0, 1], [1, 1]], signs=[[1, -1], [1, 1], [1, 1]]),
         ],

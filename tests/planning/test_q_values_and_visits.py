@@ -19,21 +19,11 @@ N_ACTIONS = 3
 
 def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, threshold=1.0, periodic=None, **kernel):
     kernel = dict(breadth=0.3, min_weight=0.01, min_fraction=0.13) | kernel
-    agent = make_agent(
-        n_variables,
-        N_ACTIONS,
-        degree=0,
-        model_breadth=kernel["breadth"],
-        min_weight=kernel["min_weight"],
-        min_fraction=kernel["min_fraction"],
-        exploration_threshold=threshold,
-        resolution=resolution,
-        gamma=gamma,
-        max_value=max_value,
-        periodic=periodic,
-    )
-    settings = dict(threshold=threshold, gamma=gamma, max_value=max_value, periodic=periodic)
-    naive = NaiveFittedRMax(agent.grid.resolution, agent.grid.margin, N_ACTIONS, kernel, **settings)
+    task = dict(gamma=gamma, max_value=max_value, periodic=periodic)
+    breadth, fractions = kernel["breadth"], {name: kernel[name] for name in ("min_weight", "min_fraction")}
+    model = dict(degree=0, model_breadth=breadth, exploration_threshold=threshold, resolution=resolution, **fractions)
+    agent = make_agent(n_variables, N_ACTIONS, **model, **task)
+    naive = NaiveFittedRMax(agent.grid.resolution, agent.grid.margin, N_ACTIONS, kernel, threshold=threshold, **task)
     return agent, naive
 
 

@@ -223,16 +223,10 @@ def line(states, effects, rewards=None, actions=None):
     """Source instances of a task with the variables of ``states``, in the unit box."""
     states, effects = np.array(states, dtype=float), np.array(effects, dtype=float)
     n, d = states.shape
-    return SourceInstances(
-        states,
-        np.zeros(n, dtype=int) if actions is None else np.array(actions),
-        -np.ones(n) if rewards is None else np.array(rewards, dtype=float),
-        states + effects,
-        np.zeros(n, dtype=bool),
-        np.zeros(d),
-        np.ones(d),
-        1 if actions is None else max(actions) + 1,
-    )
+    actions = np.zeros(n, dtype=int) if actions is None else np.array(actions)
+    rewards = -np.ones(n) if rewards is None else np.array(rewards, dtype=float)
+    ends, n_actions = np.zeros(n, dtype=bool), int(actions.max()) + 1
+    return SourceInstances(states, actions, rewards, states + effects, ends, np.zeros(d), np.ones(d), n_actions)
 
 
 @settings(max_examples=25, deadline=None)
@@ -258,9 +252,7 @@ def test_default_bandwidths_are_what_they_are_said_to_be(seed, n, n_actions):
 @pytest.mark.parametrize(
     "source",
     [
-        line([[0.5]], [[0.0]]),
-        line([[0.5]] * 30, [[0.0]] * 30),
-        line([[0.1], [0.9]], [[0.0], [0.0]], actions=[0, 2]),
+        *[line([[0.5]], [[0.0]]), line([[0.5]] * 30, [[0.0]] * 30), line([[0.1], [0.9]], [[0.0], [0.0]], actions=[0, 2])],
         line([[0.1], [0.9], [0.2]], [[1e-12], [0.0], [1e-12]], rewards=[-1e9, 1e9, 0.0]),
     ],
     ids=["one", "all alike", "one an action", "extremes"],

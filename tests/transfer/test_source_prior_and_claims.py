@@ -291,19 +291,11 @@ def test_at_the_edge_of_its_data_a_source_knows_less_than_amid_them():
     ("unexplained", "n_covered", "trust"),
     [
         # Nothing seen; too little seen, however exact.
-        (0.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0),
-        (0.01, 2.0, 0.0),
+        *[(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.01, 2.0, 0.0)],
         # From three transitions on, in steps of a tenth, and more with every other one.
-        (0.0, 3.0, 0.5),
-        (0.6, 4.0, 0.4),
-        (0.0, 10.0, 0.7),
-        (0.0, 200.0, 0.9),
+        *[(0.0, 3.0, 0.5), (0.6, 4.0, 0.4), (0.0, 10.0, 0.7), (0.0, 200.0, 0.9)],
         # Less than half of what has been seen, or so little of it that hardly anything is left.
-        (51.0, 100.0, 0.0),
-        (49.0, 100.0, 0.4),
-        (2.0, 4.0, 0.0),
-        (200.0, 100.0, 0.0),
+        *[(51.0, 100.0, 0.0), (49.0, 100.0, 0.4), (2.0, 4.0, 0.0), (200.0, 100.0, 0.0)],
     ],
 )
 def test_trust_is_what_is_explained_in_steps_or_nothing(unexplained, n_covered, trust):

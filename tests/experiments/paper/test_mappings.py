@@ -11,10 +11,8 @@ from sb3_combrel.experiments.paper.mappings import BREADTH, best_mappings, most_
 SOURCE = (("pitch", "yaw"), ("S1-", "S1+", "S2-", "S2+"))
 TARGET = (("a", "b", "c"), ("T1-", "T1+"))
 USES = [
-    ("T1-", "S1-", "a<-pitch, c<-(-yaw)", "", 4),
-    ("T1-", "S2+", "a<-pitch, c<-(-yaw)", "", 2),
-    ("T1-", "S2+", "a<-yaw, b<-pitch", "", 5),
-    ("T1+", "S1+", "a<-yaw, b<-pitch", "", 1),
+    *[("T1-", "S1-", "a<-pitch, c<-(-yaw)", "", 4), ("T1-", "S2+", "a<-pitch, c<-(-yaw)", "", 2)],
+    *[("T1-", "S2+", "a<-yaw, b<-pitch", "", 5), ("T1+", "S1+", "a<-yaw, b<-pitch", "", 1)],
     # Of another run.
     ("T1-", "S1-", "a<-pitch, c<-(-yaw)", "", 2),
 ]
