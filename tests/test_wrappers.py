@@ -40,8 +40,7 @@ class Given(gym.Env):
 @given(st.permutations(range(5)), st.integers(1, 2), st.lists(st.floats(-3.1, 3.1), min_size=5, max_size=5), st.booleans())
 def test_each_angle_stands_where_its_cosine_was(order, n_pairs, values, single):
     pairs = [(order[2 * p], order[2 * p + 1]) for p in range(n_pairs)]
-    env = Given(dtype=np.float32 if single else np.float64)
-    state = dict(enumerate(values))
+    env, state = Given(dtype=np.float32 if single else np.float64), dict(enumerate(values))
     for cos, sin in pairs:
         env.next[cos], env.next[sin] = np.cos(state[cos]), np.sin(state[cos])
     for k in order[2 * n_pairs :]:

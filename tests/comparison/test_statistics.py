@@ -61,8 +61,7 @@ def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
 @quick
 @given(few_whole, few_whole)
 def test_a_permutation_test_of_few_runs_counts_every_regrouping(first, second):
-    together = first + second
-    differences = []
+    together, differences = first + second, []
     for chosen in combinations(range(len(together)), len(first)):
         one = [together[i] for i in chosen]
         other = [together[i] for i in range(len(together)) if i not in chosen]

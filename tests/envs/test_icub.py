@@ -73,8 +73,7 @@ class TestEpisodes:
         assert env.unwrapped.environment.physics.ball_displacement() == 0.0
 
     def test_without_noise_a_run_repeats_itself_bit_by_bit(self, env_id):
-        actions = random_actions(env_id, 150)
-        env = gymnasium.make(env_id)
+        actions, env = random_actions(env_id, 150), gymnasium.make(env_id)
         runs = [[env.reset()[0].tolist()] + [env.step(action)[0].tolist() for action in actions] for _ in range(2)]
         assert runs[0] == runs[1] == observations(env_id, actions, seed=1)
 

@@ -29,8 +29,7 @@ class TestDynamics:
     @given(data=st.data())
     def test_a_step_follows_the_equations(self, env_id, data):
         state = data.draw(possible_states(N_AXES[env_id]))
-        action = data.draw(st.integers(0, 2 * N_AXES[env_id]))
-        env = env_in(env_id, state)
+        action, env = data.draw(st.integers(0, 2 * N_AXES[env_id])), env_in(env_id, state)
         env.step(action)
         np.testing.assert_allclose(env.unwrapped.state, expected_step(state, action), rtol=0, atol=1e-15)
 
@@ -309,8 +308,7 @@ class TestICub:
     @pytest.mark.parametrize("look", ["primitives", pytest.param("meshes", marks=NO_MESHES)])
     def test_the_picture_is_well_lit_and_shows_the_strike_which_it_doesnt_change(self, look):
         env = gymnasium.make(TORSO, render_mode="rgb_array", look=look, width=320, height=240)
-        seen = [env.reset()[0].tolist()]
-        before = env.render()
+        seen, before = [env.reset()[0].tolist()], env.render()
         seen += [env.step(action)[0].tolist() for action in plan_of(TORSO)]
         after = env.render()
         env.close()

@@ -71,8 +71,7 @@ def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     job = replace(SHORT, method=name, env=env_id)
     env = job.make_env()
     assert np.all(env.observation_space.low == -1.0) and np.all(env.observation_space.high == 1.0)
-    model = make_model(job, env)
-    frequency = settings.pop("train_freq")
+    model, frequency = make_model(job, env), settings.pop("train_freq")
     assert model.train_freq.frequency == frequency and {key: getattr(model, key) for key in settings} == settings
     assert [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([first_rate, first_rate / 2, 0.0])
     assert model.policy.net_arch == network.pop("net_arch")
@@ -219,8 +218,7 @@ def test_the_control_is_what_really_happened(prefilled_job):
 
 @pytest.mark.parametrize("algorithm", baselines.OF_SOURCE)
 def test_the_buffer_holds_them_before_learning_and_their_steps_count(algorithm, prefilled_job, monkeypatch):
-    job = replace(prefilled_job, method=algorithm)
-    seen = {}
+    job, seen = replace(prefilled_job, method=algorithm), {}
     learn = DQN.learn
 
     def watched(model, *arguments, **others):

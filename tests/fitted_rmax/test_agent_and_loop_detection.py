@@ -171,8 +171,7 @@ def test_a_prior_is_not_asked_where_its_instances_have_changed(use, monkeypatch)
 
 def test_statistics_are_those_of_model_and_planner(method, degree):
     agent = square_agent(method, degree=degree)
-    n_steps = sum(map(len, learn(agent, 3)))
-    figures = agent.statistics()
+    n_steps, figures = sum(map(len, learn(agent, 3))), agent.statistics()
     known, modelled = agent.model.known, agent.mdp.arrays.modelled
     assert figures["model/instances"] == n_steps and figures["model/known"] == known.mean() > 0.0
     assert figures["model/transferred"] == pytest.approx((modelled & ~known).mean())

@@ -87,8 +87,7 @@ def test_other_returns_give_no_warning(episodes, explores):
 class Corridor(gym.Env):
     """A long corridor, whose end is out of reach."""
 
-    observation_space = gym.spaces.Box(0.0, 1000.0, (1,))
-    action_space = gym.spaces.Discrete(2)
+    observation_space, action_space = gym.spaces.Box(0.0, 1000.0, (1,)), gym.spaces.Discrete(2)
 
     def __init__(self, reward):
         self.reward = reward

@@ -64,8 +64,7 @@ def test_an_agent_refuses_a_transfer_method_that_does_not_fit_its_task():
 
 
 def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
-    defaults = FittedRMaxSettings()
-    of_fitted_rmax = inspect.signature(FittedRMax).parameters
+    defaults, of_fitted_rmax = FittedRMaxSettings(), inspect.signature(FittedRMax).parameters
     for name in FittedRMaxSettings.names():
         assert of_fitted_rmax[name].default == getattr(defaults, name), name
     # The policy hands on what it is given, and has no defaults of its own.

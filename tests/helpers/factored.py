@@ -71,8 +71,7 @@ def walk(mapping, n, seed=0, length=40, spread=0.5):
     d, n_actions = mapping.n_target_variables, mapping.n_target_actions
     rows = []
     while len(rows) < n:
-        state = 0.5 + spread * (rng.random(d) - 0.5)
-        action = int(rng.integers(n_actions))
+        state, action = 0.5 + spread * (rng.random(d) - 0.5), int(rng.integers(n_actions))
         for _ in range(length):
             if rng.random() < 0.3:
                 action = int(rng.integers(n_actions))
@@ -87,15 +86,13 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     """Effect, reward, end and weight that a local linear model predicts at ``at``, from the instances of one action."""
     squared = ((states - at) ** 2).sum(axis=1)
     near = np.argsort(squared, kind="stable")[:n_neighbors]
-    squared = squared[near]
-    scale = 1.0 / breadth**2
+    squared, scale = squared[near], 1.0 / breadth**2
     if len(near) == n_neighbors:
         scale = min(max(scale, -np.log(0.05) / squared[-1]), scale / 0.02**2)
     weights = np.exp(-(squared - squared[0]) * scale)
     x, e = states[near], effects[near]
     mean_x, mean_e = np.average(x, axis=0, weights=weights), np.average(e, axis=0, weights=weights)
-    ridge = RIDGE / scale
-    root = np.sqrt(weights)[:, None]
+    ridge, root = RIDGE / scale, np.sqrt(weights)[:, None]
     design = np.vstack([root * (x - mean_x), np.sqrt(ridge) * np.eye(len(at))])
     slopes = np.linalg.lstsq(design, np.vstack([root * (e - mean_e), np.zeros((len(at), e.shape[1]))]), rcond=None)[0]
     effect = np.clip(mean_e + (at - mean_x) @ slopes, effects.min(axis=0), effects.max(axis=0))
@@ -128,8 +125,7 @@ def predicted_by(copies, copy, source_action, states):
     effects = (source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))[mask][:, used]
     found = np.full(states.shape, np.nan)
     for i, state in enumerate(states):
-        at = np.array([state[list(row).index(k)] for k in used])
-        nowhere = np.zeros(len(units))
+        at, nowhere = np.array([state[list(row).index(k)] for k in used]), np.zeros(len(units))
         effect, *_ = naive_prediction(units, effects, nowhere, nowhere, at, 0.2, 24, 0.05)
         for k, value in zip(used, effect, strict=True):
             found[i, list(row).index(k)] = value

@@ -32,8 +32,7 @@ KERNELS = [
 
 def random_transitions(seed, n_variables, n):
     """States that repeat now and then, effects that leave the box now and then, some of them zero."""
-    rng = np.random.default_rng(seed)
-    transitions = []
+    rng, transitions = np.random.default_rng(seed), []
     for _ in range(n):
         state = rng.random(n_variables)
         if transitions and rng.random() < 0.15:

@@ -38,11 +38,9 @@ class Ring(gym.Env):
 
 def ring_transitions(seed, n):
     """Random transitions of a periodic and another variable, unit coordinates, many of them across the origin."""
-    rng = np.random.default_rng(seed)
-    transitions = []
+    rng, transitions = np.random.default_rng(seed), []
     for _ in range(n):
-        state = rng.random(2)
-        action = int(rng.integers(2))
+        state, action = rng.random(2), int(rng.integers(2))
         effect = rng.normal([0.08 if action else -0.08, 0.0], 0.04)
         after = np.array([(state[0] + effect[0]) % 1.0, np.clip(state[1] + effect[1], 0.0, 1.0)])
         transitions.append((state, action, -1.0, after, bool(abs(after[0] - 0.5) < 0.05)))

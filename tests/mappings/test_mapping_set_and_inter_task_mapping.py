@@ -178,8 +178,7 @@ class TestInterTaskMapping:
         np.testing.assert_allclose(mapping.target_to_source([0.2, 0.4, 0.9], 2), [0.4, 0.9])
 
     def test_each_instance_may_have_its_own_target_state(self):
-        mapping = InterTaskMapping((0, None), (0,))
-        current = [[0.1, 0.2], [0.3, 0.4]]
+        mapping, current = InterTaskMapping((0, None), (0,)), [[0.1, 0.2], [0.3, 0.4]]
         np.testing.assert_allclose(mapping.source_to_target([[0.5], [0.6]], current), [[0.5, 0.2], [0.6, 0.4]])
 
     def test_actions_translate_both_ways(self):

@@ -253,8 +253,7 @@ def assert_same_parameters(one, other):
 
 def test_beyond_max_instances_a_third_party_model_replaces_its_oldest_instances(tmp_path):
     model = third_party(TRANSFERS["none"], max_instances=15).learn(150)
-    agent = model.agent
-    expected = [np.empty((0, 2))] * 2
+    agent, expected = model.agent, [np.empty((0, 2))] * 2
     rng = np.random.default_rng(0)
     for _ in range(60):
         state, action = rng.random(2), int(rng.integers(2))

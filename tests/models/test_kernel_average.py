@@ -58,8 +58,7 @@ def test_a_transition_or_a_lower_threshold_changes_the_rows_of_the_pairs_that_ar
     kernel_models.learn(model, before)
     changed = model.add(*last)
     assert len(np.unique(changed)) == len(changed) and (changed // model.grid.n_points == last[1]).all()
-    known = model.known.copy()
-    newly_known = model.lower_threshold(low)
+    known, newly_known = model.known.copy(), model.lower_threshold(low)
     np.testing.assert_array_equal(newly_known, np.flatnonzero(~known & (model.own_weight >= low)))
     np.testing.assert_array_equal(model.known, known | (model.own_weight >= low))
     model.update_rows(changed)
@@ -126,8 +125,7 @@ def test_lists_rows_and_instances_are_complete_after_their_arrays_have_grown():
     grid, kernel = ((4, 4), 0), dict(breadth=0.4, min_weight=0.01, min_fraction=0.001)
     model, naive = kernel_models.model_and_definition(grid, kernel)
     lists, rows = len(model.arrays.lists.item), len(model.mdp.arrays.rows.item)
-    capacity = model.instances.capacity
-    transitions = kernel_models.random_transitions(3, 2, 500)
+    capacity, transitions = model.instances.capacity, kernel_models.random_transitions(3, 2, 500)
     kernel_models.learn(model, transitions)
     assert len(model.arrays.lists.item) > lists and len(model.mdp.arrays.rows.item) > rows
     assert model.instances.capacity > capacity

@@ -114,8 +114,7 @@ def test_sums_and_rows_are_right_after_arrays_have_grown(grid):
 def test_a_lower_threshold_and_what_is_accepted_make_pairs_known(problem, threshold):
     model, naive, _ = with_some_prior(problem, [])
     linear_models.learn_linear(model, naive, random_transitions(problem[2], len(problem[0][0]), problem[3]))
-    before = model.known.copy()
-    newly_known = model.lower_threshold(threshold)
+    before, newly_known = model.known.copy(), model.lower_threshold(threshold)
     naive.lower_threshold(threshold)
     np.testing.assert_array_equal(newly_known, np.flatnonzero(~before & naive.known.reshape(-1)))
     model.update_rows(newly_known)
@@ -148,8 +147,7 @@ def test_within_an_episode_pairs_are_fitted_again_before_too_much_is_left_unexpl
 
 def test_most_instances_that_agree_with_the_fit_change_no_row():
     model = linear_models.make_linear_model(((3, 3), 0), linear_models.LINEAR_KERNELS[0], n_actions=1)
-    rng = np.random.default_rng(0)
-    n_changed = []
+    rng, n_changed = np.random.default_rng(0), []
     for state in rng.random((400, 2)):
         n_changed.append(len(model.add(state, 0, -1.0, state + 0.1 + 0.05 * state, False)))
     assert np.mean(n_changed[200:]) < 0.2 * np.mean(n_changed[:20])

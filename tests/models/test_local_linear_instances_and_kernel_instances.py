@@ -235,8 +235,7 @@ def assert_same_to_the_last_bit(one, other):
 
 @pytest.mark.parametrize(("grid", "kernel"), [(grid, KERNELS[i % 4]) for i, grid in enumerate(GRIDS) if i % 3 == 2], ids=str)
 def test_a_restored_model_is_and_learns_on_as_the_original_to_the_last_bit(grid, kernel):
-    model = make_model(grid, kernel)
-    transitions = random_transitions(3, len(grid[0]), 130)
+    model, transitions = make_model(grid, kernel), random_transitions(3, len(grid[0]), 130)
     learn(model, transitions[:100])
     fresh = restored(model, grid, kernel)
     assert model.arrays.lists.length.max() > 1
@@ -257,8 +256,7 @@ def test_a_model_that_replaced_instances_is_restored_to_what_it_is_without_them(
     grid = GRIDS[2]
     model = make_model(grid, kernel, max_instances=20)
     learn(model, random_transitions(4, 2, 200))
-    fresh = restored(model, grid, kernel, max_instances=20)
-    n_points = model.grid.n_points
+    fresh, n_points = restored(model, grid, kernel, max_instances=20), model.grid.n_points
     for pair in range(N_ACTIONS * n_points):
         action, at = pair // n_points, model.grid.points()[pair % n_points]
         apart = ((model.instances.state[action, :20] - at) ** 2).sum(axis=1)

@@ -88,8 +88,7 @@ def effects_of(model, states):
 
 @pytest.mark.parametrize("d", [1, 2, 3, 4])
 def test_linear_dynamics_are_found_from_a_few_instances_far_better_than_by_the_kernel_average(d):
-    rng = np.random.default_rng(d)
-    dynamics = LinearDynamics(d, d)
+    rng, dynamics = np.random.default_rng(d), LinearDynamics(d, d)
     grid = ((2,) * d, 0)
     models = make_linear_model(grid, BROAD), make_model(grid, BROAD)
     transitions = dynamics.transitions(rng.random((10 * d, d)))

@@ -49,8 +49,7 @@ def random_predictions(rng, n, n_successors, n_variables):
 def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
     rng = np.random.default_rng(seed)
     mdp, naive = make_mdp(grid, gamma)
-    n_points = mdp.grid.n_points
-    expected = {}
+    n_points, expected = mdp.grid.n_points, {}
     for _ in range(3):  # a later row replaces an earlier one
         pairs = rng.choice(N_ACTIONS * n_points, min(40, n_points), replace=False)
         probability, effect, reward = random_predictions(rng, len(pairs), n_successors, len(grid[0]))
@@ -124,8 +123,7 @@ def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, exp
 def test_the_stores_grow_and_keep_the_rows_that_were_written_before():
     mdp, naive = make_mdp(((4, 4), 0))
     rows, predecessors = len(mdp.arrays.rows.item), len(mdp.arrays.predecessors.item)
-    rng = np.random.default_rng(0)
-    pairs = np.arange(N_ACTIONS * mdp.grid.n_points)
+    rng, pairs = np.random.default_rng(0), np.arange(N_ACTIONS * mdp.grid.n_points)
     probability, effect, reward = random_predictions(rng, len(pairs), 40, 2)
     for some in np.array_split(pairs, 7):
         write(mdp, some, probability[some], effect[some], reward[some])

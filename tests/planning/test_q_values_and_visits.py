@@ -140,8 +140,7 @@ def test_q_does_not_depend_on_the_states_asked_for_before():
     agent, _ = agent_and_definition(2, 3, breadth=0.15, min_fraction=0.05)
     for state in np.round(rng.random((150, 2)) * 12) / 12:
         agent.model.add(state, int(rng.integers(N_ACTIONS)), -1.0, np.clip(state + 0.05, 0, 1), False)
-    values = rng.normal(size=len(agent.planner.values)) - 5.0
-    untouched = copy.deepcopy(agent)
+    values, untouched = rng.normal(size=len(agent.planner.values)) - 5.0, copy.deepcopy(agent)
     queries = np.round(rng.random((20, 2)) * 24) / 24
     first = [agent.q_values(state, values) for state in queries]
     for number in rng.permutation(len(queries)):
@@ -243,8 +242,7 @@ def agent_beside_unknown_points():
 
 @pytest.mark.filterwarnings("ignore:resolution")
 def test_the_agent_makes_pairs_known_that_it_has_visited_often_enough():
-    agent = agent_beside_unknown_points()
-    points = list(NaiveGrid((3, 3), 1).corners(STATE))
+    agent, points = agent_beside_unknown_points(), list(NaiveGrid((3, 3), 1).corners(STATE))
     pairs = [action * agent.grid.n_points + point for action in range(2) for point in points]
     agent.model.known[pairs] = False
     agent.model.fits.total[pairs] = 0.3

@@ -56,8 +56,7 @@ def walk(seed, n, n_variables=2, goal=0.8, reward=lambda rng: -1.0):
     """Steps about the box; those that end near the upper corner end the episode."""
     rng = np.random.default_rng(seed)
     for _ in range(n):
-        state = rng.random(n_variables)
-        action = int(rng.integers(N_ACTIONS))
+        state, action = rng.random(n_variables), int(rng.integers(N_ACTIONS))
         next_state = np.clip(state + rng.normal((0.12 if action else -0.12), 0.05, n_variables), 0.0, 1.0)
         yield state, action, reward(rng), next_state, bool((next_state > goal).all())
 
@@ -93,8 +92,7 @@ def test_passes_over_the_grid_reach_the_same_values_and_a_few_leave_the_rest_of_
 
 
 def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again():
-    problem = Problem((3,), 0, gamma=0.9, max_value=2.0, max_instances=2)
-    lost = 0
+    problem, lost = Problem((3,), 0, gamma=0.9, max_value=2.0, max_instances=2), 0
     known = problem.model.known.copy()
     for transition in walk(2, 40, 1):
         problem.update(transition)
@@ -139,8 +137,7 @@ def values_of_rows(problem, optimistic=True, upper=np.inf):
 )
 def test_values_are_bounded_by_what_is_given_and_optimistic_ones_are_that(seed, n, changes):
     """However bounds come, fall and rise between transitions: exactly, as from the beginning with the last of them."""
-    rng = np.random.default_rng(seed)
-    problem = Problem((3,), 1, gamma=0.9, max_value=2.0)
+    rng, problem = np.random.default_rng(seed), Problem((3,), 1, gamma=0.9, max_value=2.0)
     for k, change in enumerate(changes):
         for transition in walk(seed + k, n, 1):
             problem.update(transition)
@@ -183,8 +180,7 @@ def test_exploitation_values_are_those_of_the_modelled_pairs_alone(resolution, s
         problem.update(transition)
     modelled = problem.model.mdp.arrays.n_optimistic < N_ACTIONS
     assert 0 < modelled.sum() < len(modelled), "points with a model and points without"
-    before = problem.planner.values.copy()
-    values = problem.planner.exploitation_values()
+    before, values = problem.planner.values.copy(), problem.planner.exploitation_values()
     np.testing.assert_allclose(values, values_of_rows(problem, optimistic=False), atol=1e-5)
     assert (values <= before + 1e-9).all() and (values < before).any()
     np.testing.assert_array_equal(problem.planner.values, before)

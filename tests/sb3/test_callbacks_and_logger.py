@@ -31,8 +31,7 @@ def test_a_callback_can_stop_the_learning(make):
 
 
 def test_an_interrupt_ends_the_training_and_leaves_a_model_that_saves_and_goes_on(make, tmp_path):
-    recorder = Recorder(interrupt_at=12)
-    model = make()
+    recorder, model = Recorder(interrupt_at=12), make()
     with pytest.raises(KeyboardInterrupt):
         model.learn(100, callback=recorder)
     assert recorder.ended == 1 and model.agent.model.n_instances == 12

@@ -214,14 +214,12 @@ def test_the_old_file_is_there_until_the_new_one_is(tmp_path, monkeypatch):
 class Untouched(Env):
     """Spaces of Mountain Car's size."""
 
-    observation_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
-    action_space = spaces.Discrete(3)
+    observation_space, action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float64), spaces.Discrete(3)
 
 
 def test_a_file_is_no_larger_than_states_and_effects(tmp_path):
     """State and effect have all their digits; reward, action and the rest cost nothing to speak of."""
-    n = 5_000
-    rng = np.random.default_rng(0)
+    n, rng = 5_000, np.random.default_rng(0)
     effect = 0.02 * rng.normal(size=(n, 2))
     state = np.abs((np.cumsum(effect, axis=0) + 0.5) % 2.0 - 1.0)
     action = np.sort(rng.integers(3, size=n))

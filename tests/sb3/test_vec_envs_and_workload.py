@@ -90,8 +90,7 @@ def test_get_vec_normalize_env_returns_the_normalizing_environment(tmp_path):
 
 
 def test_set_env_goes_on_with_what_was_learned():
-    model = small().learn(20)
-    other = DummyVecEnv([Walk])
+    model, other = small().learn(20), DummyVecEnv([Walk])
     model.set_env(other)
     assert model.get_env() is other
     model.learn(10)

@@ -140,8 +140,7 @@ def test_what_is_no_source_is_refused_at_construction(source, error, message):
 
 
 def test_a_path_that_goes_before_it_is_read_is_named(tmp_path):
-    file = some_source().save(tmp_path / "source.npz")
-    transfer = COMBREL(tmp_path / "source")
+    file, transfer = some_source().save(tmp_path / "source.npz"), COMBREL(tmp_path / "source")
     file.unlink()
     with pytest.raises(FileNotFoundError, match=r"no source file .*source"):
         small(transfer=transfer)

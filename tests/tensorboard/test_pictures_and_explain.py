@@ -91,8 +91,7 @@ def test_without_matplotlib_there_are_no_pictures_but_all_else(tmp_path, monkeyp
 def test_the_greedy_action_is_the_best_of_the_model():
     agent = walker().learn(400).agent
     points = np.arange(agent.grid.n_points)
-    q = action_values(agent, points)
-    greedy = greedy_actions(agent, points)
+    q, greedy = action_values(agent, points), greedy_actions(agent, points)
     for point in points:
         slow = [slow_q(agent, point, action) for action in range(2)]
         assert q[:, point] == pytest.approx([np.nan if value is None else value for value in slow], nan_ok=True)
@@ -130,8 +129,7 @@ def test_source_actions_are_those_of_the_chosen_mappings(learnt):
 
 
 def test_shares_of_state_mappings_add_up(learnt):
-    transfer = learnt.transfer
-    history = ChoiceHistory()
+    transfer, history = learnt.transfer, ChoiceHistory()
     history.note(0, np.full(9, -1))
     history.note(100, transfer.choices())
     names, shares = state_mapping_shares(history, transfer)

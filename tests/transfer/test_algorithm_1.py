@@ -86,8 +86,7 @@ def mapping_of(method, candidate):
 def mean_compliances(method, sample, source, near, action, guard):
     """Lines 9-13 and 19 of Algorithm 1: mean compliance of every candidate of ``action`` with transitions ``near``."""
     first, usual = method.candidates.arrays.first, default_bandwidths(method.candidates.instances)
-    sample_near = Transitions(*(column[near] for column in sample))
-    of_candidates = []
+    sample_near, of_candidates = Transitions(*(column[near] for column in sample)), []
     for candidate in range(first[action], first[action + 1]):
         mapping = mapping_of(method, candidate)
         n_compared = len(mapping.state) - mapping.state.count(None)
@@ -103,8 +102,7 @@ def test_combrel_selects_the_best_mapping_of_the_equations(seed, k, guard):
     states, actions, first = rng.random((4, 3)), np.tile(np.arange(2), 2), method.candidates.arrays.first
     chosen = method.selected(states, actions)
     changed_pairs(method)
-    on_grid = method.choices().reshape(2, -1)
-    asked = list(zip(states, actions, chosen, strict=True))
+    on_grid, asked = method.choices().reshape(2, -1), list(zip(states, actions, chosen, strict=True))
     asked += [(GRID[p], a, on_grid[a, p]) for a in (0, 1) for p in rng.choice(len(GRID), 2)]
     for state, action, candidate in asked:
         near = equations.nearest_transitions(state, action, sample, k)

@@ -237,8 +237,7 @@ def test_every_state_gets_the_whole_mapping_with_the_highest_mean_compliance(n_n
     for point, state in enumerate(STATES):
         # The nearest transitions, whatever their action.
         expected = table[np.argsort([np.linalg.norm(t.state - state) for t in seen])[:n_neighbors]].mean(axis=0)
-        best = expected.max()
-        first = choices[:, point] - method.candidates.arrays.first[:-1]
+        best, first = expected.max(), choices[:, point] - method.candidates.arrays.first[:-1]
         if best == 0.0:
             assert (choices[:, point] == -1).all()
             continue
@@ -254,15 +253,13 @@ def test_every_state_gets_the_whole_mapping_with_the_highest_mean_compliance(n_n
 
 def test_the_action_of_a_neighbor_decides_between_mappings_with_the_same_source_action():
     """Both mappings have source action 0 for target action 0; a transition with action 1 next to it tells them apart."""
-    states = np.random.default_rng(0).random((200, 1))
-    actions = np.arange(200) % 2
+    states, actions = np.random.default_rng(0).random((200, 1)), np.arange(200) % 2
     effects = np.where(actions == 0, 0.1, -0.1)[:, None]
     source = naive.SourceInstances(
         states, actions, -np.ones(200), states + effects, np.zeros(200, bool), np.zeros(1), np.ones(1), 2
     )
     mappings = [InterTaskMapping([0], [0, 0]), InterTaskMapping([0], [0, 1])]
-    task = naive.target_task(np.array([[0.5]]), 2)
-    chosen = {}
+    task, chosen = naive.target_task(np.array([[0.5]]), 2), {}
     for neighbors in ("action", "state_action"):
         method = asking.bound(COMBREL(source, mappings, neighbors=neighbors), task)
         asking.show(method, naive.Transition(np.array([0.5]), 1, -1.0, np.array([0.4])))

@@ -109,8 +109,7 @@ def test_more_evidence_demanded_makes_compliances_0_and_changes_no_other(seed, s
 
 def test_compliance_of_the_source_with_itself_is_1_where_instances_do_not_overlap():
     """Far enough from each other, each instance is predicted by itself alone."""
-    at = np.linspace(0.0, 1.0, 5)[:, None]
-    effect = np.array([[0.1], [-0.1], [0.05], [0.0], [-0.2]])
+    at, effect = np.linspace(0.0, 1.0, 5)[:, None], np.array([[0.1], [-0.1], [0.05], [0.0], [-0.2]])
     instances = Transitions(at, np.array([0, 1, 0, 1, 0]), effect, np.arange(5.0), np.zeros(5, dtype=bool))
     bandwidths, mirrored = Bandwidths(0.001, 0.0001, 0.1), instances._replace(state=1.0 - at, effect=-effect)
     identity, swapped = InterTaskMapping([0], [0, 1]), InterTaskMapping([0], [1, 0])
@@ -279,8 +278,7 @@ def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_n
 
 def test_min_evidence_is_the_sum_of_kernels_below_which_nothing_counts():
     source, transition = line([[0.3], [0.3]], [[0.1], [0.1]]), naive.Transition(np.array([0.4]), 0, -1.0, np.array([0.5]))
-    evidence = 2 * np.exp(-0.01 / 0.005)
-    task = naive.target_task(np.array([[0.4]]), 1)
+    evidence, task = 2 * np.exp(-0.01 / 0.005), naive.target_task(np.array([[0.4]]), 1)
     for least, expected in ((0.0, 1.0), (0.99 * evidence, 1.0), (1.01 * evidence, np.nan)):
         arguments = dict(bandwidths=(0.005, 0.01, 1.0), min_evidence=least, min_compliance=0.0)
         method = bound(COMBREL(source, InterTaskMapping([0], [0]), **arguments), task)

@@ -153,8 +153,7 @@ def naive_ucb1(returns, exploration):
 
 
 def test_the_bandit_is_ucb1():
-    rng = np.random.default_rng(0)
-    chosen = set()
+    rng, chosen = np.random.default_rng(0), set()
     for _ in range(300):
         returns = [rng.normal(size=rng.integers(0, 6)).tolist() for _ in range(4)]
         returns[int(rng.integers(4))].append(0.0)
@@ -308,8 +307,7 @@ def test_of_several_sources_the_best_mapping_to_one_is_chosen(use):
 def test_a_set_in_which_state_mappings_are_repeated():
     """Those of the paper come in pairs of equal ones."""
     source, transitions = source_of(0, 2, 3), transitions_of(8, 4, 5)
-    points = np.random.default_rng(0).random((5, 4))
-    different = MappingSet.balanced(2, 4, 3, 5)
+    points, different = np.random.default_rng(0).random((5, 4)), MappingSet.balanced(2, 4, 3, 5)
     errors = naive_errors(source, different, transitions)
     for use in USES:
         method = bound(MASTER(source, "paper_mountain_car", n_random_steps=8, use=use), naive.target_task(points, 5))

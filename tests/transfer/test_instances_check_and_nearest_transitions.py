@@ -159,8 +159,7 @@ def test_ends_that_came_once_outweigh_those_that_did_not():
     ("rewards", "narrows"), [((-1.0, -1.0), True), ((0.0, 0.0), True), ((1.0, 1.0), False), ((-1.0, 0.0), False)]
 )
 def test_episodes_in_which_nothing_is_tried_count_where_no_reward_tells_states_apart(rewards, narrows):
-    check = check_of()
-    found = []
+    check, found = check_of(), []
     for _ in range(EPISODES_IN_VAIN + 1):
         for reward in rewards:
             step(check, None, [0.05, 0.0], reward=reward)
@@ -194,10 +193,8 @@ def random_cache(rng, n_transitions, n_candidates, least=0.4):
 
 def shares(near, cache, n_candidates, n_before=5):
     """The fraction of evenly spread draws that chooses each candidate of the second of two actions; the last entry: none."""
-    draws = (np.arange(N_DRAWS) + 0.5) / N_DRAWS
-    choice = np.full(2 * N_DRAWS, -7)
-    first = np.array([0, n_before, n_before + n_candidates])
-    actions = np.ones(N_DRAWS, dtype=np.int64)
+    draws, choice = (np.arange(N_DRAWS) + 0.5) / N_DRAWS, np.full(2 * N_DRAWS, -7)
+    first, actions = np.array([0, n_before, n_before + n_candidates]), np.ones(N_DRAWS, dtype=np.int64)
     rows, each_near = np.arange(N_DRAWS, 2 * N_DRAWS), np.tile(near, (2 * N_DRAWS, 1))
     choose(rows, actions, each_near, tuple(cache), first, draws, choice)
     assert (choice[:N_DRAWS] == -7).all()
@@ -209,8 +206,7 @@ def shares(near, cache, n_candidates, n_before=5):
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from([0.0, 0.4, 0.6, 2.0]))
 def test_each_candidate_is_drawn_in_proportion_to_its_mean_compliance(seed, n_candidates, least):
     rng = np.random.default_rng(seed)
-    cache = random_cache(rng, 6, n_candidates, least)
-    near = rng.permutation(6)[:3]
+    cache, near = random_cache(rng, 6, n_candidates, least), rng.permutation(6)[:3]
     near[rng.integers(1, 4) :] = -1
     means = cache.compliance[near[near >= 0], :n_candidates].mean(axis=0)
     enough = np.where(means > least, means, 0.0)

@@ -67,8 +67,7 @@ def test_standardised_columns_have_mean_0_and_deviation_1_or_do_not_vary():
 
 def test_with_the_right_mapping_it_is_timbrel_with_that_mapping():
     """Two permuted variables: the instances transferred, nearest first until the threshold, are those of TIMBREL."""
-    source = f.oscillator_source(200)
-    task = target_task(np.random.default_rng(0).random((15, 2)), 3)
+    source, task = f.oscillator_source(200), target_task(np.random.default_rng(0).random((15, 2)), 3)
     ours = bound(Swapping(source, n_random_steps=10, breadth=0.2), task)
     theirs = bound(TIMBREL(source, InterTaskMapping([1, 0], [2, 1, 0]), breadth=0.2), task)
     states, actions, effects = random_transitions(10, 2, 3)
@@ -280,8 +279,7 @@ def test_training_depends_on_its_seed_alone_and_leaves_pytorchs_generator_and_th
 
 @pytest.mark.parametrize("n", [1, 7])
 def test_a_reconstruction_is_a_fixed_point_of_its_iterations_where_weights_are_small(n):
-    machine = machines.Machine(*(0.3 * each for each in some_machine()))
-    source = some_units(n)[0]
+    machine, source = machines.Machine(*(0.3 * each for each in some_machine())), some_units(n)[0]
     found = machines.reconstruct(machine, source)
     units, target = tensors(source, found)
     again = machines.target_mean(machine, units, th.sigmoid(machines.hidden_input(machine, units, target)))

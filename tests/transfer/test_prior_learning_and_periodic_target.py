@@ -43,8 +43,7 @@ def car_task():
 
 @pytest.mark.parametrize(("mappings", "seed"), [("factored", 0), ("signed_factored", 2)])
 def test_two_cars_are_found_in_mountain_car_4d_within_one_episode(mappings, seed):
-    transfer = COMBREL(car_source(seed), mappings, use="prior")
-    task = car_task()
+    transfer, task = COMBREL(car_source(seed), mappings, use="prior"), car_task()
     rng = np.random.default_rng(seed)
     transfer.bind(task, rng)
     state = np.array([-0.52, -0.52, 0.0, 0.0])

@@ -39,8 +39,7 @@ def factored():
 
 def test_the_mapping_of_a_prior_is_named_with_compliances_and_errors_of_the_targets_transitions(factored):
     transfer, (states, actions, effects) = factored
-    report = transfer.report()
-    scale = np.abs(effects).mean(axis=0) ** 2
+    report, scale = transfer.report(), np.abs(effects).mean(axis=0) ** 2
     places = {0: [0, 1], 1: [2, 3]}
     assert [each.target_action for each in report.mappings] == [f"a{k}" for k in range(5)]
     assert report.mappings[3].mapping == "Wait on (s0, s1), Down on (s2, s3)"

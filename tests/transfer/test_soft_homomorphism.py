@@ -39,8 +39,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
     ]
     assert float(method.describe().rsplit(" ", 1)[1]) == pytest.approx(state[0, 0, 0, 1] * action[0, 2, 2], abs=0.02)
     states, actions = inside(100, 2, 3)
-    predicted = method.prior(states, actions)
-    expected = f.target_effects(SWAPPED, states, actions)
+    predicted, expected = method.prior(states, actions), f.target_effects(SWAPPED, states, actions)
     assert ((predicted.effect - expected) ** 2).sum() < 0.01 * (expected**2).sum()
     assert method._claims.trust.min() >= 0.8 and predicted.weight.min() > 1.0
     assert method.statistics()["transfer/prediction_error"] < 0.1
@@ -49,8 +48,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
 
 def test_a_mirrored_variable_and_renamed_actions_are_found():
     """The target's first variable is the source's second, mirrored; its actions are the source's in another order."""
-    rng = np.random.default_rng(1)
-    renamed = np.array([2, 0])
+    rng, renamed = np.random.default_rng(1), np.array([2, 0])
     states, actions = rng.random((150, 2)), rng.integers(2, size=150)
     at = np.column_stack([states[:, 1], 1.0 - states[:, 0]])
 
@@ -122,8 +120,7 @@ def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doub
 
 
 def test_periodic_variables_are_taken():
-    rng = np.random.default_rng(0)
-    env = Ring()
+    rng, env = np.random.default_rng(0), Ring()
     states, actions = rng.random((300, 2)), rng.integers(2, size=300)
     low, high = env.observation_space.low, env.observation_space.high
     speed = np.clip(states[:, 1] + np.where(actions == 1, 0.075, -0.075), 0.0, 1.0)
@@ -229,8 +226,7 @@ def naive_loss(logits, readings, data):
 
 def problem(seed=0, n=6, n_copies=2):
     """Random parameters and transitions of two source and three target variables."""
-    rng = np.random.default_rng(seed)
-    readings = soft.all_readings(2, 3, True)
+    rng, readings = np.random.default_rng(seed), soft.all_readings(2, 3, True)
     logits = soft.Logits(rng.normal(size=(n_copies, 2, 6)), rng.normal(size=(n_copies, 4, 3)))
     data = soft.FitData(
         predicted=rng.normal(size=(n, len(readings.variable), 3, 3)),
@@ -282,8 +278,7 @@ def test_the_most_probable_parts_come_first_and_add_up_to_one(max_terms, mass):
 def mixture(sample, n_target=3):
     """The predictions of a random mixture, and what they are made of."""
     model = SourceModel(stacked_instances([f.oscillator_source(200, rewards=lambda states: states[:, 0])]))
-    rng = np.random.default_rng(0)
-    readings = soft.all_readings(2, n_target, True)
+    rng, readings = np.random.default_rng(0), soft.all_readings(2, n_target, True)
     logits = soft.Logits(rng.normal(size=(2, 2, 2 * n_target)), rng.normal(size=(2, 4, 3)))
     predictions = soft.MixturePredictions(model, readings, np.array([0.5, 0.5]), sample)
     predictions.set_terms(soft.most_probable(*soft.probabilities(logits, readings), 4, 0.9))

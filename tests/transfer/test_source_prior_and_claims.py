@@ -66,8 +66,7 @@ MAPPINGS = [
 @pytest.mark.parametrize("n", [1, 100])
 def test_predictions_are_those_of_the_copies(mapping, n):
     source = f.oscillator_source(rewards=lambda states: states[:, 0])
-    prior = bound(TIMBREL(source, mapping, use="prior")).source_prior
-    rng = np.random.default_rng(n)
+    prior, rng = bound(TIMBREL(source, mapping, use="prior")).source_prior, np.random.default_rng(n)
     # Few different values, as on a grid, in any order.
     states, actions = rng.integers(0, 5, size=(n, 4)) / 4.0, rng.integers(5, size=n)
     effect, reward, end, weight = prior._raw(states, actions)
@@ -347,8 +346,7 @@ def test_noise_in_a_variable_that_an_action_leaves_alone_is_no_motion(size, trus
     states, actions, effects = with_noise_at_rest(size)
     show(transfer, (states, actions, effects))
     squares = np.array([(effects[actions == action, 2] ** 2).mean() for action in range(3)])
-    explained = transfer.source_prior.explained()
-    n = np.bincount(actions, minlength=3)
+    explained, n = transfer.source_prior.explained(), np.bincount(actions, minlength=3)
     np.testing.assert_allclose(explained, (1.0 - np.sqrt(squares / squares.max())) * n / (n + PRESUMED), atol=0.03)
     trust = transfer.source_prior.claims.trust
     assert trust[0] == 0.0 and ((trust[1:] > 0.75).all() if trusted else not trust[1:].any())
@@ -365,8 +363,7 @@ def drive_to_the_end(n=200):
 
 @pytest.mark.parametrize("transfer_terminals", [True, False])
 def test_ends_are_claimed_once_confirmed_and_no_more_once_they_do_not_come(transfer_terminals):
-    one = f.copies_mapping(1)
-    make = dict(use="prior", transfer_terminals=transfer_terminals)
+    one, make = f.copies_mapping(1), dict(use="prior", transfer_terminals=transfer_terminals)
     transfer = bound(TIMBREL(f.oscillator_source(2000), one, **make), 2, 3)
     states, actions, effects = drive_to_the_end()
     show(transfer, (states[:200], actions[:200], effects[:200]))

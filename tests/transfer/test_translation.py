@@ -69,8 +69,7 @@ def test_with_relevance_the_most_relevant_come_first_and_light_ones_count_too(se
     source = naive.random_source(rng, 60, 2, 2)
     mappings = [naive.random_mapping(rng, 2, 3, 2, 1) for _ in range(2)]
     states, own = rng.random((4, 3)), rng.uniform(0.0, threshold, 4)
-    task = naive.target_task(states, 1, threshold)
-    relevance = rng.random((2, 60))
+    task, relevance = naive.target_task(states, 1, threshold), rng.random((2, 60))
     if ties:
         relevance = np.round(2.0 * relevance) / 2.0
     within = naive.places_of(source, stacked_instances([source]))
@@ -122,8 +121,7 @@ def test_a_method_has_room_for_all_that_a_pair_may_need(min_fraction):
 def test_by_relevance_as_many_light_instances_are_transferred_as_it_takes():
     """Each weighs 0.0183, so 55 of them reach the threshold; by distance the smallest fraction allows no more than ten."""
     points = np.array([[0.5], [0.9]])
-    task = naive.target_task(points, 1, min_fraction=0.1)
-    source = row_of_instances([0.5 + 0.2] * 100)
+    task, source = naive.target_task(points, 1, min_fraction=0.1), row_of_instances([0.5 + 0.2] * 100)
     method = bound(TIMBREL(source, InterTaskMapping([0], [0]), breadth=0.1, relevance=True), task)
     for _ in range(2):
         found = transferred_to_pairs(method, np.arange(2), np.zeros(2))

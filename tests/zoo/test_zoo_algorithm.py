@@ -61,8 +61,7 @@ def test_what_a_study_draws_replaces_what_the_configuration_says(algo, source):
     entry = {"policy": "FittedRMaxPolicy", **drawn, "transfer": None if algo == "fitted_rmax" else given, "resolution": 1}
     if algo == "timbrel":
         given["sb3_combrel.TIMBREL"]["mapping"] = "random"
-    model = ZooFittedRMax(env=gym.make(CAR), **entry)
-    changed = drawn.get("transfer_kwargs", {})
+    model, changed = ZooFittedRMax(env=gym.make(CAR), **entry), drawn.get("transfer_kwargs", {})
     assert len(changed) == {"fitted_rmax": 0, "timbrel": 1, "combrel": 6}[algo]
     assert {name: getattr(model.transfer, name) for name in changed} == changed
     assert model.agent.model_settings.model_breadth == trial.params["model_breadth"]

@@ -52,8 +52,7 @@ def naive_iqm(values):
 
 
 def cells_by(levels, **options):
-    outcomes = made_up(levels, **options)
-    pair = pair_of(options.get("pair", "made-up"))
+    outcomes, pair = made_up(levels, **options), pair_of(options.get("pair", "made-up"))
     return pair, cells_of(pair, [method_of(name) for name in levels], outcomes, range(100))
 
 
@@ -112,8 +111,7 @@ class TestRanks:
     def test_the_table_says_where_seeds_make_no_difference(self):
         pair, methods = pair_of(), [method_of(NONE), method_of("a")]
         same = [outcome(pair.name, "a", seed, [1.0, 2.0]) for seed in range(3)]
-        differs = outcome(pair.name, "a", 3, [2.0, 1.0])
-        notes = {}
+        differs, notes = outcome(pair.name, "a", 3, [2.0, 1.0]), {}
         for runs in (same[:1], same, [*same, differs]):
             notes[len(runs)] = report.note_of("a", cells_of(pair, methods, runs, range(4))["a"])
         assert notes == {1: "", 3: "all runs alike", 4: ""}

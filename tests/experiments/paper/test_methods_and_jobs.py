@@ -157,8 +157,7 @@ class Replay(BaseCallback):
         self.rows, self.n_done, self.before, self.states = [], 0, {}, states
 
     def _on_step(self):
-        uses = self.model.agent.transfer.uses()
-        state = self.states[self.num_timesteps - 1]
+        uses, state = self.model.agent.transfer.uses(), self.states[self.num_timesteps - 1]
         self.rows += [(number, state) for number, n in uses.items() if n > self.before.get(number, 0)]
         self.before = dict(uses)
         self.n_done += int(self.locals["dones"][0])

@@ -124,8 +124,7 @@ def cells_of(selections):
 
 class TestDependence:
     def test_the_numbers_are_those_of_scipy(self):
-        rng = np.random.default_rng(0)
-        n = 60
+        rng, n = np.random.default_rng(0), 60
         mapping = rng.choice(["one", "two", "three"], size=n, p=[0.5, 0.3, 0.2])
         selection = selection_of(rng, n, mapping)
         selection["x"] += 1.5 * (mapping == "one")
@@ -162,16 +161,14 @@ class TestDependence:
         assert float(cells["x"][2]) > 0.05 and float(cells["vx"][2]) > 0.05
 
     def test_rates_of_false_findings_are_those_of_the_level(self):
-        rng = np.random.default_rng(3)
-        found = []
+        rng, found = np.random.default_rng(3), []
         for _ in range(60):
             cells = cells_of(selection_of(rng, 1250, rng.choice(["one", "two", "three"], size=1250)))
             found.append([float(cells[name][k]) < 0.05 for name in ("x", "vx", "target action") for k in (2, 5)])
         assert np.all(np.mean(found, axis=0) < 0.15)
 
     def test_the_thinned_test_sees_several_actions_where_every_step_has_one_selection_of_each(self):
-        rng = np.random.default_rng(4)
-        action = np.tile(np.array(list("abcde")), 400)
+        rng, action = np.random.default_rng(4), np.tile(np.array(list("abcde")), 400)
         selection = selection_of(rng, 2000, np.where(np.isin(action, ["a", "b"]), "one", "two"), action)
         assert float(cells_of(selection)["target action"][5]) < 1e-6
 

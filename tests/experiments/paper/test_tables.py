@@ -218,8 +218,7 @@ def test_the_csv_has_the_runs_of_earlier_calls_too(tmp_path):
 
 class TestDiagnosis:
     def results(self, n_runs=8, spread=0):
-        rng = np.random.default_rng(0)
-        means = dict(zip(DIAGNOSED, (400, 200, 300), strict=True))
+        rng, means = np.random.default_rng(0), dict(zip(DIAGNOSED, (400, 200, 300), strict=True))
         steps = {
             method_at(method, breadth): rng.normal(mean, spread, size=(n_runs, 6)).astype(int)
             for method, mean in means.items()

@@ -45,8 +45,7 @@ def test_variables_and_their_bounds_stand_in_the_order_given():
 
 
 def test_the_right_mapping_undoes_the_order():
-    task = TASKS["CartPole-long"]
-    mapping = cart_pole.right_mapping()
+    task, mapping = TASKS["CartPole-long"], cart_pole.right_mapping()
     plain, target = gym.make("CartPole-v1"), task.make()
     seen, after = plain.reset(seed=1)[0], target.reset(seed=1)[0]
     # The start does not depend on the pole.

@@ -44,8 +44,7 @@ def move_in_tiny_steps(position, displacement, walls, n=500):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
 def test_a_move_ends_at_the_first_wall_or_boundary_in_its_way(seed, n_variables):
     rng = np.random.default_rng(seed)
-    position = rng.random(n_variables)
-    walls = point_robot.WALLS[n_variables]
+    position, walls = rng.random(n_variables), point_robot.WALLS[n_variables]
     # A start in a wall is moved beside one, where something is to be seen.
     if any(wall.contains(position) for wall in walls):
         position[0] = rng.choice([0.29, 0.37, 0.63, 0.71])
@@ -201,8 +200,7 @@ class TestCartWithPendulum:
         env = CartWithPendulumEnv("cart")
         env.reset(seed=0)
         assert 20 <= next(k for k in range(300) if env.step(2)[2]) <= 60
-        both = CartWithPendulumEnv("both")
-        turned = []
+        both, turned = CartWithPendulumEnv("both"), []
         for action in (0, 2):
             both.reset(seed=0)
             turned.append(both.step(action)[0][3])
