@@ -16,16 +16,13 @@ class TestRecord:
         status, written = call_for_all_output("record", *self.SHORT, "--output", tmp_path / "car", "--seed", "3")
         assert status == 0
         source = SourceInstances.load(tmp_path / "car.npz")
-        assert len(source) == 20
-        assert source.state_names == ("x", "v")
-        assert str(tmp_path / "car.npz") in written
+        assert len(source) == 20 and source.state_names == ("x", "v") and str(tmp_path / "car.npz") in written
 
     def test_a_file_is_overwritten_only_when_asked(self, tmp_path):
         file = tmp_path / "car.npz"
         file.write_text("mine")
         status, written = call_for_all_output("record", *self.SHORT, "--output", file)
-        assert status == 1
-        assert "--overwrite" in written
+        assert status == 1 and "--overwrite" in written
         assert file.read_text() == "mine"
         assert call_for_all_output("record", *self.SHORT, "--output", file, "--overwrite")[0] == 0
         assert len(SourceInstances.load(file)) == 20
@@ -36,21 +33,17 @@ class TestRecord:
     )
     def test_a_task_that_cannot_be_learned_is_named_without_a_traceback(self, tmp_path, env_id, message):
         status, written = call_for_all_output("record", env_id, "--output", tmp_path / "none.npz")
-        assert status == 1
-        assert message in written
-        assert "Traceback" not in written
+        assert status == 1 and message in written and "Traceback" not in written
         assert not list(tmp_path.iterdir())
 
 
 class TestCommandLine:
     def test_help_names_the_commands(self):
         status, written = call_for_all_output("--help")
-        assert status == 0
-        assert all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
+        assert status == 0 and all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
         assert call_for_all_output("dance")[0] == 2
 
     def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "tyro", None)
         status, written = call_for_all_output("demo")
-        assert status == 1
-        assert "sb3-combrel[experiments]" in written
+        assert status == 1 and "sb3-combrel[experiments]" in written

@@ -153,8 +153,7 @@ def test_the_readme_is_short_and_its_tables_have_all_that_is_exported_and_all_co
 def test_every_equation_and_line_of_algorithm_1_has_its_function():
     text = (DOCS / "equations.md").read_text()
     algorithm, equations = (re.split(r"\n#", text.partition(f"### {part}")[2])[0] for part in ("Algorithm 1", "Equations"))
-    lines = numbers_of(re.findall(r"^\| (\d[^|]*)\|", algorithm, flags=re.MULTILINE))
-    assert sorted(lines) == list(range(1, 28))
+    assert sorted(numbers_of(re.findall(r"^\| (\d[^|]*)\|", algorithm, flags=re.MULTILINE))) == list(range(1, 28))
     assert set(numbers_of(re.findall(r"^\| ([\d, ]+)\|", equations, flags=re.MULTILINE))) == set(range(1, 8))
     source = (ROOT / "sb3_combrel" / "transfer" / "equations.py").read_text()
     named = set(re.findall(r"\[`(\w+)`\]\([^)]*transfer/equations\.py\)", text))

@@ -49,8 +49,7 @@ def made(tmp_path_factory):
 )
 def test_whatever_is_exported_has_an_example_that_runs(name, made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    documented = getattr(sb3_combrel, name)
-    found = examples_of(documented.__doc__)
+    found = examples_of(getattr(sb3_combrel, name).__doc__)
     assert found, f"{name} has no example"
     source, model = made
     shutil.copy(model, "car.zip")

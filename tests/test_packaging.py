@@ -48,15 +48,13 @@ def test_every_folder_with_modules_is_a_package_that_is_listed():
 
 def test_versions_agree():
     version = sb3_combrel.__version__
-    assert re.fullmatch(r"\d+\.\d+\.\d+\w*", version)
-    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert re.fullmatch(r"\d+\.\d+\.\d+\w*", version) and f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"\n## [{version}] - 20" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_all_contains_every_extra_but_those_of_developers():
     (line,) = EXTRAS["all"]
-    named = set(re.fullmatch(r"sb3-combrel\[(.+)\]", line)[1].split(","))
-    assert named == set(EXTRAS) - {"all", "dev", "docs"}
+    assert set(re.fullmatch(r"sb3-combrel\[(.+)\]", line)[1].split(",")) == set(EXTRAS) - {"all", "dev", "docs"}
 
 
 def test_constraints_pin_all_that_is_required():

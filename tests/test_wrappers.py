@@ -6,7 +6,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,10 +22,10 @@ class Given(gym.Env):
     :param low: of the observation space; ``high``: the same
     """
 
-    action_space = spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, low=(-1.0,) * 5, high=(1.0,) * 5, dtype=np.float64):
-        self.observation_space = spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+        self.observation_space = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
         self.next = np.zeros(len(low), dtype)
 
     def reset(self, *, seed=None, options=None):
@@ -41,8 +40,7 @@ class Given(gym.Env):
 @given(st.permutations(range(5)), st.integers(1, 2), st.lists(st.floats(-3.1, 3.1), min_size=5, max_size=5), st.booleans())
 def test_each_angle_stands_where_its_cosine_was(order, n_pairs, values, single):
     pairs = [(order[2 * p], order[2 * p + 1]) for p in range(n_pairs)]
-    env = Given(dtype=np.float32 if single else np.float64)
-    state = dict(enumerate(values))
+    env, state = Given(dtype=np.float32 if single else np.float64), dict(enumerate(values))
     for cos, sin in pairs:
         env.next[cos], env.next[sin] = np.cos(state[cos]), np.sin(state[cos])
     for k in order[2 * n_pairs :]:
@@ -95,8 +93,7 @@ def test_names_and_flags_of_the_environment_are_kept():
 
 
 def test_other_pairs_of_a_known_environment_have_other_names():
-    wrapper = AngleObservation(gym.make("Acrobot-v1"), [(2, 3)])
-    assert wrapper.state_names == ("s0", "s1", "angle_s2", "s4", "s5")
+    assert AngleObservation(gym.make("Acrobot-v1"), [(2, 3)]).state_names == ("s0", "s1", "angle_s2", "s4", "s5")
     assert AngleObservation(gym.make("Acrobot-v1"), [[2, 3], [0, 1]]).state_names[0] == "theta1"
 
 
@@ -110,17 +107,10 @@ def test_the_wrapper_is_made_again_from_its_specification_and_pickled():
 @pytest.mark.parametrize(
     ("pairs", "message"),
     [
-        (None, "not known"),
-        ([], r"got \[\]"),
-        ([(0, 0)], r"got \[\(0, 0\)\]"),
-        ([(0, 1), (1, 2)], "each index once"),
-        ([(0, 5)], "whole number from 0 to 4, got 5"),
-        ([(0, -1)], "got -1"),
-        ([(0, 1.0)], "got 1.0"),
-        ([0, 1], r"got \[0, 1\]"),
-        ("01", "got '01'"),
-        ([(0, 1, 2)], r"got \[\(0, 1, 2\)\]"),
-        ([(0, 2)], "variable 2 is from -8 to 8"),
+        *[(None, "not known"), ([], r"got \[\]"), ([(0, 0)], r"got \[\(0, 0\)\]")],
+        *[([(0, 1), (1, 2)], "each index once"), ([(0, 5)], "whole number from 0 to 4, got 5"), ([(0, -1)], "got -1")],
+        *[([(0, 1.0)], "got 1.0"), ([0, 1], r"got \[0, 1\]"), ("01", "got '01'")],
+        *[([(0, 1, 2)], r"got \[\(0, 1, 2\)\]"), ([(0, 2)], "variable 2 is from -8 to 8")],
     ],
 )
 def test_wrong_pairs_are_named(pairs, message):

@@ -28,8 +28,7 @@ def test_compliance_of_3000_transitions_with_every_mapping(benchmark, name):
     assert (mappings.n_state_mappings, mappings.n_action_mappings) == (n_state_mappings, 243)
     instances, table = stacked_instances([source_of_random_walks()]), stacked_table([mappings])
     rng = np.random.default_rng(0)
-    states = rng.uniform(0.3, 0.7, (N_TRANSITIONS, 4))
-    bandwidths = default_bandwidths(instances)
+    states, bandwidths = rng.uniform(0.3, 0.7, (N_TRANSITIONS, 4)), default_bandwidths(instances)
     effects, found = 0.02 * rng.normal(size=states.shape), np.empty((len(table.variable), len(instances.size)))
     scratch = ComplianceScratch.for_mappings(table, instances, bandwidths.start)
     given = tuple(instances), tuple(table), tuple(bandwidths), tuple(scratch), found

@@ -85,8 +85,7 @@ def test_a_store_without_room_stays_as_it_is_until_it_has_grown():
     store = ListStore.empty(2, 4)
     assert len(store.entries(0)[0]) == 0
     for item in range(4):
-        assert append(store, 0, item, float(item))
-        assert store.with_room() is store
+        assert append(store, 0, item, float(item)) and store.with_room() is store
     assert not append(store, 1, 9, 9.0) and not append(store, 0, 9, 9.0)
     larger = store.with_room()
     assert larger is not store and larger.with_room() is larger

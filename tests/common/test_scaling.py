@@ -3,14 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sb3_combrel.common.scaling import StateScaling
 
-BOX = spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float64)
+BOX = gym.spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float64)
 
 finite = st.floats(-1e6, 1e6)
 
@@ -27,8 +26,7 @@ def test_each_variable_is_divided_by_its_range():
     scaling = StateScaling.from_space(BOX)
     units = scaling.to_unit([[-1.2, -0.07], [0.6, 0.07], [-0.3, 0.0]])
     np.testing.assert_allclose(units, [[0, 0], [1, 1], [0.5, 0.5]], atol=1e-15)
-    assert units.dtype == np.float64
-    assert scaling.n_variables == 2
+    assert units.dtype == np.float64 and scaling.n_variables == 2
     # One state alone, and one outside the box: neither reshaped nor clipped.
     np.testing.assert_allclose(scaling.to_unit([2.4, 0.21]), [2.0, 2.0])
 
@@ -36,8 +34,7 @@ def test_each_variable_is_divided_by_its_range():
 def test_scalings_of_equal_bounds_are_equal_and_cannot_be_changed():
     low = np.array([-1.2, -0.07])
     scaling = StateScaling(low, [0.6, 0.07])
-    assert scaling == StateScaling.from_space(BOX)
-    assert hash(scaling) == hash(StateScaling.from_space(BOX))
+    assert scaling == StateScaling.from_space(BOX) and hash(scaling) == hash(StateScaling.from_space(BOX))
     assert scaling != StateScaling(low, [0.6, 0.08])
     low[0] = 5.0
     assert scaling.low[0] == -1.2
@@ -53,7 +50,7 @@ def test_bounds_replace_those_of_the_space_and_scalars_hold_for_all_variables():
 
 def test_a_space_that_is_unbounded_or_as_large_as_the_largest_float_needs_bounds():
     huge = np.finfo(np.float32).max
-    for space in (gym.make("CartPole-v1").observation_space, spaces.Box(-huge, huge, (2,), np.float32)):
+    for space in (gym.make("CartPole-v1").observation_space, gym.spaces.Box(-huge, huge, (2,), np.float32)):
         with pytest.raises(ValueError, match=r"no finite bounds .*1.*bounds=\(low, high\)"):
             StateScaling.from_space(space)
 
@@ -61,14 +58,9 @@ def test_a_space_that_is_unbounded_or_as_large_as_the_largest_float_needs_bounds
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        (7, "got bounds=7"),
-        ((0,), r"got bounds=\(0,\)"),
-        (([0, 1, 2], 3), r"low of shape \(3,\)"),
-        ((0, 0), "low=0.0 and high=0.0 for variable 0"),
-        (([0, 2], [1, 1]), "low=2.0 and high=1.0 for variable 1"),
-        ((np.nan, 1), "low of nan"),
-        ((0, np.inf), "high of inf"),
-        (([0, "a"], 3), "got bounds="),
+        *[(7, "got bounds=7"), ((0,), r"got bounds=\(0,\)"), (([0, 1, 2], 3), r"low of shape \(3,\)")],
+        *[((0, 0), "low=0.0 and high=0.0 for variable 0"), (([0, 2], [1, 1]), "low=2.0 and high=1.0 for variable 1")],
+        *[((np.nan, 1), "low of nan"), ((0, np.inf), "high of inf"), (([0, "a"], 3), "got bounds=")],
     ],
 )
 def test_wrong_bounds_are_named_with_their_value(bounds, message):
@@ -80,11 +72,11 @@ def test_wrong_bounds_are_named_with_their_value(bounds, message):
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Discrete(3), "one-dimensional Box of floating-point numbers, got Discrete"),
-        (spaces.Dict({"x": BOX}), "FlattenObservation"),
-        (spaces.Box(0, 255, (8, 8, 3), np.uint8), "images"),
-        (spaces.Box(0, 1, (2, 2)), r"shape \(2, 2\)"),
-        (spaces.Box(0, 9, (2,), np.int64), "dtype int64"),
+        (gym.spaces.Discrete(3), "one-dimensional Box of floating-point numbers, got Discrete"),
+        (gym.spaces.Dict({"x": BOX}), "FlattenObservation"),
+        (gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), "images"),
+        (gym.spaces.Box(0, 1, (2, 2)), r"shape \(2, 2\)"),
+        (gym.spaces.Box(0, 9, (2,), np.int64), "dtype int64"),
     ],
 )
 def test_other_spaces_are_refused(space, message):
@@ -95,13 +87,9 @@ def test_other_spaces_are_refused(space, message):
 @pytest.mark.parametrize(
     ("low", "high", "message"),
     [
-        ([0, 0], [1], "same length"),
-        ([], [], "at least one"),
-        ([[0]], [[1]], "one-dimensional"),
-        ([np.nan], [1], "low must hold finite"),
-        ([1], [0], "below its upper bound"),
-        ([-1.5e308], [1.5e308], "overflows"),
-        ("ab", [1], "low must be"),
+        *[([0, 0], [1], "same length"), ([], [], "at least one"), ([[0]], [[1]], "one-dimensional")],
+        *[([np.nan], [1], "low must hold finite"), ([1], [0], "below its upper bound")],
+        *[([-1.5e308], [1.5e308], "overflows"), ("ab", [1], "low must be")],
     ],
 )
 @pytest.mark.filterwarnings("ignore:overflow")

@@ -19,16 +19,9 @@ def there_and_back(value):
 @pytest.mark.parametrize(
     ("value", "comes_back"),
     [
-        (None, None),
-        (True, True),
-        (3, 3),
-        (0.1 + 0.2, 0.1 + 0.2),
-        ("injective", "injective"),
-        (np.float64(0.1), 0.1),
-        (np.int32(7), 7),
-        (np.bool_(True), True),
-        (np.array([[1.5, 2.0], [3.0, 4.0]]), [[1.5, 2.0], [3.0, 4.0]]),
-        ((1, None, "x"), [1, None, "x"]),
+        *[(None, None), (True, True), (3, 3), (0.1 + 0.2, 0.1 + 0.2), ("injective", "injective")],
+        *[(np.float64(0.1), 0.1), (np.int32(7), 7), (np.bool_(True), True)],
+        *[(np.array([[1.5, 2.0], [3.0, 4.0]]), [[1.5, 2.0], [3.0, 4.0]]), ((1, None, "x"), [1, None, "x"])],
         (pathlib.PurePosixPath("a/b.npz"), "a/b.npz"),
         ({"state": (0, None), "action": [1, 0]}, {"state": [0, None], "action": [1, 0]}),
     ],
@@ -36,8 +29,7 @@ def there_and_back(value):
 )
 def test_plain_values_and_arrays_come_back_as_plain_values(value, comes_back):
     back = there_and_back(value)
-    assert back == comes_back
-    assert type(back) is type(comes_back)
+    assert back == comes_back and type(back) is type(comes_back)
 
 
 SETS = {
@@ -61,12 +53,7 @@ class SecretiveSet(MappingSet):
 @pytest.mark.parametrize(
     "value",
     [
-        object(),
-        {1: "one"},
-        b"bytes",
-        [[lambda n: n]],
-        np.array([object()]),
-        {KIND: "InterTaskMapping"},
+        *[object(), {1: "one"}, b"bytes", [[lambda n: n]], np.array([object()]), {KIND: "InterTaskMapping"}],
         SecretiveSet([[0, 1]], AllActionMappings(2, 2)),
     ],
     ids=["object", "number as key", "bytes", "function inside", "objects", "reserved key", "subclass"],

@@ -101,12 +101,8 @@ def test_what_is_no_contiguous_array_of_the_right_type_is_refused(field):
 @pytest.mark.parametrize(
     ("field", "shape"),
     [
-        ("length", (N + 1, 1)),
-        ("length", (N,)),
-        ("weight", (N + 1,)),
-        ("effect", (N + 1, MAX_INSTANCES)),
-        ("effect", (N + 1, MAX_INSTANCES, N_VARIABLES + 1)),
-        ("reward", (N + 1, MAX_INSTANCES - 1)),
+        *[("length", (N + 1, 1)), ("length", (N,)), ("weight", (N + 1,)), ("effect", (N + 1, MAX_INSTANCES))],
+        *[("effect", (N + 1, MAX_INSTANCES, N_VARIABLES + 1)), ("reward", (N + 1, MAX_INSTANCES - 1))],
         ("terminated", (N, MAX_INSTANCES)),
     ],
 )

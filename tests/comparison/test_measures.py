@@ -33,8 +33,7 @@ def learning_curves(draw):
     """Returns and steps of 2 to 5 runs of 3 to 8 episodes."""
     lengths = draw(st.lists(st.integers(3, 8), min_size=2, max_size=5))
     returns = [draw(st.lists(st.integers(-50, 50), min_size=n, max_size=n)) for n in lengths]
-    steps = [draw(st.lists(st.integers(1, 20), min_size=n, max_size=n)) for n in lengths]
-    return returns, steps
+    return returns, [draw(st.lists(st.integers(1, 20), min_size=n, max_size=n)) for n in lengths]
 
 
 def measures_of(first, second, **arguments):
@@ -45,8 +44,7 @@ def test_rows_of_different_lengths_are_filled_with_nan():
     np.testing.assert_array_equal(CURVES.returns[0], [-9.0, -5.0, -1.0, NAN, NAN])
     np.testing.assert_array_equal(CURVES.steps[2], [6.0, 3.0, 3.0, 4.0, NAN])
     assert CURVES.n_episodes.tolist() == [3, 5, 4] and CURVES.n_steps.tolist() == [15.0, 22.0, 16.0]
-    again = LearningCurves(CURVES.returns, CURVES.steps)
-    np.testing.assert_array_equal(again.returns, CURVES.returns)
+    np.testing.assert_array_equal(LearningCurves(CURVES.returns, CURVES.steps).returns, CURVES.returns)
     cut = CURVES.first_episodes()
     np.testing.assert_array_equal(cut.returns, [row[:3] for row in RETURNS])
     np.testing.assert_array_equal(cut.steps, [row[:3] for row in STEPS])
@@ -143,8 +141,7 @@ def test_ratios_of_negative_returns_are_of_areas_above_a_floor():
     worse = LearningCurves(np.array([[-10.0, -6.0, -4.0], [-8.0, -8.0, -4.0]]), np.full((2, 3), 2))
     measures = measures_of(better, worse)
     # Sums -8 and -10 against -20 and -20; above -10 they are 22 and 20 against 10 and 10.
-    assert measures.floor == -10.0
-    assert measures.transfer_ratio.effect == pytest.approx(1.1)
+    assert measures.floor == -10.0 and measures.transfer_ratio.effect == pytest.approx(1.1)
     assert measures.transfer_ratio.with_transfer.tolist() == [22.0, 20.0]
     assert measures.transfer_ratio_by_steps.effect == pytest.approx(1.1)
     # Above -20 they are 52 and 50 against 40 and 40.

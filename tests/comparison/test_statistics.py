@@ -47,8 +47,7 @@ def test_the_interval_of_a_mean_is_students():
 @pytest.mark.parametrize(("without", "with_transfer"), [([60.0], [50.0]), ([60.0, 60.0], [50.0, 50.0])])
 def test_runs_that_allow_no_test_still_have_a_difference(without, with_transfer):
     saved = saving(np.array(without), np.array(with_transfer))
-    assert saved.steps == 10.0
-    assert np.isnan([saved.low, saved.high, saved.p_value]).all()
+    assert saved.steps == 10.0 and np.isnan([saved.low, saved.high, saved.p_value]).all()
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
@@ -62,8 +61,7 @@ def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end():
 @quick
 @given(few_whole, few_whole)
 def test_a_permutation_test_of_few_runs_counts_every_regrouping(first, second):
-    together = first + second
-    differences = []
+    together, differences = first + second, []
     for chosen in combinations(range(len(together)), len(first)):
         one = [together[i] for i in chosen]
         other = [together[i] for i in range(len(together)) if i not in chosen]
@@ -90,8 +88,7 @@ def test_a_permutation_test_of_many_runs_agrees_with_scipys():
 
 
 def test_a_permutation_test_never_says_that_chance_is_impossible():
-    far = p_value_of_difference(np.arange(20.0), np.arange(20.0) + 1e6, "permutation")
-    assert far == 1 / (N_PERMUTATIONS + 1)
+    assert p_value_of_difference(np.arange(20.0), np.arange(20.0) + 1e6, "permutation") == 1 / (N_PERMUTATIONS + 1)
     assert p_value_of_difference(np.ones(3), np.zeros(3), "permutation") == pytest.approx(2 / 20), "2 of 20 regroupings"
     assert p_value_of_difference(np.ones(3), np.ones(3), "permutation") == 1.0
     assert np.isnan(p_value_of_difference(np.ones(1), np.zeros(3), "permutation"))
@@ -204,8 +201,7 @@ def test_bounds_are_percentiles_of_all_pairs_of_draws():
 
 def test_medians_of_censored_steps():
     reached = np.array([10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0])
-    one_never = np.append(reached[:-1], INF)
-    value, low, high = bootstrap_difference(one_never, reached + 100.0, "median")
+    value, low, high = bootstrap_difference(np.append(reached[:-1], INF), reached + 100.0, "median")
     assert value == -100.0 and np.isfinite([low, high]).all()
     # Four of nine: the median is finite, yet in many draws it is not, so nothing bounds the difference from above.
     four_never = np.append(reached[:5], np.full(4, INF))
@@ -269,8 +265,7 @@ def test_bad_input_is_refused(call, message):
 def test_cliffs_delta_counts_pairs(first, second):
     pairs = [1 if a > b else -1 if a < b else 0 for a in first for b in second]
     delta = cliffs_delta(first, second)
-    assert delta == pytest.approx(np.mean(pairs))
-    assert cliffs_delta(second, first) == pytest.approx(-delta)
+    assert delta == pytest.approx(np.mean(pairs)) and cliffs_delta(second, first) == pytest.approx(-delta)
     assert cliffs_delta(np.arctan(first), np.arctan(second)) == pytest.approx(delta), "any increasing function keeps it"
 
 

@@ -105,8 +105,7 @@ def test_dm_controls_time_limit_is_the_same_and_can_be_set(env_id, unit, n_steps
     environment.reset()
     n = n_steps or EXPECTED[env_id].max_steps
     steps = [environment.step(0) for _ in range(n)]
-    assert [step.last() for step in steps] == [False] * (n - 1) + [True]
-    assert steps[-1].discount == 1.0
+    assert [step.last() for step in steps] == [False] * (n - 1) + [True] and steps[-1].discount == 1.0
 
 
 @pytest.mark.parametrize(

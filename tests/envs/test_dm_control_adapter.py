@@ -35,8 +35,7 @@ def test_it_gives_the_same_episodes_as_the_fast_environment():
 def test_a_seed_determines_the_starts():
     env, other = adapted(), adapted()
     first = [env.reset(seed=5)[0], env.reset()[0]]
-    assert np.array_equal(first, [other.reset(seed=5)[0], other.reset()[0]])
-    assert not np.array_equal(first[0], first[1])
+    assert np.array_equal(first, [other.reset(seed=5)[0], other.reset()[0]]) and not np.array_equal(first[0], first[1])
     assert not np.array_equal(first[0], env.reset(seed=6)[0])
 
 
@@ -49,8 +48,7 @@ def test_the_last_step_of_the_time_limit_truncates_unless_the_task_ends_on_it(st
     with env.environment.physics.reset_context():
         env.environment.physics.set_car(*state)
     _, _, terminated, truncated, info = env.step(2)
-    assert (terminated, truncated) == end
-    assert info["is_success"] == terminated
+    assert (terminated, truncated) == end and info["is_success"] == terminated
     with pytest.raises(ResetNeeded):
         env.step(0)
 

@@ -45,9 +45,7 @@ class TestHits:
         down, up = (env.unwrapped.action_names.index(name) for name in ("S1+", "S1-"))
         for _ in range(100):
             blocked = env.step(down)[0][0]
-        assert blocked < 16 and physics.hand_distance("table") > -0.03
-        lifted = env.step(up)[0][0]
-        assert lifted < blocked - 0.5
+        assert blocked < 16 and physics.hand_distance("table") > -0.03 and env.step(up)[0][0] < blocked - 0.5
 
     def test_a_hit_on_the_last_step_of_the_time_limit_is_an_end(self):
         environment = combrel_envs.load("icub", "torso_strike", {"time_limit": 2.6})
@@ -75,8 +73,7 @@ class TestEpisodes:
         assert env.unwrapped.environment.physics.ball_displacement() == 0.0
 
     def test_without_noise_a_run_repeats_itself_bit_by_bit(self, env_id):
-        actions = random_actions(env_id, 150)
-        env = gymnasium.make(env_id)
+        actions, env = random_actions(env_id, 150), gymnasium.make(env_id)
         runs = [[env.reset()[0].tolist()] + [env.step(action)[0].tolist() for action in actions] for _ in range(2)]
         assert runs[0] == runs[1] == observations(env_id, actions, seed=1)
 
@@ -129,8 +126,7 @@ class TestOptions:
             before = environment.physics.targets()
             environment.step(2)
             steps.append(before[1] - environment.physics.targets()[1])
-        assert np.mean(steps) == pytest.approx(2.0, abs=0.04)
-        assert np.std(steps) == pytest.approx(0.2, abs=0.03)
+        assert np.mean(steps) == pytest.approx(2.0, abs=0.04) and np.std(steps) == pytest.approx(0.2, abs=0.03)
 
     def test_the_extent_is_how_far_a_command_goes(self):
         before, after = observations(TORSO, [2], extent=5.0)

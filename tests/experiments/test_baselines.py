@@ -14,23 +14,7 @@ from stable_baselines3 import DQN
 from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.experiments.paper import baselines
-from sb3_combrel.experiments.paper.baselines import (
-    ALGORITHMS,
-    HYPERPARAMETERS,
-    OF_SOURCE,
-    OWN,
-    PLAIN,
-    PREFILLED,
-    QUANTILE,
-    BaselineJob,
-    GreedyEvaluator,
-    always_reached_from,
-    evaluation_steps,
-    fill,
-    make_model,
-    prefill,
-    translate,
-)
+from sb3_combrel.experiments.paper.baselines import evaluation_steps, make_model
 from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 from sb3_combrel.runs.job import make_env
 from sb3_combrel.sources.transitions import Transitions
@@ -39,7 +23,7 @@ from sb3_combrel.transfer.base import TargetTask
 CAR, ARM = mountain_car.TARGET_ID, icub_arm.TARGET_ID
 CONFIGURATIONS = Path(__file__).resolve().parents[2] / "zoo_configs"
 # Long enough for some updates of the network, which begin after 1000 steps.
-SHORT = BaselineJob(group="car", method=PLAIN, env=CAR, seed=3, n_steps=1200, max_episode_steps=50)
+SHORT = baselines.BaselineJob(group="car", method=baselines.PLAIN, env=CAR, seed=3, n_steps=1200, max_episode_steps=50)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +34,7 @@ def source():
 
 @pytest.fixture(scope="module")
 def prefilled_job(source):
-    return replace(SHORT, method=PREFILLED, seed=1, n_steps=400, source=source)
+    return replace(SHORT, method=baselines.PREFILLED, seed=1, n_steps=400, source=source)
 
 
 def learnt(job, monkeypatch):
@@ -70,37 +54,35 @@ def weights_of(model):
     return [tensor.numpy() for tensor in model.policy.state_dict().values()]
 
 
-@pytest.mark.parametrize("name", (PLAIN, QUANTILE))
-@pytest.mark.parametrize("env_id", tuple(HYPERPARAMETERS))
+@pytest.mark.parametrize("name", (baselines.PLAIN, baselines.QUANTILE))
+@pytest.mark.parametrize("env_id", tuple(baselines.HYPERPARAMETERS))
 def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     yaml = pytest.importorskip("yaml")
     pytest.importorskip("sb3_contrib")
-    file = CONFIGURATIONS / {PLAIN: "dqn.yml", QUANTILE: "qrdqn.yml"}[name]
-    settings = yaml.safe_load(file.read_text())[env_id]
-    assert settings.pop("n_timesteps") > 0
-    assert settings.pop("policy") == "MlpPolicy"
+    settings = yaml.safe_load(
+        (CONFIGURATIONS / {baselines.PLAIN: "dqn.yml", baselines.QUANTILE: "qrdqn.yml"}[name]).read_text()
+    )[env_id]
+    assert settings.pop("n_timesteps") > 0 and settings.pop("policy") == "MlpPolicy"
     assert settings.pop("env_wrapper") == [{"gymnasium.wrappers.RescaleObservation": {"min_obs": -1.0, "max_obs": 1.0}}]
     first_rate = float(settings.pop("learning_rate").removeprefix("lin_"))
     network = eval(settings.pop("policy_kwargs"))
     # Nothing of the file is left out, and nothing is added.
-    assert HYPERPARAMETERS[env_id] == {**settings, "learning_rate": first_rate}
+    assert baselines.HYPERPARAMETERS[env_id] == {**settings, "learning_rate": first_rate}
     job = replace(SHORT, method=name, env=env_id)
     env = job.make_env()
     assert np.all(env.observation_space.low == -1.0) and np.all(env.observation_space.high == 1.0)
-    model = make_model(job, env)
-    frequency = settings.pop("train_freq")
-    assert model.train_freq.frequency == frequency
-    assert {key: getattr(model, key) for key in settings} == settings
+    model, frequency = make_model(job, env), settings.pop("train_freq")
+    assert model.train_freq.frequency == frequency and {key: getattr(model, key) for key in settings} == settings
     assert [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([first_rate, first_rate / 2, 0.0])
     assert model.policy.net_arch == network.pop("net_arch")
     assert {key: getattr(model.policy, key) for key in network} == network
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", baselines.ALGORITHMS)
 def test_the_same_job_has_the_same_result(algorithm, source, monkeypatch):
-    if algorithm == QUANTILE:
+    if algorithm == baselines.QUANTILE:
         pytest.importorskip("sb3_contrib")
-    job = replace(SHORT, method=algorithm, source=source if algorithm in OF_SOURCE else None)
+    job = replace(SHORT, method=algorithm, source=source if algorithm in baselines.OF_SOURCE else None)
     first, model = learnt(job, monkeypatch)
     np.random.seed(7)
     again, other = learnt(pickle.loads(pickle.dumps(job)), monkeypatch)
@@ -131,7 +113,7 @@ def test_settings_tell_hyperparameters_and_sources_apart(prefilled_job, monkeypa
     before = prefilled_job.settings()
     assert before == prefilled_job.settings()
     assert replace(prefilled_job, source=prefilled_job.source.subset(200, seed=0)).settings()["source"] != before["source"]
-    monkeypatch.setitem(HYPERPARAMETERS, CAR, {**HYPERPARAMETERS[CAR], "gamma": 0.5})
+    monkeypatch.setitem(baselines.HYPERPARAMETERS, CAR, {**baselines.HYPERPARAMETERS[CAR], "gamma": 0.5})
     assert prefilled_job.settings() != before
 
 
@@ -163,7 +145,9 @@ def test_an_instance_is_translated_as_by_hand():
     visited_states = np.array([[0.8, 20.0, 2.0], [3.9, 20.0, 2.9], [2.0, -10.0, 1.5]])
     ignored = np.zeros(3)
     outcomes = ignored, visited_states, ignored > 0
-    found = translate(transfer, Transitions(visited_states, np.zeros(3, dtype=np.int64), *outcomes, low, high, 3, (), (), {}))
+    found = baselines.translate(
+        transfer, Transitions(visited_states, np.zeros(3, dtype=np.int64), *outcomes, low, high, 3, (), (), {})
+    )
     # Effects: 0.25 of the first variable's range, -0.1 of the second's; and 0.05 of the second's.
     expected = {
         (0.8, 1): ([0.8 - 0.4, 20.0, 2.0 + 0.5], -3.0, False),
@@ -184,7 +168,9 @@ def test_where_nothing_is_transferred_nothing_is_translated(source):
     transfer = TIMBREL(source, InterTaskMapping(state=(0, None, 1), action=(0, 0, 0)), breadth=0.01, use="instances")
     transfer.bind(target_task(low, high, threshold=1e6), np.random.default_rng(0))
     at, none = np.full((4, 3), 0.5), np.zeros(4)
-    found = translate(transfer, Transitions(at, np.zeros(4, dtype=np.int64), none, at, none > 0, low, high, 3, (), (), {}))
+    found = baselines.translate(
+        transfer, Transitions(at, np.zeros(4, dtype=np.int64), none, at, none > 0, low, high, 3, (), (), {})
+    )
     assert [column.shape for column in found[:5]] == [(0, 3), (0,), (0,), (0, 3), (0,)]
 
 
@@ -197,12 +183,12 @@ def test_what_is_translated_stays_within_the_bounds():
     transfer.bind(target_task(low, high), np.random.default_rng(0))
     at = np.array([[4.75, 0.5, 0.5]])
     visited = Transitions(at, np.zeros(1, dtype=np.int64), -one, at, one > 2, low, high, 3, (), (), {})
-    np.testing.assert_allclose(translate(transfer, visited).next_states, [[5.0, 0.5, 0.5]] * 3)
+    np.testing.assert_allclose(baselines.translate(transfer, visited).next_states, [[5.0, 0.5, 0.5]] * 3)
 
 
 def test_combrels_translations_are_source_instances_seen_through_some_mapping(prefilled_job, source):
-    _, found = prefill(prefilled_job)
-    own = prefill(replace(prefilled_job, method=OWN))[1]
+    _, found = baselines.prefill(prefilled_job)
+    own = baselines.prefill(replace(prefilled_job, method=baselines.OWN))[1]
     assert len(found.states) > len(own.states) / 2
     assert {tuple(state) for state in found.states} <= {tuple(state) for state in own.states}
     scaling = StateScaling(found.low, found.high)
@@ -213,15 +199,14 @@ def test_combrels_translations_are_source_instances_seen_through_some_mapping(pr
     for first, second in permutations(range(4), 2):
         translated = np.zeros((len(effects), 4))
         translated[:, first], translated[:, second] = effects.T
-        predicted = np.clip(starts[:, None] + translated, 0.0, 1.0)
-        fits = np.abs(predicted - ends[:, None]).max(axis=2) < 1e-9
+        fits = np.abs(np.clip(starts[:, None] + translated, 0.0, 1.0) - ends[:, None]).max(axis=2) < 1e-9
         fits &= (found.rewards[:, None] == source.rewards) & (found.terminated[:, None] == source.terminated)
         explained |= fits.any(axis=1)
     assert explained.all()
 
 
 def test_the_control_is_what_really_happened(prefilled_job):
-    episodes, own = prefill(replace(prefilled_job, method=OWN))
+    episodes, own = baselines.prefill(replace(prefilled_job, method=baselines.OWN))
     assert len(own.states) == episodes.steps.sum()
     with make_env(CAR) as env:
         for start, action, end, reward in zip(own.states[:40], own.actions, own.next_states, own.rewards, strict=False):
@@ -231,10 +216,9 @@ def test_the_control_is_what_really_happened(prefilled_job):
             assert now == reward
 
 
-@pytest.mark.parametrize("algorithm", OF_SOURCE)
+@pytest.mark.parametrize("algorithm", baselines.OF_SOURCE)
 def test_the_buffer_holds_them_before_learning_and_their_steps_count(algorithm, prefilled_job, monkeypatch):
-    job = replace(prefilled_job, method=algorithm)
-    seen = {}
+    job, seen = replace(prefilled_job, method=algorithm), {}
     learn = DQN.learn
 
     def watched(model, *arguments, **others):
@@ -244,7 +228,7 @@ def test_the_buffer_holds_them_before_learning_and_their_steps_count(algorithm, 
 
     monkeypatch.setattr(DQN, "learn", watched)
     result = job.carry_out()
-    episodes, found = prefill(job)
+    episodes, found = baselines.prefill(job)
     assert seen["size"] == len(found.states) > 0
     np.testing.assert_allclose(seen["starts"], 2.0 * (found.states - found.low) / (found.high - found.low) - 1.0, atol=1e-6)
     assert result.steps[:2] == episodes.steps.tolist() and result.returns[:2] == episodes.returns.tolist()
@@ -261,13 +245,12 @@ def test_each_is_learnt_from_on_its_own():
         rewards, terminated = np.arange(50.0), rng.random(50) < 0.3
         given = Transitions(states, rng.integers(5, size=50), rewards, ends, terminated, low, high, 5, (), (), {})
         model = make_model(SHORT, env)
-        fill(model.replay_buffer, given, env)
+        baselines.fill(model.replay_buffer, given, env)
         batch = model.replay_buffer.sample(400)
     assert model.replay_buffer.size() == 50
     # Rewards are their numbers.
     rows = batch.rewards.numpy()[:, 0].astype(int)
-    assert len(set(rows)) == 50
-    assert np.array_equal(batch.dones.numpy()[:, 0], terminated[rows])
+    assert len(set(rows)) == 50 and np.array_equal(batch.dones.numpy()[:, 0], terminated[rows])
     assert np.array_equal(batch.actions.numpy()[:, 0], given.actions[rows])
     np.testing.assert_allclose(batch.discounts.numpy(), 0.99, atol=1e-6)
     np.testing.assert_allclose(batch.next_observations.numpy(), (2.0 * (ends - low) / (high - low) - 1.0)[rows], atol=1e-6)
@@ -275,7 +258,7 @@ def test_each_is_learnt_from_on_its_own():
 
 def test_the_greedy_policy_is_what_is_evaluated():
     with gym.make("CartPole-v1") as env:
-        evaluator = GreedyEvaluator([10, 50, 70], env, seed=5, n_before=40)
+        evaluator = baselines.GreedyEvaluator([10, 50, 70], env, seed=5, n_before=40)
         # It does not learn in so few steps, so it can be asked again afterwards.
         model = DQN("MlpPolicy", "CartPole-v1", seed=0, learning_starts=1000, device="cpu").learn(60, evaluator)
         returns = []
@@ -298,8 +281,7 @@ def test_evaluations_are_evenly_spaced_on_a_logarithmic_axis(total):
     steps = evaluation_steps(total)
     assert steps[-1] == total and steps == sorted(set(steps)) and steps[0] >= 1
     if total > 10_000:
-        assert len(steps) == 10
-        assert np.ptp(np.diff(np.log(steps))) < 1e-3
+        assert len(steps) == 10 and np.ptp(np.diff(np.log(steps))) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -307,11 +289,11 @@ def test_evaluations_are_evenly_spaced_on_a_logarithmic_axis(total):
     [((1.0, 0.8, 1.0, 1.0), 40), ((1.0, 1.0, 1.0, 1.0), 10), ((0.0, 1.0, 1.0, 0.8), np.inf), ((), np.inf)],
 )
 def test_steps_from_which_on_the_goal_is_always_reached(reached, expected):
-    assert always_reached_from(list(zip((10, 20, 40, 80), (-1.0,) * 4, reached, strict=False))) == expected
+    assert baselines.always_reached_from(list(zip((10, 20, 40, 80), (-1.0,) * 4, reached, strict=False))) == expected
 
 
 class TestBadInput:
-    @pytest.mark.parametrize("wrong", [{"method": "SAC"}, {"method": PREFILLED}, {"source": "any"}])
+    @pytest.mark.parametrize("wrong", [{"method": "SAC"}, {"method": baselines.PREFILLED}, {"source": "any"}])
     def test_unknown_algorithms_and_sources_that_are_missing_or_given_in_vain(self, wrong):
         with pytest.raises(ValueError, match=r"method must be one of DQN, QR-DQN, .*, with a source for .* only, got"):
             replace(SHORT, **wrong)
@@ -323,4 +305,4 @@ class TestBadInput:
     def test_without_sb3_contrib_the_extra_is_named(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "sb3_contrib", None)
         with pytest.raises(ImportError, match=r"pip install 'sb3-combrel\[experiments\]'"):
-            replace(SHORT, method=QUANTILE).carry_out()
+            replace(SHORT, method=baselines.QUANTILE).carry_out()

@@ -11,8 +11,7 @@ MARKS = "<!-- table: results/t.md, {} -->\n{}<!-- end of table -->"
 
 
 def test_tables_are_found_without_their_titles():
-    assert tables_in(TABLES) == [FIRST, SECOND]
-    assert tables_in("no table | here") == []
+    assert tables_in(TABLES) == [FIRST, SECOND] and tables_in("no table | here") == []
 
 
 def test_tables_are_filled_in_and_what_is_around_stays(tmp_path):
@@ -28,8 +27,7 @@ def test_tables_are_filled_in_and_what_is_around_stays(tmp_path):
 
 def test_a_table_that_is_not_there_is_named(tmp_path):
     (tmp_path / "t.md").write_text(TABLES)
-    page = tmp_path / "page.md"
-    text = "<!-- table: t.md, 3 -->\n<!-- end of table -->\n"
+    page, text = tmp_path / "page.md", "<!-- table: t.md, 3 -->\n<!-- end of table -->\n"
     page.write_text(text)
     with pytest.raises(ValueError, match=r"page.md: t.md has tables 1 to 2, and number 3 is asked for"):
         fill_in(page)

@@ -64,14 +64,12 @@ def test_an_agent_refuses_a_transfer_method_that_does_not_fit_its_task():
 
 
 def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
-    defaults = FittedRMaxSettings()
-    of_fitted_rmax = inspect.signature(FittedRMax).parameters
+    defaults, of_fitted_rmax = FittedRMaxSettings(), inspect.signature(FittedRMax).parameters
     for name in FittedRMaxSettings.names():
         assert of_fitted_rmax[name].default == getattr(defaults, name), name
     # The policy hands on what it is given, and has no defaults of its own.
     assert not set(FittedRMaxSettings.names()) & set(inspect.signature(FittedRMaxPolicy).parameters)
-    box = spaces.Box(0.0, 1.0, (1,), dtype=np.float64)
-    assert FittedRMaxPolicy(box, spaces.Discrete(2)).agent.settings == defaults
+    assert FittedRMaxPolicy(spaces.Box(0.0, 1.0, (1,), dtype=np.float64), spaces.Discrete(2)).agent.settings == defaults
     assert FittedRMax(Walk()).agent.settings == defaults
     task = Task(StateScaling(np.zeros(1), np.ones(1)), 2)
     assert FittedRMaxAgent(defaults, task).model_settings == defaults.model_settings(1)

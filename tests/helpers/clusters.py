@@ -77,15 +77,8 @@ def running(*arguments, log):
     """A Python process in a session of its own, which is ended with all processes of that session."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")])}
     with log.open("w") as file:
-        process = subprocess.Popen(
-            [sys.executable, *map(str, arguments)],
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            cwd=log.parent,
-            start_new_session=True,
-        )
+        options = dict(stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=log.parent, start_new_session=True)
+        process = subprocess.Popen([sys.executable, *map(str, arguments)], stdin=subprocess.DEVNULL, **options)
     try:
         yield process
     finally:

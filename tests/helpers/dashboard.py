@@ -1,7 +1,6 @@
 """A small task for tests of the dashboard, and what reads its event files back."""
 
 import gymnasium as gym
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -21,7 +20,7 @@ class Still(gym.Env):
     """Nothing happens, whatever the action."""
 
     def __init__(self, low, high, action_names=("wait",)):
-        self.observation_space, self.action_space = spaces.Box(low, high), spaces.Discrete(len(action_names))
+        self.observation_space, self.action_space = gym.spaces.Box(low, high), gym.spaces.Discrete(len(action_names))
         self.action_names = tuple(action_names)
 
     def reset(self, *, seed=None, options=None):

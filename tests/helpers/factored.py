@@ -32,19 +32,10 @@ def oscillator_source(n=600, seed=0, noise=0.0, effects=oscillate, rewards=None)
     rng = np.random.default_rng(seed)
     states, actions = rng.random((n, 2)), rng.integers(3, size=n)
     after = states + effects(states, actions) + noise * rng.normal(size=states.shape)
-    return SourceInstances(
-        LOW + RANGE * states,
-        actions,
-        -np.ones(n) if rewards is None else rewards(states),
-        LOW + RANGE * after,
-        ends(after),
-        LOW,
-        LOW + RANGE,
-        3,
-        ("x", "v"),
-        ("Wait", "Down", "Up"),
-        {"env": "Oscillator-v0"},
-    )
+    rewards = -np.ones(n) if rewards is None else rewards(states)
+    states, next_states = LOW + RANGE * states, LOW + RANGE * after
+    about = 3, ("x", "v"), ("Wait", "Down", "Up"), {"env": "Oscillator-v0"}
+    return SourceInstances(states, actions, rewards, next_states, ends(after), LOW, LOW + RANGE, *about)
 
 
 def copies_mapping(n_copies, order=None):
@@ -80,8 +71,7 @@ def walk(mapping, n, seed=0, length=40, spread=0.5):
     d, n_actions = mapping.n_target_variables, mapping.n_target_actions
     rows = []
     while len(rows) < n:
-        state = 0.5 + spread * (rng.random(d) - 0.5)
-        action = int(rng.integers(n_actions))
+        state, action = 0.5 + spread * (rng.random(d) - 0.5), int(rng.integers(n_actions))
         for _ in range(length):
             if rng.random() < 0.3:
                 action = int(rng.integers(n_actions))
@@ -96,18 +86,15 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     """Effect, reward, end and weight that a local linear model predicts at ``at``, from the instances of one action."""
     squared = ((states - at) ** 2).sum(axis=1)
     near = np.argsort(squared, kind="stable")[:n_neighbors]
-    squared = squared[near]
-    scale = 1.0 / breadth**2
+    squared, scale = squared[near], 1.0 / breadth**2
     if len(near) == n_neighbors:
         scale = min(max(scale, -np.log(0.05) / squared[-1]), scale / 0.02**2)
     weights = np.exp(-(squared - squared[0]) * scale)
     x, e = states[near], effects[near]
     mean_x, mean_e = np.average(x, axis=0, weights=weights), np.average(e, axis=0, weights=weights)
-    ridge = RIDGE / scale
-    root = np.sqrt(weights)[:, None]
+    ridge, root = RIDGE / scale, np.sqrt(weights)[:, None]
     design = np.vstack([root * (x - mean_x), np.sqrt(ridge) * np.eye(len(at))])
-    wanted = np.vstack([root * (e - mean_e), np.zeros((len(at), e.shape[1]))])
-    slopes = np.linalg.lstsq(design, wanted, rcond=None)[0]
+    slopes = np.linalg.lstsq(design, np.vstack([root * (e - mean_e), np.zeros((len(at), e.shape[1]))]), rcond=None)[0]
     effect = np.clip(mean_e + (at - mean_x) @ slopes, effects.min(axis=0), effects.max(axis=0))
     outcome = np.exp(-(squared - squared[0]) / min(breadth, outcome_breadth) ** 2)
     spread = np.linalg.solve(design.T @ design / weights.sum(), at - mean_x)
@@ -138,8 +125,7 @@ def predicted_by(copies, copy, source_action, states):
     effects = (source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))[mask][:, used]
     found = np.full(states.shape, np.nan)
     for i, state in enumerate(states):
-        at = np.array([state[list(row).index(k)] for k in used])
-        nowhere = np.zeros(len(units))
+        at, nowhere = np.array([state[list(row).index(k)] for k in used]), np.zeros(len(units))
         effect, *_ = naive_prediction(units, effects, nowhere, nowhere, at, 0.2, 24, 0.05)
         for k, value in zip(used, effect, strict=True):
             found[i, list(row).index(k)] = value

@@ -13,10 +13,7 @@ N_ACTIONS = 2
 # (resolution by variable, margin), and which variables are periodic where some are: a few hundred points at most, as the
 # naive loops are slow.
 PERIODIC_GRIDS = [
-    ((3,), 1, (True,)),
-    ((2, 2), 1, (True, False)),
-    ((2, 3), 0, (False, True)),
-    ((1, 2, 1), 1, (True, False, True)),
+    *[((3,), 1, (True,)), ((2, 2), 1, (True, False)), ((2, 3), 0, (False, True)), ((1, 2, 1), 1, (True, False, True))],
 ]
 GRIDS = [((3,), 1), ((4,), 0), ((2, 2), 1), ((3, 2), 0), ((2, 1), 1), ((1, 2, 1), 0), ((1, 1, 1), 1), *PERIODIC_GRIDS]
 
@@ -28,17 +25,14 @@ def make_grid(grid):
 
 
 KERNELS = [
-    dict(breadth=0.3, min_weight=0.01, min_fraction=0.13),
-    dict(breadth=0.15, min_weight=0.01, min_fraction=0.02),
-    dict(breadth=0.5, min_weight=0.1, min_fraction=0.37),
-    dict(breadth=0.8, min_weight=0.3, min_fraction=0.9),
+    *[dict(breadth=0.3, min_weight=0.01, min_fraction=0.13), dict(breadth=0.15, min_weight=0.01, min_fraction=0.02)],
+    *[dict(breadth=0.5, min_weight=0.1, min_fraction=0.37), dict(breadth=0.8, min_weight=0.3, min_fraction=0.9)],
 ]
 
 
 def random_transitions(seed, n_variables, n):
     """States that repeat now and then, effects that leave the box now and then, some of them zero."""
-    rng = np.random.default_rng(seed)
-    transitions = []
+    rng, transitions = np.random.default_rng(seed), []
     for _ in range(n):
         state = rng.random(n_variables)
         if transitions and rng.random() < 0.15:
@@ -55,15 +49,9 @@ def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model
 
     :param grid: an entry of GRIDS, or another such
     """
-    settings = ModelSettings(
-        model_breadth=kernel["breadth"],
-        min_weight=kernel["min_weight"],
-        min_fraction=kernel["min_fraction"],
-        exploration_threshold=threshold,
-        max_instances=max_instances,
-    )
-    mdp = FiniteMDP(make_grid(grid), N_ACTIONS, gamma)
-    return model_class(mdp, settings, transfer)
+    arguments = dict(min_fraction=kernel["min_fraction"], exploration_threshold=threshold, max_instances=max_instances)
+    settings = ModelSettings(model_breadth=kernel["breadth"], min_weight=kernel["min_weight"], **arguments)
+    return model_class(FiniteMDP(make_grid(grid), N_ACTIONS, gamma), settings, transfer)
 
 
 def model_and_definition(grid, kernel, gamma=1.0, max_instances=None):
@@ -112,8 +100,7 @@ def without_staying(reward, successors, point, gamma):
     leave = 1.0 - gamma * successors.get(point, 0.0)
     if leave < 1e-9:
         return (0.0 if reward == 0.0 else float(np.sign(reward) * np.inf)), {}
-    others = {to: gamma * p / leave for to, p in successors.items() if to != point}
-    return reward / leave, others
+    return reward / leave, {to: gamma * p / leave for to, p in successors.items() if to != point}
 
 
 def assert_same_row(found, expected):

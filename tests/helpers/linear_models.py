@@ -17,14 +17,7 @@ LINEAR_KERNELS = [
 ]
 
 # As in ``kernel_models.GRIDS``, of a few points.
-SMALL_GRIDS = [
-    ((3,), 1),
-    ((2, 2), 0),
-    ((2, 1), 1),
-    ((1, 1, 1), 0),
-    ((3,), 1, (True,)),
-    ((2, 2), 1, (True, False)),
-]
+SMALL_GRIDS = [((3,), 1), ((2, 2), 0), ((2, 1), 1), ((1, 1, 1), 0), ((3,), 1, (True,)), ((2, 2), 1, (True, False))]
 
 # What a model has of each pair, and of its effects.
 LEARNED = ("sums", "outcome", "reach", "scale", "n_counted", "limit", "total", "known", "claimed", "prior", "effect_range")

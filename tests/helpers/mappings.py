@@ -19,5 +19,4 @@ def choices(n_source, n_target):
 def mappings(draw, n_source=3, n_target=4):
     state = draw(st.tuples(*[st.sampled_from([None, *range(n_source)])] * n_target).filter(lambda s: s != (None,) * n_target))
     sign = draw(st.tuples(*[st.sampled_from([1, -1])] * n_target))
-    action = draw(st.tuples(*[st.integers(0, 2)] * 5))
-    return InterTaskMapping(state, action, sign)
+    return InterTaskMapping(state, draw(st.tuples(*[st.integers(0, 2)] * 5)), sign)

@@ -17,15 +17,13 @@ def expected_step(state, action):
         force[axis] = 0.001 if direction else -0.001
     v = np.clip(state[n:] + force - 0.0025 * np.cos(3.0 * state[:n]), -0.07, 0.07)
     x = np.clip(state[:n] + v, -1.2, 0.6)
-    into_wall = ((x == -1.2) & (v < 0)) | ((x == 0.6) & (v > 0))
-    return np.concatenate([x, np.where(into_wall, 0.0, v)])
+    return np.concatenate([x, np.where(((x == -1.2) & (v < 0)) | ((x == 0.6) & (v > 0)), 0.0, v)])
 
 
 def possible_states(n_axes):
     """All states of a task with so many axes."""
     positions = st.lists(st.floats(-1.2, 0.6), min_size=n_axes, max_size=n_axes)
-    velocities = st.lists(st.floats(-0.07, 0.07), min_size=n_axes, max_size=n_axes)
-    return st.builds(lambda x, v: x + v, positions, velocities)
+    return st.builds(lambda x, v: x + v, positions, st.lists(st.floats(-0.07, 0.07), min_size=n_axes, max_size=n_axes))
 
 
 def env_in(env_id, state, **kwargs):

@@ -2,7 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from helpers import factored as f
@@ -14,8 +13,8 @@ class Oscillators(gym.Env):
 
     def __init__(self, n_copies):
         self.mapping = f.copies_mapping(n_copies)
-        self.observation_space = spaces.Box(0.0, 1.0, (2 * n_copies,), dtype=np.float64)
-        self.action_space = spaces.Discrete(2 * n_copies + 1)
+        self.observation_space = gym.spaces.Box(0.0, 1.0, (2 * n_copies,), dtype=np.float64)
+        self.action_space = gym.spaces.Discrete(2 * n_copies + 1)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

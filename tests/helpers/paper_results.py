@@ -33,8 +33,7 @@ def made_up_runs(domain, steps):
 
 def from_equations(n, seed, n_actions=2, d=2, effects=None):
     """Transitions from random states in [0, 1]^d whose effects are given by a function of states and actions."""
-    rng = np.random.default_rng(seed)
-    states = rng.uniform(0.2, 0.8, size=(n, d))
+    states = np.random.default_rng(seed).uniform(0.2, 0.8, size=(n, d))
     actions = np.arange(n) % n_actions
     moves = effects(states, actions)
     return SourceInstances(

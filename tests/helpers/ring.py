@@ -2,7 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 PERIODIC = [True, False]
 
@@ -17,13 +16,12 @@ class Ring(gym.Env):
     action_names = ("back", "forth")
 
     def __init__(self, origin=0.0):
-        self.observation_space = spaces.Box(np.array([-np.pi, -1.0]), np.array([np.pi, 1.0]), dtype=np.float64)
-        self.action_space = spaces.Discrete(2)
+        self.observation_space = gym.spaces.Box(np.array([-np.pi, -1.0]), np.array([np.pi, 1.0]), dtype=np.float64)
+        self.action_space = gym.spaces.Discrete(2)
         self.origin = origin
 
     def observe(self):
-        period = (self.at + self.origin + 0.5) % 1.0
-        return np.array([2.0 * np.pi * (period - 0.5), self.speed])
+        return np.array([2.0 * np.pi * (((self.at + self.origin + 0.5) % 1.0) - 0.5), self.speed])
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -40,11 +38,9 @@ class Ring(gym.Env):
 
 def ring_transitions(seed, n):
     """Random transitions of a periodic and another variable, unit coordinates, many of them across the origin."""
-    rng = np.random.default_rng(seed)
-    transitions = []
+    rng, transitions = np.random.default_rng(seed), []
     for _ in range(n):
-        state = rng.random(2)
-        action = int(rng.integers(2))
+        state, action = rng.random(2), int(rng.integers(2))
         effect = rng.normal([0.08 if action else -0.08, 0.0], 0.04)
         after = np.array([(state[0] + effect[0]) % 1.0, np.clip(state[1] + effect[1], 0.0, 1.0)])
         transitions.append((state, action, -1.0, after, bool(abs(after[0] - 0.5) < 0.05)))

@@ -2,7 +2,6 @@
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
 from sb3_combrel import SourceInstances
 
@@ -10,8 +9,8 @@ from sb3_combrel import SourceInstances
 class Corridor(gym.Env):
     """A cart that is pushed along [0, 1]: ends at 1, and is cut off after ``limit`` steps. The second variable counts."""
 
-    observation_space = spaces.Box(np.float32([0, 0]), np.float32([1, 100]), dtype=np.float32)
-    action_space = spaces.Discrete(2, start=-1)
+    observation_space = gym.spaces.Box(np.float32([0, 0]), np.float32([1, 100]), dtype=np.float32)
+    action_space = gym.spaces.Discrete(2, start=-1)
     state_names = ("place", "time")
     action_names = ("back", "forth")
 
@@ -43,19 +42,10 @@ def check_corridor(source, step_size=0.25):
 
 def some_source(n=40, seed=0):
     rng = np.random.default_rng(seed)
-    return SourceInstances(
-        rng.random((n, 2)),
-        rng.integers(3, size=n),
-        -np.ones(n),
-        rng.random((n, 2)),
-        np.arange(n) % 10 == 9,
-        np.zeros(2),
-        np.ones(2),
-        3,
-        ("x", "v"),
-        ("Neutral", "Left", "Right"),
-        {"env": "Some-v0", "seed": seed},
-    )
+    states, actions, next_states = rng.random((n, 2)), rng.integers(3, size=n), rng.random((n, 2))
+    about = 3, ("x", "v"), ("Neutral", "Left", "Right"), {"env": "Some-v0", "seed": seed}
+    ends = np.arange(n) % 10 == 9
+    return SourceInstances(states, actions, -np.ones(n), next_states, ends, np.zeros(2), np.ones(2), *about)
 
 
 def assert_same(one, other):

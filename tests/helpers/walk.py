@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances
@@ -16,8 +15,8 @@ class Walk(gym.Env):
     """A walk on a line to its right end; ``first``: number of the first action; ``start``: None for anywhere at the left."""
 
     def __init__(self, first=0, limit=30, start=None):
-        self.observation_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 2.0]))
-        self.action_space = spaces.Discrete(2, start=first)
+        self.observation_space = gym.spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 2.0]))
+        self.action_space = gym.spaces.Discrete(2, start=first)
         self.first, self.limit, self.start = first, limit, start
 
     def observe(self):

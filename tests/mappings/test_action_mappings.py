@@ -28,11 +28,8 @@ class TestActionMappings:
     @pytest.mark.parametrize(
         "actions",
         [
-            AllActionMappings(3, 4),
-            BalancedActionMappings(3, 5),
-            BalancedActionMappings(3, 4),
-            BalancedActionMappings(4, 2),
-            ListedActionMappings([[0, 2, 2], [2, 0, 2], [0, 0, 1]], n_source_actions=4),
+            *[AllActionMappings(3, 4), BalancedActionMappings(3, 5), BalancedActionMappings(3, 4)],
+            *[BalancedActionMappings(4, 2), ListedActionMappings([[0, 2, 2], [2, 0, 2], [0, 0, 1]], n_source_actions=4)],
         ],
     )
     def test_counts_and_first_members(self, actions):

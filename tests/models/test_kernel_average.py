@@ -2,21 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import (
-    GRIDS,
-    KERNELS,
-    N_ACTIONS,
-    add_instances,
-    assert_same_row,
-    learn,
-    learn_both,
-    make_model,
-    model_and_definition,
-    pairs_of,
-    random_transitions,
-    row_of,
-    without_staying,
-)
+from helpers import kernel_models
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +11,11 @@ from sb3_combrel.models.kernel_average import MIN_CHANGE
 
 slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=8)
 problems = st.tuples(
-    st.sampled_from(GRIDS), st.sampled_from(KERNELS), st.integers(0, 10**6), st.integers(1, 20), st.sampled_from([1.0, 0.9])
+    st.sampled_from(kernel_models.GRIDS),
+    st.sampled_from(kernel_models.KERNELS),
+    st.integers(0, 10**6),
+    st.integers(1, 20),
+    st.sampled_from([1.0, 0.9]),
 )
 
 
@@ -38,53 +28,54 @@ def assert_same_as_definition(model, naive, gamma, pairs):
         np.testing.assert_allclose(weight, [w for _, w in expected], rtol=1e-9)
         assert model.own_weight[pair] == pytest.approx(sum(w for _, w in expected), rel=1e-9)
         if model.known[pair]:
-            reward, successors = without_staying(*naive.row(action, point), point, gamma)
+            reward, successors = kernel_models.without_staying(*naive.row(action, point), point, gamma)
             assert model.mdp.arrays.reward[pair] == pytest.approx(reward, rel=1e-9, abs=1e-9)
-            assert_same_row(row_of(model.mdp, point, action), successors)
+            kernel_models.assert_same_row(kernel_models.row_of(model.mdp, point, action), successors)
         else:
-            assert row_of(model.mdp, point, action) == {}
+            assert kernel_models.row_of(model.mdp, point, action) == {}
 
 
 @slow_and_repeatable
 @given(problems)
 def test_lists_what_is_known_and_rows_are_those_of_the_definition(problem):
     grid, kernel, seed, n, gamma = problem
-    model, naive = model_and_definition(grid, kernel, gamma)
+    model, naive = kernel_models.model_and_definition(grid, kernel, gamma)
     np.testing.assert_allclose(model.grid.points(), [naive.grid.unit(p) for p in range(naive.n_points)], atol=1e-15)
-    for transition in random_transitions(seed, len(grid[0]), n):
-        learn_both(model, naive, [transition])
-        np.testing.assert_array_equal(model.known.reshape(N_ACTIONS, -1), naive.known)
+    for transition in kernel_models.random_transitions(seed, len(grid[0]), n):
+        kernel_models.learn_both(model, naive, [transition])
+        np.testing.assert_array_equal(model.known.reshape(kernel_models.N_ACTIONS, -1), naive.known)
     np.testing.assert_array_equal(model.mdp.arrays.modelled, model.known)
     np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~naive.known).sum(axis=0))
-    assert_same_as_definition(model, naive, gamma, pairs_of(naive))
+    assert_same_as_definition(model, naive, gamma, kernel_models.pairs_of(naive))
 
 
 @slow_and_repeatable
 @given(problems, st.floats(0.05, 0.9))
 def test_a_transition_or_a_lower_threshold_changes_the_rows_of_the_pairs_that_are_returned_and_of_no_others(problem, low):
     grid, kernel, seed, n, gamma = problem
-    model, _ = model_and_definition(grid, kernel, gamma)
-    *before, last = random_transitions(seed, len(grid[0]), n + 1)
-    learn(model, before)
+    model, _ = kernel_models.model_and_definition(grid, kernel, gamma)
+    *before, last = kernel_models.random_transitions(seed, len(grid[0]), n + 1)
+    kernel_models.learn(model, before)
     changed = model.add(*last)
     assert len(np.unique(changed)) == len(changed) and (changed // model.grid.n_points == last[1]).all()
-    known = model.known.copy()
-    newly_known = model.lower_threshold(low)
+    known, newly_known = model.known.copy(), model.lower_threshold(low)
     np.testing.assert_array_equal(newly_known, np.flatnonzero(~known & (model.own_weight >= low)))
     np.testing.assert_array_equal(model.known, known | (model.own_weight >= low))
     model.update_rows(changed)
     model.update_rows(newly_known)
-    partial = [(model.mdp.arrays.reward[pair], row_of(model.mdp, pair)) for pair in range(len(model.known))]
+    partial = [(model.mdp.arrays.reward[pair], kernel_models.row_of(model.mdp, pair)) for pair in range(len(model.known))]
     model.update_all_rows()
-    assert partial == [(model.mdp.arrays.reward[pair], row_of(model.mdp, pair)) for pair in range(len(model.known))]
+    assert partial == [
+        (model.mdp.arrays.reward[pair], kernel_models.row_of(model.mdp, pair)) for pair in range(len(model.known))
+    ]
 
 
 def test_a_pair_stays_known_when_a_nearer_instance_shortens_its_list_below_the_threshold():
-    model, naive = model_and_definition(((1,), 0), dict(breadth=0.5, min_weight=0.01, min_fraction=0.6))
+    model, naive = kernel_models.model_and_definition(((1,), 0), dict(breadth=0.5, min_weight=0.01, min_fraction=0.6))
     pair = 1  # the grid point 0.5, action 0
-    learn_both(model, naive, [(np.array([0.1]), 0, -1.0, np.array([0.2]), False)] * 2)
+    kernel_models.learn_both(model, naive, [(np.array([0.1]), 0, -1.0, np.array([0.2]), False)] * 2)
     assert model.known[pair] and model.own_weight[pair] > 1.0
-    learn_both(model, naive, [(np.array([0.45]), 0, -2.0, np.array([0.95]), False)])
+    kernel_models.learn_both(model, naive, [(np.array([0.45]), 0, -2.0, np.array([0.95]), False)])
     assert model.own_weight[pair] < 1.0, "the case that this test is about"
     assert model.known[pair] and model.mdp.arrays.modelled[pair]
     assert model.mdp.arrays.reward[pair] == pytest.approx(-2.0), "its row is that of the instance now kept"
@@ -95,7 +86,7 @@ STATE = np.array([0.5, 0.5])
 
 
 def new_model():
-    return make_model(((2, 2), 0), dict(breadth=BREADTH, min_weight=0.01, min_fraction=MIN_FRACTION))
+    return kernel_models.make_model(((2, 2), 0), dict(breadth=BREADTH, min_weight=0.01, min_fraction=MIN_FRACTION))
 
 
 def add_weighing(model, weight, angle=0.0):
@@ -132,15 +123,13 @@ def test_an_exact_state_is_known_for_ever_once_some_of_its_instances_alone_reach
 
 def test_lists_rows_and_instances_are_complete_after_their_arrays_have_grown():
     grid, kernel = ((4, 4), 0), dict(breadth=0.4, min_weight=0.01, min_fraction=0.001)
-    model, naive = model_and_definition(grid, kernel)
+    model, naive = kernel_models.model_and_definition(grid, kernel)
     lists, rows = len(model.arrays.lists.item), len(model.mdp.arrays.rows.item)
-    capacity = model.instances.capacity
-    transitions = random_transitions(3, 2, 500)
-    learn(model, transitions)
-    assert len(model.arrays.lists.item) > lists
-    assert len(model.mdp.arrays.rows.item) > rows
+    capacity, transitions = model.instances.capacity, kernel_models.random_transitions(3, 2, 500)
+    kernel_models.learn(model, transitions)
+    assert len(model.arrays.lists.item) > lists and len(model.mdp.arrays.rows.item) > rows
     assert model.instances.capacity > capacity
-    add_instances(naive, transitions)
+    kernel_models.add_instances(naive, transitions)
     chosen = np.random.default_rng(0).choice(len(model.known), 12, replace=False)
     assert_same_as_definition(model, naive, 1.0, [(*divmod(int(pair), naive.n_points), int(pair)) for pair in chosen])
 
@@ -155,14 +144,14 @@ class NoInstances:
         return TransferredInstances.empty(len(points), 2)
 
 
-@pytest.mark.parametrize("kernel", KERNELS[:2], ids=str)
+@pytest.mark.parametrize("kernel", kernel_models.KERNELS[:2], ids=str)
 def test_with_transfer_known_pairs_are_updated_at_once_and_others_once_their_weight_has_changed_enough(kernel):
     grid = ((2, 2), 1)
-    model = make_model(grid, kernel, transfer=NoInstances())
-    naive = model_and_definition(grid, kernel)[1]
+    model = kernel_models.make_model(grid, kernel, transfer=NoInstances())
+    naive = kernel_models.model_and_definition(grid, kernel)[1]
     last, waited = np.zeros(len(model.known)), 0
     # Without states that repeat: of equal weights the last may enter a list only to be cut again.
-    for transition in {tuple(transition[0]): transition for transition in random_transitions(8, 2, 40)}.values():
+    for transition in {tuple(transition[0]): transition for transition in kernel_models.random_transitions(8, 2, 40)}.values():
         changed = model.add(*transition)
         naive.add(*transition)
         action, newest = transition[1], len(naive.instances[transition[1]]) - 1

@@ -16,20 +16,10 @@ from helpers.clusters import HOST, dask_cluster, free_port, ray_cluster
 from helpers.walk import Walk, walk_source
 
 from sb3_combrel import COMBREL
+from sb3_combrel.runs import runner
 from sb3_combrel.runs.job import Job, described, file_name, make_env
-from sb3_combrel.runs.runner import (
-    BACKENDS,
-    FOLDER,
-    LOCAL,
-    MAX_BREAKDOWNS,
-    Backend,
-    JobError,
-    check_all_succeeded,
-    perform,
-    run_missing,
-)
 
-HERE = Backend(n_jobs=1)
+HERE = runner.Backend(n_jobs=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,36 +59,35 @@ def toys(folder, n=3, group="toys", method="a", **kwargs):
 
 def test_results_come_in_the_order_of_the_jobs_and_a_later_call_finds_them(tmp_path):
     jobs = toys(tmp_path)
-    found = run_missing(jobs, tmp_path / "out", HERE)
+    found = runner.run_missing(jobs, tmp_path / "out", HERE)
     assert [result.steps for result in found] == [[0, 2], [1, 2], [2, 2]]
-    assert run_missing(jobs[::-1], tmp_path / "out", HERE) == found[::-1]
+    assert runner.run_missing(jobs[::-1], tmp_path / "out", HERE) == found[::-1]
     assert [job.attempts() for job in jobs] == [1, 1, 1]
-    more = run_missing(toys(tmp_path, 4), tmp_path / "out", HERE)
+    more = runner.run_missing(toys(tmp_path, 4), tmp_path / "out", HERE)
     assert more[:3] == found and more[3].seed == 3
 
 
 def test_what_is_not_whole_is_done_again(tmp_path):
     jobs = toys(tmp_path, 2)
-    before = run_missing(jobs, tmp_path / "out", HERE)
-    file = tmp_path / "out" / FOLDER / f"{jobs[0].name}.json"
+    before = runner.run_missing(jobs, tmp_path / "out", HERE)
+    file = tmp_path / "out" / runner.FOLDER / f"{jobs[0].name}.json"
     whole = file.read_bytes()
     for n_bytes in (0, 1, len(whole) // 2, len(whole) - 3):
         file.write_bytes(whole[:n_bytes])
-        assert run_missing(jobs, tmp_path / "out", HERE) == before
-    assert [job.attempts() for job in jobs] == [5, 1]
-    assert file.read_bytes() == whole
+        assert runner.run_missing(jobs, tmp_path / "out", HERE) == before
+    assert [job.attempts() for job in jobs] == [5, 1] and file.read_bytes() == whole
 
 
 def test_results_of_other_settings_and_other_files_are_neither_mixed_nor_overwritten(tmp_path):
     out = tmp_path / "out"
-    run_missing(toys(tmp_path), out, HERE)
+    runner.run_missing(toys(tmp_path), out, HERE)
     with pytest.raises(ValueError, match=r"other settings \(toys, a, seed 0: does was 'nothing' and is 'fail'\); use another"):
-        run_missing(toys(tmp_path, does="fail"), out, HERE)
+        runner.run_missing(toys(tmp_path, does="fail"), out, HERE)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").touch()
     with pytest.raises(ValueError, match="has files that are not results"):
-        run_missing(toys(tmp_path), tmp_path / "mine", HERE)
-    assert len(list((out / FOLDER).iterdir())) == 3 and os.listdir(tmp_path / "mine") == ["thesis.txt"]
+        runner.run_missing(toys(tmp_path), tmp_path / "mine", HERE)
+    assert len(list((out / runner.FOLDER).iterdir())) == 3 and os.listdir(tmp_path / "mine") == ["thesis.txt"]
 
 
 def test_a_failed_job_is_kept_with_its_error_tried_again_and_does_not_stop_the_others(tmp_path, capsys):
@@ -107,54 +96,56 @@ def test_a_failed_job_is_kept_with_its_error_tried_again_and_does_not_stop_the_o
     jobs = toys(tmp_path, 2, method="bad", does="fail") + toys(tmp_path, 2, method="good")
     console = Console(force_terminal=False, width=200)
     for attempt in (1, 2):
-        found = run_missing(jobs, tmp_path / "out", HERE, console)
+        found = runner.run_missing(jobs, tmp_path / "out", HERE, console)
         assert [bool(result.error) for result in found] == [True, True, False, False]
         assert [job.attempts() for job in jobs] == [attempt, attempt, 1, 1]
     printed = capsys.readouterr().out
     assert "toys, bad, seed 1: failed: FileNotFoundError: [Errno 2] No such file: 'lost.npz'" in printed
     assert "2 of 4 runs were complete already." in printed
-    with pytest.raises(JobError, match=r"^bad, seed 0: FileNotFoundError.*lost.npz' \(1 other runs failed, too\)\nTrace"):
-        check_all_succeeded(found)
-    check_all_succeeded(found[2:])
+    with pytest.raises(
+        runner.JobError, match=r"^bad, seed 0: FileNotFoundError.*lost.npz' \(1 other runs failed, too\)\nTrace"
+    ):
+        runner.check_all_succeeded(found)
+    runner.check_all_succeeded(found[2:])
 
 
 def test_jobs_that_cannot_be_told_apart_or_sent_are_refused(tmp_path):
     with pytest.raises(ValueError, match="different names, got toys_a_seed0"):
-        run_missing([*toys(tmp_path, 2), *toys(tmp_path, 1)], backend=HERE)
+        runner.run_missing([*toys(tmp_path, 2), *toys(tmp_path, 1)], backend=HERE)
     locked = Toy(group="", method="locked", seed=0, folder=tmp_path, learner={"lock": pytest.importorskip("threading").Lock()})
     with pytest.raises(ValueError, match="locked, seed 0 cannot be sent to a worker, its pickling failed"):
-        run_missing([locked], backend=HERE)
-    assert run_missing([], backend=HERE) == []
+        runner.run_missing([locked], backend=HERE)
+    assert runner.run_missing([], backend=HERE) == []
     with pytest.raises(RuntimeError, match="install the same on both"):
-        perform(b"", "0.0", os.getpid())
+        runner.perform(b"", "0.0", os.getpid())
 
 
 @pytest.mark.parametrize(
     ("backend", "message"),
     [
-        (Backend("slurm"), "backend must be one of loky, ray, dask, got 'slurm'"),
-        (Backend(n_jobs=0), "jobs must be"),
-        (Backend(address="a:1"), "address is for the backends ray and dask"),
-        (Backend("dask", n_jobs=2, address="a:1"), "jobs is for the backend loky"),
-        (Backend("dask"), "address of dask must be a host and a port .*got None. Start one with: dask scheduler"),
-        (Backend("ray", address="ray://a:1"), "address of ray must be a host and a port"),
-        (Backend("dask", address="tcp://a:none"), "got 'tcp://a:none'"),
-        (Backend("dask", address=f"tcp://{HOST}:{free_port()}"), "no dask cluster answers at .*Start one with"),
+        (runner.Backend("slurm"), "backend must be one of loky, ray, dask, got 'slurm'"),
+        (runner.Backend(n_jobs=0), "jobs must be"),
+        (runner.Backend(address="a:1"), "address is for the backends ray and dask"),
+        (runner.Backend("dask", n_jobs=2, address="a:1"), "jobs is for the backend loky"),
+        (runner.Backend("dask"), "address of dask must be a host and a port .*got None. Start one with: dask scheduler"),
+        (runner.Backend("ray", address="ray://a:1"), "address of ray must be a host and a port"),
+        (runner.Backend("dask", address="tcp://a:none"), "got 'tcp://a:none'"),
+        (runner.Backend("dask", address=f"tcp://{HOST}:{free_port()}"), "no dask cluster answers at .*Start one with"),
     ],
 )
 def test_a_backend_that_cannot_be_used_says_why(backend, message):
     with pytest.raises((ValueError, ConnectionError), match=message):
         backend.check()
-    LOCAL.check()
+    runner.LOCAL.check()
 
 
 def test_a_job_learns_what_its_fields_say():
     job = Job(group="walk", method="COMBREL", seed=3, env=Walk, n_steps=90, learner={"resolution": 3}, transfer=None)
-    [result] = run_missing([job], backend=HERE)
+    [result] = runner.run_missing([job], backend=HERE)
     assert result.error == "" and result.n_steps == 90 and sum(result.steps) <= 90
     assert len(result.steps) == len(result.returns) == len(result.terminated) > 1
-    assert [replace(each, seconds=0.0) for each in run_missing([job], backend=HERE)] == [replace(result, seconds=0.0)]
-    [other] = run_missing([replace(job, n_steps=None, n_episodes=2)], backend=HERE)
+    assert [replace(each, seconds=0.0) for each in runner.run_missing([job], backend=HERE)] == [replace(result, seconds=0.0)]
+    [other] = runner.run_missing([replace(job, n_steps=None, n_episodes=2)], backend=HERE)
     assert (other.steps, other.returns) == (result.steps[:2], result.returns[:2])
 
 
@@ -178,31 +169,30 @@ def test_names_of_files_and_environments():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("name", runner.BACKENDS)
 def test_on_each_backend_dead_workers_cost_only_their_jobs(name, tmp_path):
     cluster = {"ray": ray_cluster, "dask": dask_cluster}.get(name)
     if cluster is None:
-        _check_backend(Backend(n_jobs=2), tmp_path)
+        _check_backend(runner.Backend(n_jobs=2), tmp_path)
     else:
         with cluster() as address:
-            _check_backend(Backend(name, address=address), tmp_path)
+            _check_backend(runner.Backend(name, address=address), tmp_path)
 
 
 def _check_backend(backend, folder):
     backend.check()
     jobs = toys(folder, 4) + toys(folder, 1, method="b", does="die once") + toys(folder, 1, method="c", does="fail")
-    found = run_missing(jobs, folder / "out", backend)
+    found = runner.run_missing(jobs, folder / "out", backend)
     assert [result.error.partition(":")[0] for result in found] == [""] * 5 + ["FileNotFoundError"]
     assert [result.steps for result in found[:5]] == [[0, 2], [1, 2], [2, 2], [3, 2], [0, 2]]
-    assert {result.more["threads"] for result in found[:5]} == {1}
-    assert jobs[4].attempts() == 2
+    assert {result.more["threads"] for result in found[:5]} == {1} and jobs[4].attempts() == 2
     # Those that kill every worker are given up, and the others go on.
     deadly = toys(folder, 1, method="deadly", does="die") + toys(folder, 2, method="d")
-    found = run_missing(deadly, None, backend)
+    found = runner.run_missing(deadly, None, backend)
     assert "worker died" in found[0].error and [result.error for result in found[1:]] == ["", ""]
-    assert deadly[0].attempts() >= MAX_BREAKDOWNS
+    assert deadly[0].attempts() >= runner.MAX_BREAKDOWNS
     learning = [Job(group="walk", method="m", seed=seed, env=Walk, n_steps=60) for seed in range(2)]
-    there, here = run_missing(learning, None, backend), run_missing(learning, None, HERE)
+    there, here = runner.run_missing(learning, None, backend), runner.run_missing(learning, None, HERE)
     assert [replace(each, seconds=0.0) for each in there] == [replace(each, seconds=0.0) for each in here]
 
 
@@ -236,5 +226,5 @@ except KeyboardInterrupt:
     time.sleep(1.0)
     assert not any(Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids)
     assert [job.attempts() for job in toys(tmp_path, 1)] == [1]
-    run_missing(toys(tmp_path, 2), tmp_path / "out", HERE)
+    runner.run_missing(toys(tmp_path, 2), tmp_path / "out", HERE)
     assert [job.attempts() for job in toys(tmp_path, 2)] == [1, 1]

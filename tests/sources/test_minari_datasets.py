@@ -31,8 +31,7 @@ class TestMinari:
         source = SourceInstances.record(lambda state: 0, Corridor(step_size=0.125), 20, seed=0)
         episodes = list(source.to_minari("corridor-v0").iterate_episodes())
         lengths = [len(episode.actions) for episode in episodes]
-        assert sum(lengths) == 20
-        assert max(lengths) == 6
+        assert sum(lengths) == 20 and max(lengths) == 6
         assert all(bool(episode.terminations[-1]) != bool(episode.truncations[-1]) for episode in episodes)
 
     def test_a_missing_minari_is_named_with_its_remedy(self, monkeypatch):

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from helpers.sources import assert_same
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,8 +16,8 @@ MOUNTAIN_CAR = "combrel/MountainCar2D-v0"
 class Chain(gym.Env):
     """Three places in a row; from each, action 0 ends the episode with -4 and action 1 goes on for -1, at last for +0."""
 
-    observation_space = spaces.Box(0.0, 1.0, (1,), np.float64)
-    action_space = spaces.Discrete(2, start=3)
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2, start=3)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -39,8 +38,7 @@ class TestTileCoding:
     def test_a_state_lies_in_one_tile_of_each_grid(self, state, n_tilings, n_tiles):
         coding = TileCoding(2, n_tilings, n_tiles)
         tiles = coding.tiles(np.array(state))
-        assert (tiles // (n_tiles + 1) ** 2).tolist() == list(range(n_tilings))
-        assert tiles.max() < coding.n_features
+        assert (tiles // (n_tiles + 1) ** 2).tolist() == list(range(n_tilings)) and tiles.max() < coding.n_features
 
     @settings(max_examples=50)
     @given(st.lists(st.floats(0, 1), min_size=4, max_size=4))
@@ -66,23 +64,19 @@ class TestQLearning:
 
     def test_it_solves_mountain_car_and_its_experience_is_a_source(self):
         source = SourceInstances.from_q_learning(MOUNTAIN_CAR, n_instances=1000, seed=0, total_timesteps=10_000)
-        assert len(source) == 1000
-        assert source.state_names == ("x", "v")
-        assert source.action_names == ("Neutral", "Left", "Right")
-        assert source.origin["env"] == MOUNTAIN_CAR
+        assert len(source) == 1000 and source.state_names == ("x", "v")
+        assert source.action_names == ("Neutral", "Left", "Right") and source.origin["env"] == MOUNTAIN_CAR
         assert source.origin["recorder"] == "QLearning"
         # Terminal instances are those that reach the goal.
         np.testing.assert_array_equal(source.terminated, source.next_states[:, 0] >= 0.5)
         assert source.terminated.any()
         # Section 5.1: it covers the state space. Most of the cells that a car can be in at all hold some instance.
         cells = set(map(tuple, np.floor(source.scaling.to_unit(source.states) * 8).clip(0, 7).astype(int)))
-        assert len(cells) >= 40
-        assert np.bincount(source.actions).min() > 100
+        assert len(cells) >= 40 and np.bincount(source.actions).min() > 100
 
     def test_the_greedy_policy_is_near_the_optimum_of_103_steps(self):
         learner = QLearning(MOUNTAIN_CAR, seed=1).learn(15_000)
-        source = SourceInstances.record(learner, MOUNTAIN_CAR, 200, seed=5, deterministic=True)
-        assert source.terminated.any()
+        assert SourceInstances.record(learner, MOUNTAIN_CAR, 200, seed=5, deterministic=True).terminated.any()
 
     def test_the_seed_decides_everything(self):
         runs = [SourceInstances.from_q_learning("MountainCar-v0", 50, seed, total_timesteps=400) for seed in (0, 0, 1)]

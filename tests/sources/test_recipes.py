@@ -140,8 +140,7 @@ def test_what_is_no_source_is_refused_at_construction(source, error, message):
 
 
 def test_a_path_that_goes_before_it_is_read_is_named(tmp_path):
-    file = some_source().save(tmp_path / "source.npz")
-    transfer = COMBREL(tmp_path / "source")
+    file, transfer = some_source().save(tmp_path / "source.npz"), COMBREL(tmp_path / "source")
     file.unlink()
     with pytest.raises(FileNotFoundError, match=r"no source file .*source"):
         small(transfer=transfer)
@@ -157,8 +156,7 @@ def test_a_recipe_with_other_arguments_is_another_source():
 
 
 def test_specifications_of_tasks():
-    assert task_spec(WALK).id == WALK
-    assert task_spec("combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
+    assert task_spec(WALK).id == WALK and task_spec("combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("combrel_envs:combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("Nowhere-v0") is None and task_spec("source.npz") is None
     check_source("combrel/MountainCar2D-v0")

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from helpers.sources import Corridor, assert_same, check_corridor
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import EvalCallback
@@ -24,18 +23,14 @@ class TestRecord:
         check_corridor(source)
         assert source.terminated.any()
         # Cut off at the limit: neither terminal nor joined to the first state of the next episode.
-        assert ((source.next_states[:, 1] == 6) & ~source.terminated).any()
-        assert source.state_names == ("place", "time")
-        assert source.action_names == ("back", "forth")
-        assert set(source.actions.tolist()) == {0, 1}
+        assert ((source.next_states[:, 1] == 6) & ~source.terminated).any() and source.state_names == ("place", "time")
+        assert source.action_names == ("back", "forth") and set(source.actions.tolist()) == {0, 1}
 
     def test_the_seed_decides_everything(self):
         one, same, other = (SourceInstances.record(None, "MountainCar-v0", 30, seed=seed) for seed in (0, 0, 1))
         assert_same(one, same)
-        assert not np.array_equal(one.states, other.states)
-        assert one.origin["env"] == "MountainCar-v0"
-        assert one.origin["recorder"] == "random actions"
-        assert one.origin["seed"] == 0
+        assert not np.array_equal(one.states, other.states) and one.origin["env"] == "MountainCar-v0"
+        assert one.origin["recorder"] == "random actions" and one.origin["seed"] == 0
 
     def test_a_function_of_the_state_is_recorded(self):
         source = SourceInstances.record(lambda state: 0 if state[0] < 0.6 else -1, Corridor(), 50, seed=0)
@@ -53,8 +48,7 @@ class TestRecord:
             env.close()
         assert len(source) == 100
         check_corridor(source)
-        assert source.terminated.any()
-        assert source.action_names == ("back", "forth")
+        assert source.terminated.any() and source.action_names == ("back", "forth")
 
     def test_an_sb3_model_is_recorded_without_a_trace_on_global_generators(self):
         model = DQN("MlpPolicy", "MountainCar-v0", seed=0, exploration_initial_eps=0.5)
@@ -62,12 +56,10 @@ class TestRecord:
         th.manual_seed(5)
         before = np.random.get_state()[1].copy(), th.get_rng_state()
         one = SourceInstances.record(model, "MountainCar-v0", 250, seed=3)
-        assert np.array_equal(before[0], np.random.get_state()[1])
-        assert th.equal(before[1], th.get_rng_state())
+        assert np.array_equal(before[0], np.random.get_state()[1]) and th.equal(before[1], th.get_rng_state())
         assert_same(one, SourceInstances.record(model, "MountainCar-v0", 250, seed=3))
         # 200 steps make an episode: the cut-off is no terminal state, and the next episode begins anew.
-        assert not one.terminated.any()
-        assert (one.next_states[:199] == one.states[1:200]).all()
+        assert not one.terminated.any() and (one.next_states[:199] == one.states[1:200]).all()
         assert (one.next_states[199] != one.states[200]).any()
         greedy = SourceInstances.record(model, "MountainCar-v0", 50, seed=3, deterministic=True)
         np.testing.assert_array_equal(greedy.actions, model.predict(greedy.states.astype(np.float32), deterministic=True)[0])
@@ -91,8 +83,7 @@ class TestRecord:
         with pytest.raises(ValueError, match="bounds"):
             SourceInstances.record(None, "CartPole-v1", 10)
         source = SourceInstances.record(None, "CartPole-v1", 60, seed=0, bounds=(-5, 5))
-        assert source.low.tolist() == [-5] * 4
-        assert source.terminated.any()
+        assert source.low.tolist() == [-5] * 4 and source.terminated.any()
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -110,7 +101,7 @@ class TestRecord:
 class OneAction(gym.ActionWrapper):
     """DQN and PPO want actions from 0 on."""
 
-    action_space = spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
 
     def action(self, action):
         return int(action) - 1
@@ -130,8 +121,7 @@ class TestSourceRecorder:
         source = recorder.source_instances()
         assert len(source) == 128
         check_corridor(source)
-        assert source.terminated.any()
-        assert source.origin["recorder"] == algorithm
+        assert source.terminated.any() and source.origin["recorder"] == algorithm
         model.learn(64, callback=recorder, reset_num_timesteps=False)
         assert len(recorder.source_instances()) == 192
         check_corridor(recorder.source_instances())
@@ -141,8 +131,7 @@ class TestSourceRecorder:
         recorder = SourceRecorder(max_instances=20, seed=0)
         PPO("MlpPolicy", env, n_steps=128, n_epochs=1, seed=0).learn(256, callback=recorder)
         source = recorder.source_instances()
-        assert len(source) == len(recorder.log) == 20
-        assert source.origin["n_seen"] == 256
+        assert len(source) == len(recorder.log) == 20 and source.origin["n_seen"] == 256
         check_corridor(source)
 
     def test_the_sample_of_a_bounded_log_is_uniform(self):

@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 
 from sb3_combrel import SourceInstances
 from sb3_combrel.sources.q_learning import QLearning
@@ -17,8 +16,8 @@ NO_COUNTS = [INF, NAN, 2.5, 1e308, 10**30, 0, -1, True, "3"]
 class Faulty(gym.Env):
     """A random walk on the unit square that, from its ``good_steps`` on, returns something wrong."""
 
-    observation_space = spaces.Box(0.0, 1.0, (2,), np.float64)
-    action_space = spaces.Discrete(2)
+    observation_space = gym.spaces.Box(0.0, 1.0, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, good_steps, observation=None, reward=-1.0):
         self.good_steps = good_steps

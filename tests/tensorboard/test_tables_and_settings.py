@@ -35,10 +35,8 @@ def test_settings_are_in_the_hparams_tab(transfers, tmp_path):
     walker(tmp_path, transfers["COMBREL"], max_value=1.5).learn(50)
     content = events(run_folder(tmp_path)).PluginTagToContent("hparams")["_hparams_/session_start_info"]
     settings = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info.hparams
-    assert settings["algorithm"].string_value == "FittedRMax + COMBREL"
-    assert settings["max_value"].number_value == 1.5
-    assert settings["model_breadth"].number_value == 0.15
-    assert settings["transfer.n_neighbors"].number_value == 3
+    assert settings["algorithm"].string_value == "FittedRMax + COMBREL" and settings["max_value"].number_value == 1.5
+    assert settings["model_breadth"].number_value == 0.15 and settings["transfer.n_neighbors"].number_value == 3
     assert settings["transfer.mappings"].string_value == "injective"
 
 

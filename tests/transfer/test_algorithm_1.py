@@ -37,11 +37,9 @@ def test_nearest_transitions_are_those_of_a_full_sort(seed, n_transitions, k, ac
 def test_best_mapping_has_the_highest_mean_compliance_of_the_neighbours():
     compliances = np.array([[0.9, 0.4, 0.5, 0.5], [0.0, 0.6, 0.5, 0.4]])
     assert equations.best_mapping(compliances) == 1, "of equal means the first"
-    assert equations.best_mapping(compliances[:1]) == 0
-    assert equations.best_mapping(compliances, baseline=0.49) == 1
+    assert equations.best_mapping(compliances[:1]) == 0 and equations.best_mapping(compliances, baseline=0.49) == 1
     assert equations.best_mapping(compliances, baseline=0.5) is None
-    assert equations.best_mapping(np.zeros((3, 4))) is None
-    assert equations.best_mapping(compliances[:0]) is None
+    assert equations.best_mapping(np.zeros((3, 4))) is None and equations.best_mapping(compliances[:0]) is None
 
 
 @settings(max_examples=25, deadline=None)
@@ -60,8 +58,7 @@ def test_transferred_instances_reach_the_threshold_with_none_to_spare_or_there_a
         assert len(numbers) == 0
     if len(numbers):
         assert own + weights.sum() >= threshold - 1e-12 > own + weights[:-1].sum() - 2e-12
-        order = weights if relevances is None else relevances[numbers]
-        assert (np.diff(order) <= 0.0).all()
+        assert (np.diff(weights if relevances is None else relevances[numbers]) <= 0.0).all()
 
 
 MAPPINGS = MappingSet.all(2, 3, 2, 2, signs=True)
@@ -89,8 +86,7 @@ def mapping_of(method, candidate):
 def mean_compliances(method, sample, source, near, action, guard):
     """Lines 9-13 and 19 of Algorithm 1: mean compliance of every candidate of ``action`` with transitions ``near``."""
     first, usual = method.candidates.arrays.first, default_bandwidths(method.candidates.instances)
-    sample_near = Transitions(*(column[near] for column in sample))
-    of_candidates = []
+    sample_near, of_candidates = Transitions(*(column[near] for column in sample)), []
     for candidate in range(first[action], first[action + 1]):
         mapping = mapping_of(method, candidate)
         n_compared = len(mapping.state) - mapping.state.count(None)
@@ -106,8 +102,7 @@ def test_combrel_selects_the_best_mapping_of_the_equations(seed, k, guard):
     states, actions, first = rng.random((4, 3)), np.tile(np.arange(2), 2), method.candidates.arrays.first
     chosen = method.selected(states, actions)
     changed_pairs(method)
-    on_grid = method.choices().reshape(2, -1)
-    asked = list(zip(states, actions, chosen, strict=True))
+    on_grid, asked = method.choices().reshape(2, -1), list(zip(states, actions, chosen, strict=True))
     asked += [(GRID[p], a, on_grid[a, p]) for a in (0, 1) for p in rng.choice(len(GRID), 2)]
     for state, action, candidate in asked:
         near = equations.nearest_transitions(state, action, sample, k)

@@ -75,8 +75,7 @@ def test_compiled_compliance_has_a_start_bandwidth_for_each_state_mapping(seed, 
     tables = compiled_tables(sample, [source], [mappings], bandwidths, starts=starts)
     for number in rng.choice(len(mappings), 6):
         mapping, row = mappings[int(number)], int(number) // mappings.n_action_mappings
-        own = bandwidths._replace(start=starts[row])
-        expected = equations.sample_compliance(sample, instances, mapping, own, GUARD)
+        expected = equations.sample_compliance(sample, instances, mapping, bandwidths._replace(start=starts[row]), GUARD)
         found = tables[np.arange(len(transitions)), row, np.array(mapping.action)[sample.action]]
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
         assert equations.task_compliance(expected, prior=0.25) == pytest.approx(expected.mean() / 4)
@@ -110,8 +109,7 @@ def test_more_evidence_demanded_makes_compliances_0_and_changes_no_other(seed, s
 
 def test_compliance_of_the_source_with_itself_is_1_where_instances_do_not_overlap():
     """Far enough from each other, each instance is predicted by itself alone."""
-    at = np.linspace(0.0, 1.0, 5)[:, None]
-    effect = np.array([[0.1], [-0.1], [0.05], [0.0], [-0.2]])
+    at, effect = np.linspace(0.0, 1.0, 5)[:, None], np.array([[0.1], [-0.1], [0.05], [0.0], [-0.2]])
     instances = Transitions(at, np.array([0, 1, 0, 1, 0]), effect, np.arange(5.0), np.zeros(5, dtype=bool))
     bandwidths, mirrored = Bandwidths(0.001, 0.0001, 0.1), instances._replace(state=1.0 - at, effect=-effect)
     identity, swapped = InterTaskMapping([0], [0, 1]), InterTaskMapping([0], [1, 0])
@@ -208,8 +206,7 @@ def test_relevance_is_1_for_perfect_compliance_and_for_instances_without_evidenc
     assert equations.source_relevances(instances, identity, 0, nothing, bandwidths, 0.5).tolist() == [1.0, 1.0]
     differs = instances._replace(state=np.array([[0.2], [0.21]]), effect=np.array([[0.5], [0.5]]))
     contradicted, far = equations.source_relevances(instances, identity, 0, differs, bandwidths, 0.5)
-    assert contradicted < 1e-6
-    assert far == 1.0
+    assert contradicted < 1e-6 and far == 1.0
     # Also where rounding makes the compliance of an instance that every transition repeats a little less than 1.
     repeated = Transitions(*(np.repeat(column[:1], 7, axis=0) for column in instances))
     assert equations.source_relevances(instances, identity, 0, repeated, Bandwidths(0.3, 0.1, 0.7), 0.5)[0] == 1.0
@@ -225,16 +222,10 @@ def line(states, effects, rewards=None, actions=None):
     """Source instances of a task with the variables of ``states``, in the unit box."""
     states, effects = np.array(states, dtype=float), np.array(effects, dtype=float)
     n, d = states.shape
-    return SourceInstances(
-        states,
-        np.zeros(n, dtype=int) if actions is None else np.array(actions),
-        -np.ones(n) if rewards is None else np.array(rewards, dtype=float),
-        states + effects,
-        np.zeros(n, dtype=bool),
-        np.zeros(d),
-        np.ones(d),
-        1 if actions is None else max(actions) + 1,
-    )
+    actions = np.zeros(n, dtype=int) if actions is None else np.array(actions)
+    rewards = -np.ones(n) if rewards is None else np.array(rewards, dtype=float)
+    ends, n_actions = np.zeros(n, dtype=bool), int(actions.max()) + 1
+    return SourceInstances(states, actions, rewards, states + effects, ends, np.zeros(d), np.ones(d), n_actions)
 
 
 @settings(max_examples=25, deadline=None)
@@ -260,9 +251,7 @@ def test_default_bandwidths_are_what_they_are_said_to_be(seed, n, n_actions):
 @pytest.mark.parametrize(
     "source",
     [
-        line([[0.5]], [[0.0]]),
-        line([[0.5]] * 30, [[0.0]] * 30),
-        line([[0.1], [0.9]], [[0.0], [0.0]], actions=[0, 2]),
+        *[line([[0.5]], [[0.0]]), line([[0.5]] * 30, [[0.0]] * 30), line([[0.1], [0.9]], [[0.0], [0.0]], actions=[0, 2])],
         line([[0.1], [0.9], [0.2]], [[1e-12], [0.0], [1e-12]], rewards=[-1e9, 1e9, 0.0]),
     ],
     ids=["one", "all alike", "one an action", "extremes"],
@@ -277,8 +266,7 @@ def test_default_bandwidths_are_usable_whatever_the_source(source):
 @pytest.mark.parametrize("state", [(0, 0, None), (0, 1, 0), (0, 0, 1), (1, None, None), (0, 1, None)], ids=str)
 @pytest.mark.parametrize("given", [0.02, None])
 def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_number(state, given):
-    rng = np.random.default_rng(0)
-    source, n_mapped = naive.random_source(rng, 100, 2, 2), len(state) - state.count(None)
+    source, n_mapped = naive.random_source(np.random.default_rng(0), 100, 2, 2), len(state) - state.count(None)
     candidates = Candidates(source, [InterTaskMapping(state, [0])], naive.target_task(np.zeros((1, 3)), 1))
     usual = default_bandwidths(candidates.instances).start if given is None else given
     [found] = start_bandwidths(candidates, usual)
@@ -290,8 +278,7 @@ def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_n
 
 def test_min_evidence_is_the_sum_of_kernels_below_which_nothing_counts():
     source, transition = line([[0.3], [0.3]], [[0.1], [0.1]]), naive.Transition(np.array([0.4]), 0, -1.0, np.array([0.5]))
-    evidence = 2 * np.exp(-0.01 / 0.005)
-    task = naive.target_task(np.array([[0.4]]), 1)
+    evidence, task = 2 * np.exp(-0.01 / 0.005), naive.target_task(np.array([[0.4]]), 1)
     for least, expected in ((0.0, 1.0), (0.99 * evidence, 1.0), (1.01 * evidence, np.nan)):
         arguments = dict(bandwidths=(0.005, 0.01, 1.0), min_evidence=least, min_compliance=0.0)
         method = bound(COMBREL(source, InterTaskMapping([0], [0]), **arguments), task)

@@ -99,8 +99,7 @@ def test_what_is_restored_goes_on_as_if_nothing_had_happened(name, n):
     """Made of its arguments, before it has seen anything, before its mapping is found and afterwards."""
     method = bound(VARIANTS[name](), TASK)
     live(method, 0, n)
-    again = bound(type(method)(**method.arguments()), TASK, seed=9)
-    state = method.get_state()
+    again, state = bound(type(method)(**method.arguments()), TASK, seed=9), method.get_state()
     shapes = [{key: array.shape[1:] for key, array in each.get_state().items()} for each in (method, again)]
     assert shapes[0] == shapes[1] and all(array.dtype == np.float64 for array in state.values())
     again.set_state(state)

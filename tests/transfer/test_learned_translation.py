@@ -11,13 +11,7 @@ from helpers.asking import bound, changed_pairs, transferred_to_pairs
 from helpers.naive_transfer import random_source, target_task
 from helpers.ring import Ring
 
-from sb3_combrel import (
-    TIMBREL,
-    FittedRMax,
-    InterTaskMapping,
-    SparseCodingMapping,
-    ThreeWayRBM,
-)
+from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping, SparseCodingMapping, ThreeWayRBM
 from sb3_combrel.transfer.methods import three_way_rbm as machines
 from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
 from sb3_combrel.transfer.methods.sparse_coding import fit_regression, sparse_codes
@@ -36,8 +30,7 @@ class Swapping(LearnedTranslation):
 
     def learn_translation(self, source, target, instances):
         self.given = source, target
-        n = self.task.n_actions
-        return Triplets(instances.state[:, ::-1], n - 1 - instances.action, instances.effect[:, ::-1])
+        return Triplets(instances.state[:, ::-1], self.task.n_actions - 1 - instances.action, instances.effect[:, ::-1])
 
 
 def observe(method, transitions):
@@ -74,8 +67,7 @@ def test_standardised_columns_have_mean_0_and_deviation_1_or_do_not_vary():
 
 def test_with_the_right_mapping_it_is_timbrel_with_that_mapping():
     """Two permuted variables: the instances transferred, nearest first until the threshold, are those of TIMBREL."""
-    source = f.oscillator_source(200)
-    task = target_task(np.random.default_rng(0).random((15, 2)), 3)
+    source, task = f.oscillator_source(200), target_task(np.random.default_rng(0).random((15, 2)), 3)
     ours = bound(Swapping(source, n_random_steps=10, breadth=0.2), task)
     theirs = bound(TIMBREL(source, InterTaskMapping([1, 0], [2, 1, 0]), breadth=0.2), task)
     states, actions, effects = random_transitions(10, 2, 3)
@@ -83,8 +75,7 @@ def test_with_the_right_mapping_it_is_timbrel_with_that_mapping():
     effects[:2] = [[-0.5, -0.5], [0.5, 0.5]]
     observe(ours, (states, actions, effects))
     pairs, own = np.arange(45), np.linspace(0.0, 1.2, 45)
-    inside = np.flatnonzero((source.scaling.to_unit(source.next_states) <= 1.0).all(axis=1))
-    assert len(inside) > 150
+    assert len(np.flatnonzero((source.scaling.to_unit(source.next_states) <= 1.0).all(axis=1))) > 150
     one, other = (transferred_to_pairs(method, pairs, own) for method in (ours, theirs))
     np.testing.assert_array_equal(one.length, other.length)
     assert (one.length > 0).sum() > 20
@@ -288,8 +279,7 @@ def test_training_depends_on_its_seed_alone_and_leaves_pytorchs_generator_and_th
 
 @pytest.mark.parametrize("n", [1, 7])
 def test_a_reconstruction_is_a_fixed_point_of_its_iterations_where_weights_are_small(n):
-    machine = machines.Machine(*(0.3 * each for each in some_machine()))
-    source = some_units(n)[0]
+    machine, source = machines.Machine(*(0.3 * each for each in some_machine())), some_units(n)[0]
     found = machines.reconstruct(machine, source)
     units, target = tensors(source, found)
     again = machines.target_mean(machine, units, th.sigmoid(machines.hidden_input(machine, units, target)))

@@ -24,11 +24,8 @@ def note(made, ends, terminated=False, weight=5.0, reward=-1.0, predicted=-1.0):
         ([NONE] * 20, False, 0, 0),
         ([NONE, SURE], True, 1, 0),
         # At the border a kernel average decides nothing: an end a step or two later is the one that was predicted.
-        ([NONE, SURE, 0.3, 0.2], True, 1, 0),
-        ([NONE, 0.2], True, 1, 0),
-        ([NONE, NONE], True, 0, 1),
-        ([NONE, SURE, SURE, NONE], False, 0, 1),
-        ([NONE, SURE, NONE, SURE, NONE], False, 0, 2),
+        *[([NONE, SURE, 0.3, 0.2], True, 1, 0), ([NONE, 0.2], True, 1, 0), ([NONE, NONE], True, 0, 1)],
+        *[([NONE, SURE, SURE, NONE], False, 0, 1), ([NONE, SURE, NONE, SURE, NONE], False, 0, 2)],
         ([NONE, 0.3, 0.3, NONE], False, 0, 0),
         # Whoever stays where an end is predicted contradicts it again and again.
         ([SURE] * STEPS_OF_A_VISIT, False, 0, 1),

@@ -39,8 +39,7 @@ def factored():
 
 def test_the_mapping_of_a_prior_is_named_with_compliances_and_errors_of_the_targets_transitions(factored):
     transfer, (states, actions, effects) = factored
-    report = transfer.report()
-    scale = np.abs(effects).mean(axis=0) ** 2
+    report, scale = transfer.report(), np.abs(effects).mean(axis=0) ** 2
     places = {0: [0, 1], 1: [2, 3]}
     assert [each.target_action for each in report.mappings] == [f"a{k}" for k in range(5)]
     assert report.mappings[3].mapping == "Wait on (s0, s1), Down on (s2, s3)"
@@ -91,8 +90,7 @@ def test_where_the_target_contradicts_a_source_is_said_by_action_variable_and_ra
     assert {each.target_action for each in found} == {"a0", "a1", "a2"}
     # Twice the effect is missed.
     assert all(each.error == pytest.approx(4.0, rel=0.1) for each in found)
-    assert report.n_worse == pytest.approx(0.25 * report.n_compared, rel=0.3)
-    assert "s0 from 0.75 to 1" in str(report)
+    assert report.n_worse == pytest.approx(0.25 * report.n_compared, rel=0.3) and "s0 from 0.75 to 1" in str(report)
 
 
 def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
@@ -174,8 +172,7 @@ def test_the_confidence_of_combrel_is_that_of_its_choices_and_they_are_the_best(
     for action, each in enumerate(report.mappings):
         n = len(selector.task.sample_states)
         pairs = action * n + np.flatnonzero(selector.choices()[action * n : (action + 1) * n] >= 0)
-        assert 0 < len(pairs) <= 500
-        assert each.compliance == pytest.approx(selector.mean_compliance(pairs).mean())
+        assert 0 < len(pairs) <= 500 and each.compliance == pytest.approx(selector.mean_compliance(pairs).mean())
         # What does not exceed the no-change baseline is not chosen.
         assert each.compliance >= each.next_best_compliance and each.compliance > each.no_change_compliance
     assert report.mappings[1].target_action == "forth" and "place<-" in report.mappings[1].mapping

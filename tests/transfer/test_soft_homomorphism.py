@@ -39,8 +39,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
     ]
     assert float(method.describe().rsplit(" ", 1)[1]) == pytest.approx(state[0, 0, 0, 1] * action[0, 2, 2], abs=0.02)
     states, actions = inside(100, 2, 3)
-    predicted = method.prior(states, actions)
-    expected = f.target_effects(SWAPPED, states, actions)
+    predicted, expected = method.prior(states, actions), f.target_effects(SWAPPED, states, actions)
     assert ((predicted.effect - expected) ** 2).sum() < 0.01 * (expected**2).sum()
     assert method._claims.trust.min() >= 0.8 and predicted.weight.min() > 1.0
     assert method.statistics()["transfer/prediction_error"] < 0.1
@@ -49,8 +48,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
 
 def test_a_mirrored_variable_and_renamed_actions_are_found():
     """The target's first variable is the source's second, mirrored; its actions are the source's in another order."""
-    rng = np.random.default_rng(1)
-    renamed = np.array([2, 0])
+    rng, renamed = np.random.default_rng(1), np.array([2, 0])
     states, actions = rng.random((150, 2)), rng.integers(2, size=150)
     at = np.column_stack([states[:, 1], 1.0 - states[:, 0]])
 
@@ -61,8 +59,7 @@ def test_a_mirrored_variable_and_renamed_actions_are_found():
     method = bound(SoftHomomorphism(f.oscillator_source(effects=pushed), n_starts=2), 2, 2)
     show(method, (states, actions, np.column_stack([-effects[:, 1], effects[:, 0]])))
     state, action = method.mixture()
-    assert state[0, 0, 0, 1] > 0.95 and state[0, 1, 1, 0] > 0.95
-    assert action[0, [0, 1], renamed].min() > 0.85
+    assert state[0, 0, 0, 1] > 0.95 and state[0, 1, 1, 0] > 0.95 and action[0, [0, 1], renamed].min() > 0.85
 
 
 def test_two_copies_of_the_source_are_told_apart():
@@ -102,8 +99,7 @@ def test_a_target_that_has_nothing_in_common_is_not_claimed_to_be_known():
     states, actions = rng.random((100, 2)), rng.integers(3, size=100)
     method = bound(SoftHomomorphism(f.oscillator_source(), n_starts=1), 2, 3)
     show(method, (states, actions, 0.1 * np.sin(40.0 * states[:, ::-1])))
-    assert method._claims.trust.tolist() == [0.0, 0.0, 0.0]
-    assert method.prior(*inside(50, 2, 3)).weight.max() == 0.0
+    assert method._claims.trust.tolist() == [0.0, 0.0, 0.0] and method.prior(*inside(50, 2, 3)).weight.max() == 0.0
 
 
 def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doubted():
@@ -114,8 +110,7 @@ def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doub
     assert method.prior(at_end, actions).end[0] > 0.5 and method.prior(at_end, actions).weight[0] == 0.0
     before, [after] = method.prior_version(), at_end + f.target_effects(SWAPPED, at_end, actions)
     method.observe(at_end[0], 0, -1.0, after, True)
-    assert method.prior_version() == before + 1
-    assert method.prior(at_end, actions).weight[0] > 0.0
+    assert method.prior_version() == before + 1 and method.prior(at_end, actions).weight[0] > 0.0
     for _ in range(2):
         # It stays for an episode where an end is predicted.
         method.observe(at_end[0], 0, -1.0, after, False)
@@ -125,8 +120,7 @@ def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doub
 
 
 def test_periodic_variables_are_taken():
-    rng = np.random.default_rng(0)
-    env = Ring()
+    rng, env = np.random.default_rng(0), Ring()
     states, actions = rng.random((300, 2)), rng.integers(2, size=300)
     low, high = env.observation_space.low, env.observation_space.high
     speed = np.clip(states[:, 1] + np.where(actions == 1, 0.075, -0.075), 0.0, 1.0)
@@ -181,8 +175,7 @@ def test_all_mappings_are_listed_once_and_counted(size):
         tuple(None if v < 0 else (v, int(s)) for v, s in zip(variable, sign, strict=True))
         for variable, sign in zip(readings.variable.tolist(), readings.sign.tolist(), strict=True)
     ]
-    assert sorted(rows, key=str) == sorted(naive_mappings(*size), key=str)
-    assert len(rows) == soft.count_mappings(*size)
+    assert sorted(rows, key=str) == sorted(naive_mappings(*size), key=str) and len(rows) == soft.count_mappings(*size)
     # Different readings have different logits, and the same one the same.
     means = set(zip(readings.number.ravel(), readings.variable.ravel(), readings.sign.ravel(), strict=True))
     assert sorted(number for number, _, _ in means) == list(range(1 + readings.number.max()))
@@ -233,8 +226,7 @@ def naive_loss(logits, readings, data):
 
 def problem(seed=0, n=6, n_copies=2):
     """Random parameters and transitions of two source and three target variables."""
-    rng = np.random.default_rng(seed)
-    readings = soft.all_readings(2, 3, True)
+    rng, readings = np.random.default_rng(seed), soft.all_readings(2, 3, True)
     logits = soft.Logits(rng.normal(size=(n_copies, 2, 6)), rng.normal(size=(n_copies, 4, 3)))
     data = soft.FitData(
         predicted=rng.normal(size=(n, len(readings.variable), 3, 3)),
@@ -285,10 +277,8 @@ def test_the_most_probable_parts_come_first_and_add_up_to_one(max_terms, mass):
 
 def mixture(sample, n_target=3):
     """The predictions of a random mixture, and what they are made of."""
-    source = f.oscillator_source(200, rewards=lambda states: states[:, 0])
-    model = SourceModel(stacked_instances([source]))
-    rng = np.random.default_rng(0)
-    readings = soft.all_readings(2, n_target, True)
+    model = SourceModel(stacked_instances([f.oscillator_source(200, rewards=lambda states: states[:, 0])]))
+    rng, readings = np.random.default_rng(0), soft.all_readings(2, n_target, True)
     logits = soft.Logits(rng.normal(size=(2, 2, 2 * n_target)), rng.normal(size=(2, 4, 3)))
     predictions = soft.MixturePredictions(model, readings, np.array([0.5, 0.5]), sample)
     predictions.set_terms(soft.most_probable(*soft.probabilities(logits, readings), 4, 0.9))
@@ -319,6 +309,5 @@ def test_predictions_are_means_over_the_mixture(at_sample):
             actions[-1] = (action + 1) % 4
         found = predictions.predict(sample, actions)
         for i in range(12):
-            expected = naive_mixture(predictions, sample[i], actions[i])
-            for ours, theirs in zip(found, expected, strict=True):
+            for ours, theirs in zip(found, naive_mixture(predictions, sample[i], actions[i]), strict=True):
                 np.testing.assert_allclose(ours[i], theirs, rtol=1e-7, atol=1e-10)

@@ -14,8 +14,7 @@ from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 class Untouched(Env):
     """A task with three variables and two actions that nobody may step in."""
 
-    observation_space = spaces.Box(-1.0, 1.0, (3,), dtype=np.float64)
-    action_space = spaces.Discrete(2)
+    observation_space, action_space = spaces.Box(-1.0, 1.0, (3,), dtype=np.float64), spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
         raise AssertionError("the error should have come before")
@@ -79,8 +78,7 @@ def test_sets_that_do_not_exist_or_fit_are_refused(source):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_source_that_is_missing_damaged_or_of_another_task_is_refused(method, source, tmp_path):
     refused(lambda: method(tmp_path / "nowhere.npz"), "nowhere.npz", "SourceInstances.record", error=FileNotFoundError)
-    path = source.save(tmp_path / "source.npz")
-    mapping = InterTaskMapping([0, None, 2], [0, 1])
+    path, mapping = source.save(tmp_path / "source.npz"), InterTaskMapping([0, None, 2], [0, 1])
     refused(lambda: method(str(path), mapping), "state must hold indices from 0 to 1", "the source task has 2 variables")
     path.write_bytes(b"not a source")
     refused(lambda: method(path), "source.npz", "not source instances")

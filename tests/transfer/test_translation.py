@@ -20,14 +20,8 @@ seeds = st.integers(0, 2**32 - 1)
 def translated(states, own, mappings, source, task, breadth, transfer_terminals=True, relevance=None, times_weight=False):
     """What the translator gives each state from a pool of all ``mappings``, for target action 0; and what it is drawn from."""
     candidates = Candidates(source, mappings, task)
-    translator = Translator(
-        candidates,
-        task,
-        breadth=breadth,
-        transfer_terminals=transfer_terminals,
-        by_relevance=relevance is not None,
-        times_weight=times_weight,
-    )
+    arguments = dict(by_relevance=relevance is not None, times_weight=times_weight)
+    translator = Translator(candidates, task, breadth=breadth, transfer_terminals=transfer_terminals, **arguments)
     if relevance is not None:
         translator.relevance[:] = relevance[: len(candidates), : translator.relevance.shape[1]]
     found = translator(states, own, (np.zeros(len(states), dtype=np.int64), np.full(len(states), len(candidates))))
@@ -43,8 +37,7 @@ def assert_same(found, row, expected, transfer_terminals=True):
     for k, (weight, effect, reward, terminated) in enumerate(expected):
         assert found.weight[row, k] == pytest.approx(weight, rel=1e-9, abs=1e-12)
         np.testing.assert_allclose(found.effect[row, k], effect, atol=1e-12)
-        assert found.reward[row, k] == reward
-        assert found.terminated[row, k] == (terminated and transfer_terminals)
+        assert found.reward[row, k] == reward and found.terminated[row, k] == (terminated and transfer_terminals)
 
 
 @settings(max_examples=30, deadline=None)
@@ -76,8 +69,7 @@ def test_with_relevance_the_most_relevant_come_first_and_light_ones_count_too(se
     source = naive.random_source(rng, 60, 2, 2)
     mappings = [naive.random_mapping(rng, 2, 3, 2, 1) for _ in range(2)]
     states, own = rng.random((4, 3)), rng.uniform(0.0, threshold, 4)
-    task = naive.target_task(states, 1, threshold)
-    relevance = rng.random((2, 60))
+    task, relevance = naive.target_task(states, 1, threshold), rng.random((2, 60))
     if ties:
         relevance = np.round(2.0 * relevance) / 2.0
     within = naive.places_of(source, stacked_instances([source]))
@@ -120,23 +112,18 @@ ONTO_X = InterTaskMapping([0, None], [0])
 def test_a_method_has_room_for_all_that_a_pair_may_need(min_fraction):
     """Nearest first, ``min_fraction`` bounds the useful instances; nothing may be lost for lack of room below that."""
     reachable = min(list_room(min_fraction) - 3, 30)
-    points = np.array([[0.5]])
-    task = naive.target_task(points, 1, threshold=reachable - 0.5, min_fraction=min_fraction)
+    task = naive.target_task(np.array([[0.5]]), 1, threshold=reachable - 0.5, min_fraction=min_fraction)
     method = TIMBREL(row_of_instances([0.5] * 100), InterTaskMapping([0], [0]), breadth=0.1)
     method.bind(task, np.random.default_rng(0))
-    found = transferred_to_pairs(method, np.zeros(1, dtype=int), np.zeros(1))
-    assert found.length[0] == reachable
+    assert transferred_to_pairs(method, np.zeros(1, dtype=int), np.zeros(1)).length[0] == reachable
 
 
 def test_by_relevance_as_many_light_instances_are_transferred_as_it_takes():
     """Each weighs 0.0183, so 55 of them reach the threshold; by distance the smallest fraction allows no more than ten."""
     points = np.array([[0.5], [0.9]])
-    task = naive.target_task(points, 1, min_fraction=0.1)
-    source = row_of_instances([0.5 + 0.2] * 100)
+    task, source = naive.target_task(points, 1, min_fraction=0.1), row_of_instances([0.5 + 0.2] * 100)
     method = bound(TIMBREL(source, InterTaskMapping([0], [0]), breadth=0.1, relevance=True), task)
     for _ in range(2):
         found = transferred_to_pairs(method, np.arange(2), np.zeros(2))
-        assert found.length[:2].tolist() == [55, 55]
-        assert found.weight[0, :55].sum() >= 1.0 > found.weight[0, :54].sum()
-    at = transferred_at(method, points[0], np.full(1, 0.5))
-    assert at.length[0] == 28
+        assert found.length[:2].tolist() == [55, 55] and found.weight[0, :55].sum() >= 1.0 > found.weight[0, :54].sum()
+    assert transferred_at(method, points[0], np.full(1, 0.5)).length[0] == 28

@@ -62,8 +62,7 @@ def test_the_command_executes_the_cells_in_their_folder_and_environment_and_writ
 
 
 def test_a_cell_that_fails_is_an_error_and_leaves_the_file(tmp_path):
-    file = tmp_path / "1_small.md"
-    text = "```python\nprint(1)\n```\n\n```python\n1 / 0\n```\n"
+    file, text = tmp_path / "1_small.md", "```python\nprint(1)\n```\n\n```python\n1 / 0\n```\n"
     file.write_text(text)
     with pytest.raises(CellExecutionError, match="ZeroDivisionError"):
         execute(file)
@@ -84,8 +83,7 @@ def test_all_cells_run(file, tmp_path):
     (copy / "figures").mkdir()
     for beside in ("docs", "zoo_configs"):
         (tmp_path / beside).symlink_to(ROOT / beside)
-    text = file.read_text()
-    outputs = execute(copy / file.name)
+    text, outputs = file.read_text(), execute(copy / file.name)
     missing = [figure for figure in figures_of(text) if not (copy / figure).exists()]
     assert not missing, "figures that the tutorial shows and no cell has saved"
     prints = [output != "" for output in outputs]

@@ -62,8 +62,7 @@ class TestBySB3:
         model.save("car.zip")
         push_to_hub("someone/car", "car.zip", commit_message="first")
         again = FittedRMax.load(load_from_hub("someone/car", "car.zip"), env=BIG_CAR)
-        assert same_parameters(model, again)
-        assert len(again.transfer.sources[0]) == 200
+        assert same_parameters(model, again) and len(again.transfer.sources[0]) == 200
         assert again.learn(20, reset_num_timesteps=False).num_timesteps == 80
 
     @pytest.mark.long
@@ -98,18 +97,15 @@ class TestByRLZoo:
         assert card.data.model_name == "FittedRMax" and result.dataset_name == BIG_CAR
 
     def test_what_is_missing_on_the_hub_or_untrusted_gives_a_sentence(self, hub, monkeypatch, capsys):
-        assert load() == 1
-        assert capsys.readouterr().err == f"sb3_combrel.zoo: 404: no repository {OF_RL_ZOO}\n"
+        assert load() == 1 and capsys.readouterr().err == f"sb3_combrel.zoo: 404: no repository {OF_RL_ZOO}\n"
         (hub.folder / OF_RL_ZOO).mkdir(parents=True)
-        assert load() == 1
-        assert "has no file combrel-combrel-MountainCar4D-v0.zip" in capsys.readouterr().err
+        assert load() == 1 and "has no file combrel-combrel-MountainCar4D-v0.zip" in capsys.readouterr().err
         for error in (LocalEntryNotFoundError, huggingface_hub.errors.HTTPError):
             monkeypatch.setattr(huggingface_hub, "hf_hub_download", raising(error("no connection")))
             assert load() == 1
             assert re.fullmatch(r"sb3_combrel\.zoo: .*no connection.*\n", capsys.readouterr().err)
         monkeypatch.delenv("TRUST_REMOTE_CODE")
-        assert load() == 1
-        assert "TRUST_REMOTE_CODE" in capsys.readouterr().err
+        assert load() == 1 and "TRUST_REMOTE_CODE" in capsys.readouterr().err
 
 
 @pytest.mark.long

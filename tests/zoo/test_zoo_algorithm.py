@@ -61,8 +61,7 @@ def test_what_a_study_draws_replaces_what_the_configuration_says(algo, source):
     entry = {"policy": "FittedRMaxPolicy", **drawn, "transfer": None if algo == "fitted_rmax" else given, "resolution": 1}
     if algo == "timbrel":
         given["sb3_combrel.TIMBREL"]["mapping"] = "random"
-    model = ZooFittedRMax(env=gym.make(CAR), **entry)
-    changed = drawn.get("transfer_kwargs", {})
+    model, changed = ZooFittedRMax(env=gym.make(CAR), **entry), drawn.get("transfer_kwargs", {})
     assert len(changed) == {"fitted_rmax": 0, "timbrel": 1, "combrel": 6}[algo]
     assert {name: getattr(model.transfer, name) for name in changed} == changed
     assert model.agent.model_settings.model_breadth == trial.params["model_breadth"]
@@ -73,8 +72,7 @@ def test_a_drawn_grid_is_relative_to_the_one_that_suits_the_task_and_stays_withi
         return ZooFittedRMax("FittedRMaxPolicy", box(n_variables), resolution=drawn, **arguments).agent.grid.resolution
 
     drawn = [resolution(3, each, model_breadth=0.2) for each in (None, "coarser", "finer")]
-    assert drawn == [(4,) * 3, (3,) * 3, (5,) * 3]
-    assert resolution(5, "finer") == resolution(5, None)
+    assert drawn == [(4,) * 3, (3,) * 3, (5,) * 3] and resolution(5, "finer") == resolution(5, None)
 
 
 def with_combrel(**arguments):

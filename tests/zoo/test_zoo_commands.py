@@ -73,8 +73,7 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, capsys, entry, change, 
 
 
 def test_an_unknown_command_or_algorithm_is_refused(tmp_path, capsys):
-    assert call("dance") == 2
-    assert "train" in capsys.readouterr().out
+    assert call("dance") == 2 and "train" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         call("train", *train_args(tmp_path, algo="magic"))
     assert "magic" in capsys.readouterr().err
@@ -129,9 +128,7 @@ class TestChain:
         checkpoints = {f"rl_model_{steps}_steps.zip" for steps in (200, 400, 600)}
         assert {path.name for path in folder.glob("*.zip")} == {"best_model.zip", f"{IN_LOGS}.zip", *checkpoints}
         for which, file in (
-            ((), IN_LOGS),
-            (("--load-best",), "best_model"),
-            (("--load-checkpoint", 200), "rl_model_200"),
+            *[((), IN_LOGS), (("--load-best",), "best_model"), (("--load-checkpoint", 200), "rl_model_200")],
             (("--load-last-checkpoint",), "rl_model_600"),
         ):
             assert enjoy(logs, *which) == 0 and file in capsys.readouterr().out
@@ -158,8 +155,7 @@ class TestChain:
         assert call("train", *train_args(tmp_path, "--eval-freq", 30, env=env, n=60)) == 0
         (model_file,) = tmp_path.glob(f"fitted_rmax/*/{env}.zip")
         model = FittedRMax.load(model_file)
-        assert any(model.agent.periodic) and model.action_space.n == n_actions
-        assert enjoy(tmp_path, env=env) == 0
+        assert any(model.agent.periodic) and model.action_space.n == n_actions and enjoy(tmp_path, env=env) == 0
 
     def test_processes_tune_transfer_too_in_one_database_and_a_trial_is_trained_with(self, tmp_path):
         optuna = pytest.importorskip("optuna")
@@ -186,8 +182,7 @@ class TestChain:
 
     @pytest.mark.parametrize("program", ["sb3_combrel.zoo", "rl_zoo3.train"])
     def test_environments_in_processes_and_an_unmodified_zoo(self, tmp_path, program):
-        conf = write_config(tmp_path / "two.yml", n_envs=2)
-        args = train_args(tmp_path, "--vec-env", "subproc", conf=conf, n=100)
+        args = train_args(tmp_path, "--vec-env", "subproc", conf=write_config(tmp_path / "two.yml", n_envs=2), n=100)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(CONFIGS), os.environ.get("PYTHONPATH", "")])}
         command = [sys.executable, "-m", program, *(["train"] if program == "sb3_combrel.zoo" else []), *args]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)

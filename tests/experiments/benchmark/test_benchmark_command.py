@@ -113,12 +113,10 @@ def contents(folder):
 class TestThePage:
     def test_every_method_of_the_command_has_a_row_with_numbers(self, made):
         rows = rows_of(made[0] / "two-walks.csv")
-        names = [row["method"] for row in rows]
-        assert names == ["none", "oracle", "COMBREL-factored", "DrawnMappings", "wide_prior"]
+        assert [row["method"] for row in rows] == ["none", "oracle", "COMBREL-factored", "DrawnMappings", "wide_prior"]
         for row in rows:
             assert row["runs"] == "3" and row["note"] == ""
-            assert re.fullmatch(r"-\d+\.\d \[-\d+\.\d, -\d+\.\d\]", row["performance"])
-            assert float(row["seconds"]) >= 0.0
+            assert re.fullmatch(r"-\d+\.\d \[-\d+\.\d, -\d+\.\d\]", row["performance"]) and float(row["seconds"]) >= 0.0
         assert [row["known mapping"] for row in rows][:2] == ["-", "100%"]
         assert [row["steps to a mapping"] for row in rows][:2] == ["-", "-"]
         assert all(float(row["steps to a mapping"]) >= 1 for row in rows[2:])
@@ -180,8 +178,7 @@ class TestFailures:
     def test_what_does_not_fit_has_an_empty_cell_and_a_reason(self, failed):
         folder, _printed, _ = failed
         row = {row["method"]: row for row in rows_of(folder / "two-walks.csv")}["picky"]
-        assert row.pop("note") == "does not fit: it takes two to walk"
-        assert set(row.values()) == {"picky", ""}
+        assert row.pop("note") == "does not fit: it takes two to walk" and set(row.values()) == {"picky", ""}
 
     def test_a_run_that_fails_has_its_error_in_the_table_and_the_others_go_on(self, failed):
         folder, printed, _ = failed
@@ -212,8 +209,7 @@ class TestFailures:
         args = ("--pairs", files / "two_walks.py", "--methods", f"{files / 'dying.py'}:Dying", "none", *TINY)
         succeed(*args, "--jobs", 2, "--output", tmp_path / "out")
         rows = {row["method"]: row for row in rows_of(tmp_path / "out" / "two-walks.csv")}
-        assert rows["none"]["runs"] == "1"
-        assert re.match(r"failed \(seed 7000\): .*died", rows["Dying"]["note"])
+        assert rows["none"]["runs"] == "1" and re.match(r"failed \(seed 7000\): .*died", rows["Dying"]["note"])
 
     def test_a_source_that_cannot_be_learned(self, files, tmp_path):
         text = (files / "two_walks.py").read_text()
@@ -249,8 +245,7 @@ class TestBadInput:
     )
     def test_nothing_is_learned_or_written(self, options, words, files, tmp_path, monkeypatch):
         monkeypatch.chdir(files)
-        assert re.search(words, fail(*options, "--output", tmp_path / "out"))
-        assert not (tmp_path / "out").exists()
+        assert re.search(words, fail(*options, "--output", tmp_path / "out")) and not (tmp_path / "out").exists()
 
     def test_a_pair_that_has_changed_since(self, copied, files, tmp_path):
         changed = tmp_path / "two_walks.py"

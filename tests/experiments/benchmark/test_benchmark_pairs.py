@@ -164,8 +164,7 @@ class TestAgreement:
 
 def carried_out(pair, method, sources):
     """The result of one run of the mirrored car."""
-    jobs = jobs_of([pair], [method], [0], {pair.name: sources["mirrored-car"]})
-    return run_missing(jobs, backend=Backend(n_jobs=1))[0]
+    return run_missing(jobs_of([pair], [method], [0], {pair.name: sources["mirrored-car"]}), backend=Backend(n_jobs=1))[0]
 
 
 class TestStepsToAMapping:
@@ -217,14 +216,12 @@ class TestStepsToAMapping:
 
 
 def test_a_budget_without_the_end_of_an_episode_is_an_error(sources):
-    pair = replace(PAIRS["mirrored-car"], n_steps=100)
-    found = carried_out(pair, METHODS["none"], sources)
+    found = carried_out(replace(PAIRS["mirrored-car"], n_steps=100), METHODS["none"], sources)
     assert "no episode has ended within n_steps=100" in found.error and "misfit" not in found.more
 
 
 def test_a_learner_that_cannot_be_made_is_no_misfit_of_the_method(sources):
-    pair = replace(PAIRS["mirrored-car"], learner={"model_breadth": -1.0})
-    found = carried_out(pair, METHODS["COMBREL"], sources)
+    found = carried_out(replace(PAIRS["mirrored-car"], learner={"model_breadth": -1.0}), METHODS["COMBREL"], sources)
     assert found.error.startswith("ValueError: model_breadth must") and "misfit" not in found.more
 
 

@@ -11,10 +11,8 @@ from sb3_combrel.experiments.paper.mappings import BREADTH, best_mappings, most_
 SOURCE = (("pitch", "yaw"), ("S1-", "S1+", "S2-", "S2+"))
 TARGET = (("a", "b", "c"), ("T1-", "T1+"))
 USES = [
-    ("T1-", "S1-", "a<-pitch, c<-(-yaw)", "", 4),
-    ("T1-", "S2+", "a<-pitch, c<-(-yaw)", "", 2),
-    ("T1-", "S2+", "a<-yaw, b<-pitch", "", 5),
-    ("T1+", "S1+", "a<-yaw, b<-pitch", "", 1),
+    *[("T1-", "S1-", "a<-pitch, c<-(-yaw)", "", 4), ("T1-", "S2+", "a<-pitch, c<-(-yaw)", "", 2)],
+    *[("T1-", "S2+", "a<-yaw, b<-pitch", "", 5), ("T1+", "S1+", "a<-yaw, b<-pitch", "", 1)],
     # Of another run.
     ("T1-", "S1-", "a<-pitch, c<-(-yaw)", "", 2),
 ]
@@ -36,8 +34,7 @@ class TestMostFrequent:
 def of_the_source(states, actions):
     """The first action moves along the slope of the first variable, the second turns both."""
     first = np.stack([0.1 * states[:, 0], np.zeros(len(states))], axis=1)
-    second = np.stack([0.05 - 0.1 * states[:, 1], 0.08 * states[:, 0]], axis=1)
-    return np.where(actions[:, None] == 0, first, second)
+    return np.where(actions[:, None] == 0, first, np.stack([0.05 - 0.1 * states[:, 1], 0.08 * states[:, 0]], axis=1))
 
 
 def seen_through(mapping, n, seed):
@@ -67,8 +64,7 @@ class TestBest:
     def test_a_target_that_is_the_source_seen_through_a_mapping_reveals_it(self, source, mapping, monkeypatch):
         # Predictions in several parts are those of all at once.
         monkeypatch.setattr(of_paper, "_CHUNK", 37)
-        target = seen_through(mapping, 600, 1)
-        found = best_mappings(source, target, MappingSet.from_name("signed_injective", 2, 3, 2, 3))
+        found = best_mappings(source, seen_through(mapping, 600, 1), MappingSet.from_name("signed_injective", 2, 3, 2, 3))
         assert len(found) == 3
         for action, one in enumerate(found):
             assert one.action[action] == mapping.action[action]

@@ -21,8 +21,7 @@ TABLES = {"table2": 3, "table4": 2, "table5": 1, "table6": 4, "measures": 2}
 def reproduce(target, **given):
     """The files made, and what was written meanwhile."""
     console = quiet()
-    made = command.reproduce(target, console=console, **{**TINY, **given})
-    return made, console.file.getvalue()
+    return command.reproduce(target, console=console, **{**TINY, **given}), console.file.getvalue()
 
 
 def files_in(folder):
@@ -38,8 +37,7 @@ def check_tables(folder, name, number):
     for file in files:
         header, first = file.read_text().splitlines()[:2]
         assert header.count(",") >= 1 and first
-    assert not list(folder.glob(f"{name}_{number + 1}.csv"))
-    assert "nan" not in text and "inf" not in text
+    assert not list(folder.glob(f"{name}_{number + 1}.csv")) and "nan" not in text and "inf" not in text
 
 
 @pytest.fixture(scope="module")
@@ -94,12 +92,10 @@ def test_everything_from_nothing(tmp_path):
         check_tables(tmp_path / "output", name, number)
     for name, n_methods in (("mountain_car", 10), ("icub", 8)):
         lines = (tmp_path / "output" / f"{name}.csv").read_text().splitlines()
-        assert len(lines) == 1 + 2 * n_methods
-        assert all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
+        assert len(lines) == 1 + 2 * n_methods and all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
     before = files_in(tmp_path / "output")
     _, again = run()
-    assert ", seed 50" in written and ", seed 50" not in again
-    assert files_in(tmp_path / "output") == before
+    assert ", seed 50" in written and ", seed 50" not in again and files_in(tmp_path / "output") == before
 
 
 @pytest.mark.long

@@ -43,10 +43,8 @@ class TestTables:
         table = action_mapping_table(results, ACTIONS)
         assert table.header == ("mapping", *ACTIONS, "all")
         assert table.rows == [
-            ("NLR", "-", "80.0", "25.0", "64.3"),
-            ("NRL", "-", "20.0", "75.0", "35.7"),
-            ("0 others", "-", "0.0", "0.0", "0.0"),
-            ("selections", "0", "10", "4", "14"),
+            *[("NLR", "-", "80.0", "25.0", "64.3"), ("NRL", "-", "20.0", "75.0", "35.7")],
+            *[("0 others", "-", "0.0", "0.0", "0.0"), ("selections", "0", "10", "4", "14")],
         ]
 
     def test_rare_action_mappings_are_counted_together(self):
@@ -73,8 +71,7 @@ class TestTables:
     def test_state_mappings_in_percent(self):
         results = with_uses([("West", "Left", "x<-x", "", 3), ("East", "Left", "x<-v", "", 5)], [("West", "R", "x<-x", "", 4)])
         table = state_mapping_table(results)
-        assert table.rows == [("x<-x", "58.3"), ("x<-v", "41.7")]
-        assert "(2 in all)" in table.title
+        assert table.rows == [("x<-x", "58.3"), ("x<-v", "41.7")] and "(2 in all)" in table.title
 
     def test_without_any_selection(self):
         assert action_mapping_table(NOTHING, ACTIONS).rows == [
@@ -127,8 +124,7 @@ def cells_of(selections):
 
 class TestDependence:
     def test_the_numbers_are_those_of_scipy(self):
-        rng = np.random.default_rng(0)
-        n = 60
+        rng, n = np.random.default_rng(0), 60
         mapping = rng.choice(["one", "two", "three"], size=n, p=[0.5, 0.3, 0.2])
         selection = selection_of(rng, n, mapping)
         selection["x"] += 1.5 * (mapping == "one")
@@ -159,25 +155,21 @@ class TestDependence:
     def test_a_dependence_on_the_action_is_found(self):
         rng = np.random.default_rng(2)
         action = rng.choice(["West", "East"], size=2000)
-        follows = rng.random(2000) < 0.7
-        mapping = np.where(follows == (action == "West"), "one", "two")
+        mapping = np.where((rng.random(2000) < 0.7) == (action == "West"), "one", "two")
         cells = cells_of(selection_of(rng, 2000, mapping, action))
         assert 0.3 < float(cells["target action"][1]) < 0.5 and float(cells["target action"][2]) < 1e-10
         assert float(cells["x"][2]) > 0.05 and float(cells["vx"][2]) > 0.05
 
     def test_rates_of_false_findings_are_those_of_the_level(self):
-        rng = np.random.default_rng(3)
-        found = []
+        rng, found = np.random.default_rng(3), []
         for _ in range(60):
             cells = cells_of(selection_of(rng, 1250, rng.choice(["one", "two", "three"], size=1250)))
             found.append([float(cells[name][k]) < 0.05 for name in ("x", "vx", "target action") for k in (2, 5)])
         assert np.all(np.mean(found, axis=0) < 0.15)
 
     def test_the_thinned_test_sees_several_actions_where_every_step_has_one_selection_of_each(self):
-        rng = np.random.default_rng(4)
-        action = np.tile(np.array(list("abcde")), 400)
-        mapping = np.where(np.isin(action, ["a", "b"]), "one", "two")
-        selection = selection_of(rng, 2000, mapping, action)
+        rng, action = np.random.default_rng(4), np.tile(np.array(list("abcde")), 400)
+        selection = selection_of(rng, 2000, np.where(np.isin(action, ["a", "b"]), "one", "two"), action)
         assert float(cells_of(selection)["target action"][5]) < 1e-6
 
     def test_rare_mappings_and_a_variable_that_never_changes_have_no_say(self):
@@ -185,6 +177,5 @@ class TestDependence:
         rare = selection_of(rng, 50 + FEWEST - 1, ["one"] * 50 + ["rare"] * (FEWEST - 1))
         assert {cell for row in cells_of(rare).values() for cell in row} == {"-"}
         more = selection_of(rng, 50 + FEWEST, ["one"] * 50 + ["two"] * FEWEST)
-        assert cells_of(more)["x"][0] != "-"
-        assert cells_of(more.assign(vx=0.5))["vx"] == ("-",) * 6
+        assert cells_of(more)["x"][0] != "-" and cells_of(more.assign(vx=0.5))["vx"] == ("-",) * 6
         assert {cell for row in cells_of(more[:1]).values() for cell in row} == {"-"}

@@ -7,19 +7,11 @@ from helpers.paper_results import made_up, made_up_runs, quiet
 from sb3_combrel.comparison.statistics import holm, p_value_of_difference
 from sb3_combrel.comparison.tables import p_text
 from sb3_combrel.experiments.paper import methods as m
+from sb3_combrel.experiments.paper import tables
 from sb3_combrel.experiments.paper.baselines import PLAIN, QUANTILE
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR, PAPER
 from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED, method_at
 from sb3_combrel.experiments.paper.report import write_report
-from sb3_combrel.experiments.paper.tables import (
-    baselines_table,
-    diagnosis_table,
-    evaluations_frame,
-    measures_table,
-    running_times_table,
-    summary_table,
-    uses_table,
-)
 from sb3_combrel.experiments.paper.targets import targets_of
 from sb3_combrel.experiments.paper.verdicts import CLAIMS, CONTROL, HELD, NOT_HELD, OPPOSITE, PAPERS, judge, verdict_table
 from sb3_combrel.runs import runner
@@ -46,14 +38,12 @@ class TestVerdicts:
         found = verdict_of(np.array([[10, 20], [30, 40]]), np.array([[100, 100], [60, 140]]))
         assert (found.saved, found.delta) == (1 - 50 / 200, 1.0)
         # Of the six regroupings two have a difference as large.
-        assert found.p_value == pytest.approx(2 / 6)
-        assert found.verdict == NOT_HELD
+        assert found.p_value == pytest.approx(2 / 6) and found.verdict == NOT_HELD
 
     @pytest.mark.parametrize(("combrel", "none", "saved", "verdict"), [(200, 400, 0.5, HELD), (400, 200, -1.0, OPPOSITE)])
     def test_half_and_twice_the_steps(self, combrel, none, saved, verdict):
         found = verdict_of(runs(combrel), runs(none))
-        assert found.verdict == verdict
-        assert found.low < found.saved < found.high and abs(found.saved - saved) < 0.1
+        assert found.verdict == verdict and found.low < found.saved < found.high and abs(found.saved - saved) < 0.1
         assert found.delta == np.sign(saved) and found.p_value < 0.001
 
     def test_no_difference_does_not_hold(self):
@@ -68,8 +58,7 @@ class TestVerdicts:
     def test_all_rows_of_a_kind_with_all_methods(self):
         steps = {name: {method: runs(100 + 10 * k, 3) for k, method in enumerate(m.METHODS)} for name in DOMAINS}
         papers, controls = judge(steps, PAPERS), judge(steps, CONTROL)
-        assert [each.claim for each in (*papers, *controls)] == list(CLAIMS)
-        assert len(papers) == 8
+        assert [each.claim for each in (*papers, *controls)] == list(CLAIMS) and len(papers) == 8
         # Every control is beside the method of every claim: against each of them in both domains.
         assert {(each.claim.domain, each.claim.worse) for each in controls} >= {
             (name, other) for name in DOMAINS for other in (m.ONE_RANDOM, m.UNRELATED, m.NO_TRANSFER_BEST)
@@ -83,8 +72,7 @@ class TestVerdicts:
         found = judge({CAR: {m.COMBREL_PLAIN: better, m.NO_TRANSFER: better + 33, **others}}, PAPERS)
         expected = holm({each.claim: each.p_value for each in found})
         assert [each.corrected for each in found] == list(expected.values()) and len(expected) == 4
-        assert found[0].p_value == one.p_value < found[0].corrected
-        assert found[0].verdict == NOT_HELD
+        assert found[0].p_value == one.p_value < found[0].corrected and found[0].verdict == NOT_HELD
 
     def test_a_single_run_has_no_interval(self):
         (row,) = verdict_table([verdict_of(runs(100, n_runs=1), runs(200, n_runs=1))], "title").rows
@@ -93,8 +81,7 @@ class TestVerdicts:
     def test_the_threshold_is_the_domains_last(self):
         # All reach 250 steps at once with COMBREL, none without transfer, in as many steps.
         reach, never = np.full((6, 10), 240), np.full((6, 10), 260)
-        assert verdict_of(reach, never).p_threshold < 0.01
-        assert verdict_of(never + 10, never).p_threshold == 1.0
+        assert verdict_of(reach, never).p_threshold < 0.01 and verdict_of(never + 10, never).p_threshold == 1.0
         # Fewer episodes than the window of the median.
         assert verdict_of(reach[:, :2], never[:, :2]).p_threshold == 1.0
 
@@ -103,7 +90,7 @@ class TestSummary:
     def test_of_steps_by_hand(self):
         steps = {m.COMBREL_PLAIN: [[100] * 30, [300] * 30], m.NO_TRANSFER: [[1000] + [400] * 29] * 2}
         # Other methods are left out.
-        table = summary_table({CAR: made_up_runs(CAR, {**steps, "no transfer at 0.1": [[30, 50]]})})
+        table = tables.summary_table({CAR: made_up_runs(CAR, {**steps, "no transfer at 0.1": [[30, 50]]})})
         assert table.rows == [
             ("Mountain Car 4D", m.NO_TRANSFER, "2", "12,600 ± 0", "5,400 ± 0", "400 ± 0", "never (0 of 2 runs; 250)"),
             (
@@ -118,11 +105,11 @@ class TestSummary:
         ]
 
     def test_the_median_run_reaches_the_threshold(self):
-        ((*_, last),) = summary_table({ROBOT: made_up_runs(ROBOT, {m.ORACLE: [[30] * 30, [39] * 30, [400] * 30]})}).rows
+        ((*_, last),) = tables.summary_table({ROBOT: made_up_runs(ROBOT, {m.ORACLE: [[30] * 30, [39] * 30, [400] * 30]})}).rows
         assert last == f"{5 * 39} (2 of 3 runs; 40)"
 
     def test_short_and_single_runs(self):
-        (row,) = summary_table({ROBOT: [made_up(ROBOT, m.COMBREL_PLAIN, 0, [30, 50])]}).rows
+        (row,) = tables.summary_table({ROBOT: [made_up(ROBOT, m.COMBREL_PLAIN, 0, [30, 50])]}).rows
         assert row[2:] == ("1", "80", "80", "40", "never (0 of 1 runs; 40)")
 
 
@@ -130,7 +117,7 @@ def test_uses_a_step_and_mappings():
     some = [["East", "Left", "x<-x", "", 6], ["West", "Left", "x<-x", "", 3]], [["East", "Left", "x<-v", "", 1]]
     results = [made_up(CAR, m.UNRELATED, seed, [20], uses=uses) for seed, uses in enumerate(some)]
     expected = ("Mountain Car 4D", m.UNRELATED, "5", f"{(9 / 20 + 1 / 20) / 2:.3f}", "1")
-    assert uses_table({CAR: [*results, made_up(CAR, m.NO_TRANSFER, 0, [20])]}).rows[0][:4] == expected[:4]
+    assert tables.uses_table({CAR: [*results, made_up(CAR, m.NO_TRANSFER, 0, [20])]}).rows[0][:4] == expected[:4]
 
 
 def learnt(n_episodes=20, n_runs=6):
@@ -146,7 +133,7 @@ def learnt(n_episodes=20, n_runs=6):
 
 def measures_of(results, method=m.COMBREL_PLAIN, domain=MOUNTAIN_CAR):
     """Effect, without unit, and p-value of each measure of a method, as text."""
-    table = measures_table(domain, results)
+    table = tables.measures_table(domain, results)
     (row,) = [row for row in table.rows if row[0] == method]
     cells = dict(zip(table.header[1:], row[1:], strict=True))
     return {name: tuple(cell.replace(",", "").replace("%", "").rstrip(")").split(" (")) for name, cell in cells.items()}
@@ -167,27 +154,25 @@ class TestMeasures:
             "transfer ratio": pytest.approx(100 * 1700 / without, abs=0.5),
             "time to threshold": pytest.approx(times, abs=1),
         }
-        assert "threshold: a return of -250" in measures_table(MOUNTAIN_CAR, learnt()).title
+        assert "threshold: a return of -250" in tables.measures_table(MOUNTAIN_CAR, learnt()).title
 
     def test_p_values_are_corrected_over_the_column(self):
         alone = [result for result in learnt() if result.method != m.UNRELATED]
         # Exact: 2 of the 924 regroupings are as far apart, and no difference has 1.
-        assert measures_of(alone)["jumpstart"][1] == "0.002"
-        assert measures_of(learnt())["jumpstart"][1] == "0.004"
+        assert measures_of(alone)["jumpstart"][1] == "0.002" and measures_of(learnt())["jumpstart"][1] == "0.004"
         assert set(measures_of(learnt(), m.UNRELATED).values()) == {("+0", "1.00")}
 
     @pytest.mark.parametrize("n_episodes", [1, 4, 9])
     def test_trials_of_few_episodes(self, n_episodes):
         found = measures_of(learnt(n_episodes))
-        assert float(found["jumpstart"][0]) >= 0.0
-        assert (found["time to threshold"] == ("-",)) == (n_episodes < 5)
+        assert float(found["jumpstart"][0]) >= 0.0 and (found["time to threshold"] == ("-",)) == (n_episodes < 5)
 
     def test_what_has_no_effect_or_no_p_value(self):
         assert measures_of(learnt(n_runs=1))["jumpstart"] == ("+160", "-")
         slow = made_up_runs(CAR, {name: [[300] * 12] * 3 for name in (m.NO_TRANSFER, m.COMBREL_PLAIN)})
         # The threshold is never reached, and nothing is above the least return.
         assert measures_of(slow)["time to threshold"] == measures_of(slow)["transfer ratio"] == ("-",)
-        assert measures_table(MOUNTAIN_CAR, [made_up(CAR, m.NO_TRANSFER, 0, [300] * 12)]).rows == []
+        assert tables.measures_table(MOUNTAIN_CAR, [made_up(CAR, m.NO_TRANSFER, 0, [300] * 12)]).rows == []
 
     def test_the_robots_threshold_is_a_return_with_its_hit(self):
         def results(without):
@@ -205,14 +190,14 @@ def test_running_times():
         made_up(CAR, m.NO_TRANSFER, 1, [100, 600], seconds=120.0, first_episode_seconds=4.0),
         made_up(CAR, m.UNRELATED, 0, [100, 400], seconds=1.0, first_episode_seconds=0.26),
     ]
-    table = running_times_table(results)
+    table = tables.running_times_table(results)
     assert table.rows == [
         # 180 s for 1000 steps.
         (m.NO_TRANSFER, "24.0", "1.50", "3.0", "180.00", "500"),
         (m.UNRELATED, "", "0.02", "0.3", "2.00", "500"),
     ]
     assert table.title == "Processor time of 2 episodes, mean of the runs"
-    assert running_times_table([]).rows == []
+    assert tables.running_times_table([]).rows == []
 
 
 def test_the_csv_has_the_runs_of_earlier_calls_too(tmp_path):
@@ -233,8 +218,7 @@ def test_the_csv_has_the_runs_of_earlier_calls_too(tmp_path):
 
 class TestDiagnosis:
     def results(self, n_runs=8, spread=0):
-        rng = np.random.default_rng(0)
-        means = dict(zip(DIAGNOSED, (400, 200, 300), strict=True))
+        rng, means = np.random.default_rng(0), dict(zip(DIAGNOSED, (400, 200, 300), strict=True))
         steps = {
             method_at(method, breadth): rng.normal(mean, spread, size=(n_runs, 6)).astype(int)
             for method, mean in means.items()
@@ -243,13 +227,12 @@ class TestDiagnosis:
         return made_up_runs(CAR, steps), steps
 
     def test_what_is_saved_at_each_breadth(self):
-        table = diagnosis_table(self.results()[0])
+        table = tables.diagnosis_table(self.results()[0])
         assert [row[0] for row in table.rows] == ["0.05", "0.1", "0.2", "0.3", "0.4"]
         assert "6 episodes, 8 runs" in table.title
         for row in table.rows:
-            assert row[1:4] == ("2,400", "50% (50% to 50%)", "25% (25% to 25%)")
-            assert float(row[4]) < 0.01
-        assert {row[2:] for row in diagnosis_table(self.results(n_runs=1)[0]).rows} == {("50% (-)", "25% (-)", "-")}
+            assert row[1:4] == ("2,400", "50% (50% to 50%)", "25% (25% to 25%)") and float(row[4]) < 0.01
+        assert {row[2:] for row in tables.diagnosis_table(self.results(n_runs=1)[0]).rows} == {("50% (-)", "25% (-)", "-")}
 
     def test_p_values_are_corrected_over_the_breadths(self):
         results, steps = self.results(spread=200)
@@ -258,7 +241,7 @@ class TestDiagnosis:
             combrel, random = (steps[method_at(method, breadth)].sum(axis=1) for method in DIAGNOSED[1:])
             raw[breadth] = p_value_of_difference(combrel, random, "permutation")
         assert len(set(raw.values())) == 5
-        assert [row[4] for row in diagnosis_table(results).rows] == [p_text(p) for p in holm(raw).values()]
+        assert [row[4] for row in tables.diagnosis_table(results).rows] == [p_text(p) for p in holm(raw).values()]
 
 
 def test_baselines():
@@ -269,7 +252,7 @@ def test_baselines():
         made_up(ROBOT, PLAIN, 2, [5, 4], evaluations=evaluations[1:]),
     ]
     results = {CAR: [made_up(CAR, m.COMBREL_PLAIN, 1, [5, 4])], ROBOT: of_robot}
-    frame = evaluations_frame(results)
+    frame = tables.evaluations_frame(results)
     assert list(frame) == ["domain", "algorithm", "seed", "steps", "greedy_return", "fraction_reached"]
     assert [tuple(row) for row in frame.itertuples(index=False)] == [
         (ROBOT, PLAIN, 2, 20_000, -30.0, 1.0),
@@ -278,7 +261,7 @@ def test_baselines():
         (ROBOT, QUANTILE, 1, 1000, -400.0, 0.2),
         (ROBOT, QUANTILE, 1, 20_000, -400.0, 0.8),
     ]
-    assert [row[1:] for row in baselines_table(results).rows] == [
+    assert [row[1:] for row in tables.baselines_table(results).rows] == [
         (PLAIN, "20,000", "2 of 2", "20,000", "-30"),
         (QUANTILE, "20,000", "0 of 1", "never", "-400"),
     ]

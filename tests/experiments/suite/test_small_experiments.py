@@ -35,8 +35,7 @@ def learned(model_class, n):
 def test_the_mean_is_that_of_least_squares_on_the_nearest_instances(n):
     model = learned(MeanSuccessor, n)
     state, action = np.array([0.4, 0.6]), 0
-    found = model.predict(state[None], np.array([action]))
-    size = int(model.instances.size[action])
+    found, size = model.predict(state[None], np.array([action])), int(model.instances.size[action])
     states, effects = model.instances.state[action, :size], model.instances.effect[action, :size]
     squared = ((states - state) ** 2).sum(axis=1)
     near = np.argsort(squared)[:8]

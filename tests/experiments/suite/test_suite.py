@@ -13,16 +13,8 @@ from scipy import stats
 from sb3_combrel import SourceInstances
 from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.suite import command as suite
-from sb3_combrel.experiments.suite.measures import (
-    failures,
-    mean_return_in,
-    mean_steps_in,
-    steps_in,
-    steps_until_always,
-    steps_until_median,
-    summary_of_evaluation,
-    summary_of_learning,
-)
+from sb3_combrel.experiments.suite import measures
+from sb3_combrel.experiments.suite.measures import failures
 from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
 from sb3_combrel.experiments.suite.runs import Variant
 from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Source, Task, tasks_of
@@ -32,7 +24,9 @@ from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.episodes import Episodes
 from sb3_combrel.runs.job import chosen_on_purpose, make_env
 
-SMALL = Task("small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(steps_in(1, 3),), headline="steps_1_to_3")
+SMALL = Task(
+    "small", partial(make_point_robot, 2, 0.003), n_episodes=3, measures=(measures.steps_in(1, 3),), headline="steps_1_to_3"
+)
 SHORT = Task("short", partial(make_point_robot, 2), n_steps=500)
 VARIANTS = [Variant("default"), Variant("narrow", {"model_breadth": 0.05})]
 
@@ -134,8 +128,7 @@ def test_seeds_and_tasks_are_read_from_text():
     for names in (["CartPole"], []):
         with pytest.raises(ValueError, match="tasks must be"):
             tasks_of(names)
-    assert suite.seeds_of("0-3") == [0, 1, 2, 3]
-    assert suite.seeds_of("4, 0-1,1") == [4, 0, 1]
+    assert suite.seeds_of("0-3") == [0, 1, 2, 3] and suite.seeds_of("4, 0-1,1") == [4, 0, 1]
     assert suite.seeds_of("0-2", 1000) == [1000, 1001, 1002]
     for text in ("", "3-1", "a", "1--2", "-1"):
         with pytest.raises(ValueError, match="seeds"):
@@ -145,11 +138,8 @@ def test_seeds_and_tasks_are_read_from_text():
 @pytest.mark.parametrize(
     "change",
     [
-        dict(jobs=0),
-        dict(variants=[]),
-        dict(variants=[Variant("a"), Variant("a", {"resolution": 3})]),
-        dict(reference="other"),
-        dict(test="t"),
+        *[dict(jobs=0), dict(variants=[]), dict(variants=[Variant("a"), Variant("a", {"resolution": 3})])],
+        *[dict(reference="other"), dict(test="t")],
     ],
 )
 def test_bad_input_is_refused(tmp_path, change):
@@ -176,22 +166,19 @@ def test_every_task_can_be_learnt_and_has_its_headline(name):
 def test_measures_of_hand_made_episodes():
     steps = [100, 40, 30, 60, 20, 25, 27, 26, 20]
     episodes = Episodes.from_rows([(n, -float(n), True) for n in steps])
-    assert steps_in(1, 3).of(episodes) == 170
-    assert mean_steps_in(4, 5).of(episodes) == 40
-    assert np.isnan(steps_in(1, 10).of(episodes))
-    assert mean_return_in(1, 3).of(episodes._replace(returns=np.arange(9.0) ** 2)) == pytest.approx(5 / 3)
-    assert np.isnan(mean_return_in(1, 10).of(episodes)) and mean_return_in(1, 1).higher_is_better
-    assert steps_until_always(27).of(episodes) == 230
-    assert steps_until_always(59).of(episodes) == 230
-    assert steps_until_always(60).of(episodes) == 100
-    assert steps_until_always(100).of(episodes) == 0
-    assert steps_until_always(26).of(episodes) == np.inf, "only two episodes follow the one of 27 steps"
-    assert steps_until_always(10).of(episodes) == np.inf
+    assert measures.steps_in(1, 3).of(episodes) == 170 and measures.mean_steps_in(4, 5).of(episodes) == 40
+    assert np.isnan(measures.steps_in(1, 10).of(episodes))
+    assert measures.mean_return_in(1, 3).of(episodes._replace(returns=np.arange(9.0) ** 2)) == pytest.approx(5 / 3)
+    assert np.isnan(measures.mean_return_in(1, 10).of(episodes)) and measures.mean_return_in(1, 1).higher_is_better
+    assert measures.steps_until_always(27).of(episodes) == 230 and measures.steps_until_always(59).of(episodes) == 230
+    assert measures.steps_until_always(60).of(episodes) == 100 and measures.steps_until_always(100).of(episodes) == 0
+    assert measures.steps_until_always(26).of(episodes) == np.inf, "only two episodes follow the one of 27 steps"
+    assert measures.steps_until_always(10).of(episodes) == np.inf
     # The medians of five: 40, 30, 27, 26, 25.
-    assert steps_until_median(30).of(episodes) == sum(steps[:6])
-    assert steps_until_median(24).of(episodes) == np.inf
+    assert measures.steps_until_median(30).of(episodes) == sum(steps[:6])
+    assert measures.steps_until_median(24).of(episodes) == np.inf
     none = Episodes.from_rows([])
-    assert steps_until_always(27).of(none) == np.inf and steps_until_median(27).of(none) == np.inf
+    assert measures.steps_until_always(27).of(none) == np.inf and measures.steps_until_median(27).of(none) == np.inf
 
 
 def test_failures_and_summaries_of_hand_made_episodes():
@@ -199,14 +186,14 @@ def test_failures_and_summaries_of_hand_made_episodes():
     np.testing.assert_array_equal(failures(episodes, None), [True, *[False] * 8, True, False])
     np.testing.assert_array_equal(failures(episodes, -60.0), [True, *[False] * 9, True])
     # The first of the eleven episodes is not among the last ten.
-    assert summary_of_learning(episodes, None) == {"last10_return": (8 * -50 + 499 - 60) / 10, "last10_failed": 0.1}
-    assert np.isnan(summary_of_learning(Episodes.from_rows([]), None)["last10_return"])
+    assert measures.summary_of_learning(episodes, None) == {"last10_return": (8 * -50 + 499 - 60) / 10, "last10_failed": 0.1}
+    assert np.isnan(measures.summary_of_learning(Episodes.from_rows([]), None)["last10_return"])
     played = Episodes.from_rows([(100, -100.0, True), (110, -110.0, True)])
-    summary = summary_of_evaluation(played, None, -100.0)
+    summary = measures.summary_of_evaluation(played, None, -100.0)
     assert summary == {"mean": -105.0, "worst": -110.0, "failures": 0, "as_good": 1.0}
-    assert summary_of_evaluation(played, None, -99.0)["as_good"] == 0.0
-    assert summary_of_evaluation(played, -110.0, -100.0)["as_good"] == 0.0, "one has failed"
-    assert summary_of_evaluation(played, None, np.nan)["as_good"] == 0.0, "there is nothing to compare with"
+    assert measures.summary_of_evaluation(played, None, -99.0)["as_good"] == 0.0
+    assert measures.summary_of_evaluation(played, -110.0, -100.0)["as_good"] == 0.0, "one has failed"
+    assert measures.summary_of_evaluation(played, None, np.nan)["as_good"] == 0.0, "there is nothing to compare with"
 
 
 def test_noisy_actions_are_drawn_by_the_environments_seed():
@@ -218,8 +205,7 @@ def test_noisy_actions_are_drawn_by_the_environments_seed():
 
     assert taken(0) == taken(0) != taken(1)
     # A third of the replacements draws the action itself.
-    assert np.mean(np.array(taken(0)) != 2) == pytest.approx(0.2, abs=0.03)
-    assert set(taken(0)) == {0, 1, 2}
+    assert np.mean(np.array(taken(0)) != 2) == pytest.approx(0.2, abs=0.03) and set(taken(0)) == {0, 1, 2}
     with pytest.raises(ValueError, match="probability"):
         NoisyActions(env, 1.5)
 
@@ -231,10 +217,7 @@ def test_tables_of_hand_made_runs():
     steps = {"a": [100.0, 104.0, 102.0], "b": [50.0, 54.0, 52.0], "c": [103.0, 98.0, np.inf]}
     rows = [row(name, seed, n, -n) for name, own in steps.items() for seed, n in enumerate(own)]
     cells = cells_of(rows, [SMALL], list(steps), "a", "welch")
-    raw = [
-        stats.ttest_ind(steps["a"], steps["b"], equal_var=False).pvalue,
-        stats.mannwhitneyu(steps["a"], steps["c"]).pvalue,
-    ]
+    raw = [stats.ttest_ind(steps["a"], steps["b"], equal_var=False).pvalue, stats.mannwhitneyu(steps["a"], steps["c"]).pvalue]
     found = [cells["small", "steps_1_to_3", name].p_value for name in ("b", "c")]
     np.testing.assert_allclose(found, list(holm(dict(enumerate(raw))).values()))
     table = {(line[0], line[1]): line[2:] for line in task_table(cells, SMALL, list(steps), "p against a").rows}
@@ -257,7 +240,5 @@ def test_the_table_of_frozen_policies_counts_seeds():
         for seed, own in enumerate(numbers)
     ]
     (line,) = frozen_table(cells_of(rows, [SMALL], ["a", "b"], "a", "welch"), [SMALL], ["a", "b"]).rows
-    assert line[:3] == ("small", "a", "-55.0 ± 5.00")
-    assert line[3:6] == ("-56.0 ± 5.00", "-70.0", "2 of 2")
-    assert line[6:9] == ("-75.5 ± 14.5", "-400.0", "1 of 2")
-    assert line[9:] == ("1", "0.20 ± 0.10")
+    assert line[:3] == ("small", "a", "-55.0 ± 5.00") and line[3:6] == ("-56.0 ± 5.00", "-70.0", "2 of 2")
+    assert line[6:9] == ("-75.5 ± 14.5", "-400.0", "1 of 2") and line[9:] == ("1", "0.20 ± 0.10")

@@ -41,18 +41,15 @@ def test_variables_and_their_bounds_stand_in_the_order_given():
         if action is not None:
             first, other = plain.step(action)[0], changed.step(action)[0]
         x, v, angle, spin = first
-        assert other.tolist() == [angle, x, spin, v]
-        assert changed.observation_space.contains(other)
+        assert other.tolist() == [angle, x, spin, v] and changed.observation_space.contains(other)
 
 
 def test_the_right_mapping_undoes_the_order():
-    task = TASKS["CartPole-long"]
-    mapping = cart_pole.right_mapping()
+    task, mapping = TASKS["CartPole-long"], cart_pole.right_mapping()
     plain, target = gym.make("CartPole-v1"), task.make()
     seen, after = plain.reset(seed=1)[0], target.reset(seed=1)[0]
     # The start does not depend on the pole.
-    assert [seen[k] for k in mapping.state] == after.tolist()
-    assert mapping.action == (0, 1)
+    assert [seen[k] for k in mapping.state] == after.tolist() and mapping.action == (0, 1)
     low, high = task.learner["bounds"]
     assert low == [cart_pole.LEARNER["bounds"][0][k] for k in mapping.state]
     assert high == [cart_pole.LEARNER["bounds"][1][k] for k in mapping.state]
@@ -62,10 +59,7 @@ def test_the_right_mapping_undoes_the_order():
 @pytest.mark.parametrize(
     "arguments",
     [
-        dict(half_length=0.0),
-        dict(half_length=np.nan),
-        dict(order=(0, 1, 2)),
-        dict(order=(0, 1, 2, 2)),
+        *[dict(half_length=0.0), dict(half_length=np.nan), dict(order=(0, 1, 2)), dict(order=(0, 1, 2, 2))],
         dict(order=(1, 2, 3, 4)),
     ],
 )
@@ -77,8 +71,7 @@ def test_bad_input_is_refused(arguments):
 @pytest.mark.long
 def test_the_source_balances_and_has_falls():
     source = cart_pole.learn_source()
-    assert len(source) == cart_pole.N_INSTANCES
-    assert set(source.actions.tolist()) == {0, 1}
+    assert len(source) == cart_pole.N_INSTANCES and set(source.actions.tolist()) == {0, 1}
     assert source.terminated.sum() >= 5
     fallen = source.next_states[source.terminated]
     assert ((np.abs(fallen[:, 2]) > 0.2095) | (np.abs(fallen[:, 0]) > 2.4)).all()

@@ -1,0 +1,117 @@
+"""The local linear model with a prior: claims are modelled at once, and own instances are fitted to what is left over."""
+
+import numpy as np
+import pytest
+from helpers.kernel_models import N_ACTIONS, learn, make_model, random_transitions
+from helpers.linear_models import LinearDynamics, StubPrior, finish_episode, make_linear_model, nothing, renew
+
+from sb3_combrel.models.linear_fits import PRIOR_OUTCOME_WEIGHT
+
+GRID, KERNEL = ((2, 2), 0), dict(breadth=0.3, min_weight=0.05, n_neighbors=8, outcome_breadth=0.1)
+
+
+def model_with_prior(prior, grid=GRID, kernel=KERNEL, **kwargs):
+    model = make_linear_model(grid, kernel, prior=prior, **kwargs)
+    model.update_rows(model.renew_prior())
+    return model
+
+
+def test_what_an_exact_prior_claims_is_modelled_exactly_from_the_start_and_nothing_is_left_over():
+    dynamics = LinearDynamics(1, 2)
+    model = model_with_prior(StubPrior(dynamics.effect))
+    points = model.grid.points()
+    assert model.mdp.arrays.modelled.all() and not model.known.any()
+    state = np.array([0.37, 0.81])
+    for transitions in ([], dynamics.transitions(np.random.default_rng(0).random((40, 2)))):
+        learn(model, transitions)
+        finish_episode(model)
+        for action in range(N_ACTIONS):
+            expected = np.array([dynamics.effect(point, action) for point in points])
+            np.testing.assert_allclose(
+                model.fits.row[action * len(points) : (action + 1) * len(points), :2], expected, atol=1e-12
+            )
+            np.testing.assert_allclose(
+                model.predict_at(state)[0].effect[action, 0], dynamics.effect(state, action), atol=1e-12
+            )
+            assert model.predict_at(state)[0].modelled[action]
+    for action, size in enumerate(model.instances.size):
+        np.testing.assert_allclose(model.fits.target[action, :size], 0.0, atol=1e-15)
+    np.testing.assert_allclose(model.fits.row[:, 2:], [[-1.0, 0.0]] * len(model.known), atol=1e-12)
+
+
+def test_a_lower_threshold_ends_what_the_prior_says_of_rewards():
+    prior = StubPrior(lambda state, action: np.zeros(2), reward=-5.0, end=0.5)
+    model = model_with_prior(prior, n_actions=1, threshold=4.0)
+    state, point = np.array([0.5, 0.5]), 12
+    learn(model, [(state, 0, -1.0, state, False)] * 3)
+    finish_episode(model)
+    assert model.fits.row[point, 2] == pytest.approx((-3.0 - 5.0 * PRIOR_OUTCOME_WEIGHT) / (3.0 + PRIOR_OUTCOME_WEIGHT))
+    model.update_rows(model.lower_threshold(2.0))
+    np.testing.assert_allclose(model.fits.row[point, 2:], [-1.0, 0.0], atol=1e-12)
+
+
+def test_a_prior_is_asked_again_when_its_version_has_grown_and_only_then():
+    one, other = LinearDynamics(5, 2), LinearDynamics(6, 2)
+    prior = StubPrior(one.effect)
+    model = model_with_prior(prior)
+    learn(model, one.transitions(np.random.default_rng(0).random((30, 2))))
+    finish_episode(model)
+    prior.effect = other.effect
+    assert len(model.renew_prior()) == 0
+    np.testing.assert_allclose(model.fits.target[0, : model.instances.size[0]], 0.0, atol=1e-15)
+    renew(model, prior)
+    for action, size in enumerate(model.instances.size):
+        states = model.instances.state[action, :size]
+        left_over = [one.effect(state, action) - other.effect(state, action) for state in states]
+        np.testing.assert_allclose(model.fits.target[action, :size], left_over, atol=1e-12)
+    assert len(model.renew_prior()) == 0
+
+
+def test_a_model_with_a_prior_asks_for_no_transferred_instances():
+    # The stub has no such methods.
+    model = model_with_prior(StubPrior(LinearDynamics(0, 2).effect, nothing))
+    learn(model, random_transitions(0, 2, 20))
+    assert model.predict_at(np.array([0.5, 0.5]))[1] is None and len(model.outdated()) > 0
+    model.update_rows(model.outdated())
+
+
+# What the local linear model makes of dynamics of a known kind: linear ones, and a wall.
+BROAD = dict(breadth=0.5, min_weight=0.05, n_neighbors=20, outcome_breadth=0.05, min_fraction=0.01)
+WALL, STRIDE = 0.6, 0.1
+
+
+def effects_of(model, states):
+    """Predicted mean effect of action 0 at states, over successors."""
+    found = model.predict(states, np.zeros(len(states), dtype=np.int64))
+    return (found.probability[:, :, None] * found.effect).sum(axis=1)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 4])
+def test_linear_dynamics_are_found_from_a_few_instances_far_better_than_by_the_kernel_average(d):
+    rng, dynamics = np.random.default_rng(d), LinearDynamics(d, d)
+    grid = ((2,) * d, 0)
+    models = make_linear_model(grid, BROAD), make_model(grid, BROAD)
+    transitions = dynamics.transitions(rng.random((10 * d, d)))
+    for model in models:
+        learn(model, transitions)
+    states = rng.uniform(0.2, 0.8, (50, d))
+    expected = np.array([dynamics.effect(state, 0) for state in states])
+    linear, average = (np.abs(effects_of(model, states) - expected).max() for model in models)
+    assert linear < 0.05 * np.abs(expected).max(), "the ridge, a hundredth of what the kernel spans"
+    assert linear < 0.25 * average
+
+
+def walk_to_the_wall(states):
+    """Steps to the right, as far as a wall; nobody gets through."""
+    ends = np.where(states[:, 0] <= WALL, np.minimum(states[:, 0] + STRIDE, WALL), states[:, 0] + STRIDE)
+    return [(s, 0, -1.0, np.array([end, s[1]]), False) for s, end in zip(states, ends, strict=True)]
+
+
+def test_at_a_wall_visits_make_the_prediction_better():
+    model = make_linear_model(((3, 3), 0), BROAD | dict(n_neighbors=40), n_actions=1)
+    learn(model, walk_to_the_wall(np.random.default_rng(1).random((100, 2))))
+    at_wall, errors = np.array([WALL, 0.5]), []
+    for _ in range(8):
+        errors.append(abs(model.predict_at(at_wall)[0].effect[0, 0, 0]))
+        learn(model, walk_to_the_wall(at_wall[None]))
+    assert errors[-1] < 0.25 * errors[0] and errors[-1] < 0.1 * STRIDE and (np.diff(errors) < 0.0).all()

@@ -1,0 +1,170 @@
+"""The finite MDP: rows written from predictions against rows in plain loops."""
+
+import warnings
+
+import numpy as np
+import pytest
+from helpers.kernel_models import GRIDS, N_ACTIONS, assert_same_row, make_grid, row_of, without_staying
+from helpers.naive_fitted_rmax import NaiveGrid
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel.planning.grid import StateGrid, fitting_grid
+from sb3_combrel.planning.mdp import FiniteMDP
+
+
+def make_mdp(grid=((2,), 0), gamma=1.0):
+    return FiniteMDP(make_grid(grid), N_ACTIONS, gamma), NaiveGrid(*grid)
+
+
+def write(mdp, pairs, probability, effect, reward, modelled=True):
+    """Write rows of predictions given as lists; effects of one variable may be plain numbers."""
+    pairs, probability = np.asarray(pairs, dtype=np.int64), np.asarray(probability, dtype=np.float64)
+    effect = np.asarray(effect, dtype=np.float64).reshape(*probability.shape, mdp.grid.n_variables)
+    modelled = np.broadcast_to(modelled, len(pairs)).copy()
+    mdp.write_rows(pairs, modelled, probability, effect, np.asarray(reward, dtype=np.float64))
+
+
+def naive_row(grid, point, probability, effect):
+    """{successor: probability} of a prediction at a grid point."""
+    successors = {}
+    for p, moved in zip(probability, effect, strict=True):
+        if p > 0.0:
+            for to, fraction in grid.corners(grid.unit(point) + moved).items():
+                successors[to] = successors.get(to, 0.0) + p * fraction
+    return successors
+
+
+def random_predictions(rng, n, n_successors, n_variables):
+    """Some of them end the episode with some probability, some stay, some leave the grid."""
+    probability = rng.random((n, n_successors)) * (rng.random((n, n_successors)) < 0.8)
+    probability *= (rng.random((n, 1)) < 0.7) * rng.random((n, 1)) + (rng.random((n, 1)) < 0.5)
+    probability /= np.maximum(1.0, probability.sum(axis=1, keepdims=True))
+    moves = rng.random((n, n_successors, n_variables)) < 0.6
+    return probability, rng.normal(0.0, 0.4, moves.shape) * moves, rng.normal(size=n)
+
+
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(st.sampled_from(GRIDS), st.integers(0, 10**6), st.integers(1, 5), st.sampled_from([1.0, 0.9]))
+def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
+    rng = np.random.default_rng(seed)
+    mdp, naive = make_mdp(grid, gamma)
+    n_points, expected = mdp.grid.n_points, {}
+    for _ in range(3):  # a later row replaces an earlier one
+        pairs = rng.choice(N_ACTIONS * n_points, min(40, n_points), replace=False)
+        probability, effect, reward = random_predictions(rng, len(pairs), n_successors, len(grid[0]))
+        modelled = rng.random(len(pairs)) < 0.8
+        write(mdp, pairs, probability, effect, reward, modelled)
+        for row, pair in enumerate(pairs.tolist()):
+            expected[pair] = (probability[row], effect[row], reward[row]) if modelled[row] else None
+    for pair in range(N_ACTIONS * n_points):
+        action, point = divmod(pair, n_points)
+        found, prediction = row_of(mdp, point, action), expected.get(pair)
+        assert mdp.arrays.modelled[pair] == (prediction is not None)
+        if prediction is None:
+            assert found == {} and mdp.arrays.reward[pair] == 0.0
+            continue
+        successors = naive_row(naive, point, prediction[0], prediction[1])
+        reward, others = without_staying(prediction[2], successors, point, gamma)
+        assert mdp.arrays.reward[pair] == pytest.approx(reward, rel=1e-9, abs=1e-9)
+        assert_same_row(found, others)
+    modelled = mdp.arrays.modelled.reshape(N_ACTIONS, -1)
+    np.testing.assert_array_equal(mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
+
+
+@settings(deadline=None, derandomize=True, max_examples=8)
+@given(st.sampled_from(GRIDS), st.integers(0, 10**6))
+def test_predecessors_include_every_point_that_a_row_leads_from_with_at_least_its_probability(grid, seed):
+    rng = np.random.default_rng(seed)
+    mdp, _ = make_mdp(grid, gamma=0.95)
+    pairs = np.arange(N_ACTIONS * mdp.grid.n_points)
+    for _ in range(3):
+        write(mdp, pairs, *random_predictions(rng, len(pairs), 3, len(grid[0])))
+    for renewed in (False, True):
+        if renewed:
+            mdp.renew_predecessors()
+        noted = [
+            dict(zip(*map(np.ndarray.tolist, mdp.arrays.predecessors.entries(to)), strict=True))
+            for to in range(len(pairs) // 2)
+        ]
+        leading = [{} for _ in noted]
+        for pair in pairs.tolist():
+            action, point = divmod(pair, mdp.grid.n_points)
+            for to, p in row_of(mdp, point, action).items():
+                leading[to][point] = max(p, leading[to].get(point, 0.0))
+        for found, needed in zip(noted, leading, strict=True):
+            assert needed.keys() <= found.keys() and all(found[point] >= p for point, p in needed.items())
+            if renewed:
+                assert needed.keys() == found.keys(), "those that no row needs any more are forgotten"
+                assert all(found[point] < 2 * p * (1 + 1e-12) for point, p in needed.items()), "the next power of two at most"
+
+
+def test_staying_is_summed_in_closed_form_and_probability_missing_to_one_ends_the_episode():
+    mdp, _ = make_mdp(gamma=0.8)
+    write(mdp, [2], [[0.6, 0.3]], [[0.0, 0.25]], [-1.0])
+    leave = 1.0 - 0.8 * 0.6
+    assert row_of(mdp, 2) == pytest.approx({3: 0.8 * 0.3 / leave})
+    assert mdp.arrays.reward[2] == pytest.approx(-1.0 / leave)
+    write(mdp, [2], [[0.0, 0.0]], [[0.25, -0.25]], [-3.0])
+    assert row_of(mdp, 2) == {} and mdp.arrays.reward[2] == -3.0
+    assert mdp.arrays.modelled[2], "a pair that always ends the episode has a model"
+
+
+@pytest.mark.parametrize(("reward", "expected"), [(-1.0, -np.inf), (2.0, np.inf), (0.0, 0.0)])
+def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, expected):
+    mdp, _ = make_mdp()
+    write(mdp, [2], [[0.5, 0.5]], [[0.0, 0.0]], [reward])
+    assert row_of(mdp, 2) == {} and mdp.arrays.reward[2] == expected
+    write(mdp, [2], [[0.5, 0.5]], [[0.0, 0.25]], [reward])
+    assert row_of(mdp, 2) == pytest.approx({3: 1.0}), "and an ordinary row once it leaves"
+    assert mdp.arrays.reward[2] == pytest.approx(2 * reward)
+
+
+def test_the_stores_grow_and_keep_the_rows_that_were_written_before():
+    mdp, naive = make_mdp(((4, 4), 0))
+    rows, predecessors = len(mdp.arrays.rows.item), len(mdp.arrays.predecessors.item)
+    rng, pairs = np.random.default_rng(0), np.arange(N_ACTIONS * mdp.grid.n_points)
+    probability, effect, reward = random_predictions(rng, len(pairs), 40, 2)
+    for some in np.array_split(pairs, 7):
+        write(mdp, some, probability[some], effect[some], reward[some])
+    assert len(mdp.arrays.rows.item) > rows and len(mdp.arrays.predecessors.item) > predecessors
+    for pair in rng.choice(pairs, 60, replace=False).tolist():
+        action, point = divmod(pair, mdp.grid.n_points)
+        expected_reward, others = without_staying(
+            reward[pair], naive_row(naive, point, probability[pair], effect[pair]), point, gamma=1.0
+        )
+        assert mdp.arrays.reward[pair] == pytest.approx(expected_reward, abs=1e-9)
+        assert_same_row(row_of(mdp, point, action), others)
+
+
+# The grid of states against plain loops: its points, interpolation between them, and its size.
+@settings(deadline=None, derandomize=True, max_examples=20)
+@given(st.sampled_from(GRIDS), st.integers(0, 10**6))
+def test_interpolation_is_multilinear_between_grid_points_and_constant_beyond_them(grid, seed):
+    rng = np.random.default_rng(seed)
+    own, naive = make_grid(grid), NaiveGrid(*grid)
+    values = rng.normal(size=own.n_points)
+    assert own.n_points == np.prod(naive.shape)
+    np.testing.assert_allclose([own.interpolate(values, state) for state in own.points()], values)
+    for state in rng.uniform(-0.8, 1.8, (10, own.n_variables)):
+        expected = sum(weight * values[point] for point, weight in naive.corners(state).items())
+        assert own.interpolate(values, state) == pytest.approx(expected, abs=1e-12)
+
+
+def test_one_resolution_counts_for_all_variables():
+    np.testing.assert_array_equal(StateGrid(3, 2).points(), StateGrid(3, (2, 2, 2)).points())
+
+
+@pytest.mark.parametrize(("n_variables", "breadth"), [(1, 0.09), (2, 0.09), (2, 0.02), (3, 0.15), (4, 0.2)])
+def test_a_default_grid_is_fine_enough_for_the_reach_of_the_kernel(n_variables, breadth):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grid = fitting_grid(n_variables, 2, None, breadth, 0.01)
+    assert np.linalg.norm(0.5 ** np.array(grid.resolution)) <= breadth * np.sqrt(-np.log(0.01))
+    assert grid.margin == (1 if n_variables <= 2 else 0)
+
+
+def test_a_default_grid_has_a_million_pairs_at_most():
+    with pytest.warns(UserWarning, match="coarse"):
+        grid = fitting_grid(4, 5, None, 0.01, 0.01)
+    assert 5 * grid.n_points <= 10**6 < 5 * (2 ** (grid.resolution[0] + 1) + 1) ** 4

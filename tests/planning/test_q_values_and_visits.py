@@ -1,0 +1,284 @@
+"""Q at exact states against its definition, through the agent."""
+
+import copy
+
+import numpy as np
+import pytest
+from helpers.agents import assert_same_state, make_agent
+from helpers.kernel_models import add_instances
+from helpers.naive_fitted_rmax import NaiveFittedRMax, NaiveGrid
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel import TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel.planning.grid import StateGrid
+from sb3_combrel.planning.visits import ENOUGH_VISITS, Visits
+
+N_ACTIONS = 3
+
+
+def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, threshold=1.0, periodic=None, **kernel):
+    kernel = dict(breadth=0.3, min_weight=0.01, min_fraction=0.13) | kernel
+    task = dict(gamma=gamma, max_value=max_value, periodic=periodic)
+    breadth, fractions = kernel["breadth"], {name: kernel[name] for name in ("min_weight", "min_fraction")}
+    model = dict(degree=0, model_breadth=breadth, exploration_threshold=threshold, resolution=resolution, **fractions)
+    agent = make_agent(n_variables, N_ACTIONS, **model, **task)
+    naive = NaiveFittedRMax(agent.grid.resolution, agent.grid.margin, N_ACTIONS, kernel, threshold=threshold, **task)
+    return agent, naive
+
+
+@settings(deadline=None, derandomize=True, max_examples=15)
+@given(
+    st.integers(0, 10**6),
+    st.integers(1, 3),
+    st.integers(0, 40),
+    st.sampled_from([1.0, 0.9]),
+    st.sampled_from([0.3, 1.0, 2.5]),
+    st.sampled_from([0.0, 7.0, -3.0]),
+    st.sampled_from([None, (True, True, True), (True, False, True)]),
+)
+def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, gamma, threshold, max_value, periodic):
+    rng = np.random.default_rng(seed)
+    flags = None if periodic is None else periodic[:n_variables]
+    arguments = dict(gamma=gamma, threshold=threshold, max_value=max_value, periodic=flags)
+    agent, naive = agent_and_definition(n_variables, 2, **arguments)
+    transitions = []
+    for _ in range(n):
+        state = rng.random(n_variables)
+        effect = rng.normal(0.0, 0.2, n_variables) * (rng.random() < 0.7)
+        transitions.append(
+            (state, int(rng.integers(N_ACTIONS)), float(rng.normal()), state + effect, bool(rng.random() < 0.1))
+        )
+    # Only the models learn: Q is compared on values at the grid points that are chosen here.
+    for transition in transitions:
+        agent.model.add(*transition)
+    add_instances(naive, transitions)
+    values = max_value - 5.0 * rng.random(naive.n_points)
+    agent.planner.bounds = (max_value - 20.0, max_value)
+    for state in [rng.random(n_variables) for _ in range(5)] + [t[0] for t in transitions[:5]]:
+        expected = naive.q_values(state, values, max_value - 20.0)
+        found = agent.q_values(state, values)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+        # Optimism is exact: exploration finds untried actions by comparing with ==.
+        np.testing.assert_array_equal(found == max_value, expected == max_value)
+
+
+class OneVariable:
+    """An agent on a line, and values that fall by 1 with every grid point: grid coordinates are 4 u + 1."""
+
+    def __init__(self):
+        self.agent, naive = agent_and_definition(1, 2, breadth=0.2, min_fraction=0.01)
+        self.values = -np.arange(naive.n_points, dtype=float)
+        self.agent.planner.bounds = (-100.0, 0.0)
+
+    def learn(self, state, effect, reward=-1.0, terminated=False, times=2, action=0):
+        state = np.array([state])
+        for _ in range(times):
+            self.agent.model.add(state, action, reward, state + effect, terminated)
+
+    def q_values(self, state):
+        return self.agent.q_values(np.array([state]), self.values)
+
+    def q(self, state):
+        return self.q_values(state)[0]
+
+
+@pytest.fixture
+def line():
+    return OneVariable()
+
+
+def test_below_the_threshold_an_action_has_the_bound_interpolated_between_grid_points(line):
+    bounds = -np.arange(line.agent.grid.n_points, dtype=float) ** 2
+    line.agent.planner.set_upper(bounds)
+    line.learn(0.5, 0.1)
+    for state in (0.0, 0.125, 0.3, 0.9):
+        expected = np.interp(4.0 * state + 1.0, np.arange(len(bounds)), bounds)
+        np.testing.assert_allclose(line.q_values(state), expected, atol=1e-12)
+    assert line.q(0.5) == pytest.approx(-1.0 - 3.4), "a known action has what it leads to"
+    assert line.q_values(0.5)[1] == pytest.approx(-9.0)
+    line.agent.planner.set_upper(None)
+    assert (line.q_values(0.3) == 0.0).all()
+
+
+def test_staying_is_worth_the_state_s_own_q_and_not_the_interpolated_value(line):
+    line.learn(0.5, 0.0)
+    line.learn(0.5, 0.1)
+    # q = -1 + q / 2 + V(0.6) / 2
+    assert line.q(0.5) == pytest.approx(2 * (-1.0 - 0.5 * (4 * 0.6 + 1)))
+
+
+def test_staying_for_ever_is_worth_the_bound_on_the_side_of_the_reward(line):
+    line.learn(0.5, 0.0)
+    assert line.q(0.5) == -100.0
+    line.learn(0.5, 0.0, reward=0.0, action=1)
+    assert line.q_values(0.5)[1] == 0.0
+
+
+def test_pushing_against_the_edge_of_the_grid_is_staying():
+    agent, _ = agent_and_definition(3, 1, breadth=0.5, min_fraction=0.01)
+    agent.planner.bounds = (-100.0, 0.0)
+    corner = np.ones(3)
+    for _ in range(2):
+        agent.model.add(corner, 0, -1.0, corner + 0.3, False)
+    assert agent.q_values(corner)[0] == -100.0
+
+
+def test_asking_for_q_changes_nothing_and_gives_an_array_of_the_caller_s_own(line):
+    line.learn(0.5, 0.05)
+    before, first = copy.deepcopy(line.agent), line.q_values(0.52)
+    expected = first.copy()
+    line.q_values(0.1)[:] = np.nan
+    np.testing.assert_array_equal(first, expected)
+    np.testing.assert_array_equal(line.q_values(0.52), expected)
+    assert_same_state(line.agent, before)
+
+
+def test_q_does_not_depend_on_the_states_asked_for_before():
+    """A search starts from what the last one found; wherever that was, the result is the same bit for bit."""
+    rng = np.random.default_rng(3)
+    agent, _ = agent_and_definition(2, 3, breadth=0.15, min_fraction=0.05)
+    for state in np.round(rng.random((150, 2)) * 12) / 12:
+        agent.model.add(state, int(rng.integers(N_ACTIONS)), -1.0, np.clip(state + 0.05, 0, 1), False)
+    values, untouched = rng.normal(size=len(agent.planner.values)) - 5.0, copy.deepcopy(agent)
+    queries = np.round(rng.random((20, 2)) * 24) / 24
+    first = [agent.q_values(state, values) for state in queries]
+    for number in rng.permutation(len(queries)):
+        np.testing.assert_array_equal(agent.q_values(queries[number], values), first[number])
+    np.testing.assert_array_equal(untouched.q_values(queries[7], values), first[7])
+
+
+HERE, ELSEWHERE = np.array([0.3]), np.array([0.7])
+
+
+@pytest.fixture(params=[0, 1])
+def line_agent(request):
+    """Makes an agent on a line, with actions 0 and 1."""
+
+    def make(transfer=None):
+        return make_agent(1, 2, transfer, degree=request.param, model_breadth=0.05, resolution=4)
+
+    return make
+
+
+def learn_to_move(agent):
+    for _ in range(3):
+        agent.update(HERE, 0, -1.0, np.array([0.32]), False)
+
+
+def ends_anywhere(reward):
+    """Transfer from a source in which action 1 ends the episode anywhere, with a reward; action 0 moves a little, for -1."""
+    at = np.linspace(0.0, 1.0, 201)
+    states, ends = np.tile(at, 2)[:, None], np.append(np.clip(at + 0.1, 0.0, 1.0), at)[:, None]
+    actions = np.repeat([0, 1], 201)
+    source = SourceInstances(states, actions, np.where(actions == 1, reward, -1.0), ends, actions == 1, [0.0], [1.0], 2)
+    return TIMBREL(source, InterTaskMapping([0], [0, 1]))
+
+
+def test_an_evaluation_prefers_known_actions_to_transferred_ones_that_look_better(line_agent):
+    agent = line_agent(ends_anywhere(-1.0))
+    agent.prepare()
+    learn_to_move(agent)
+    best, second = agent.q_values(HERE)[::-1]
+    assert best > second and agent.act(HERE) == 1 and agent.act(HERE, explore=False) == 0
+    assert agent.act(ELSEWHERE, explore=False) == 1, "where nothing is known, the best of what was transferred"
+    # A transferred end that is worth as much as optimism.
+    agent = line_agent(ends_anywhere(0.0))
+    agent.prepare()
+    assert agent.q_values(HERE)[1] == agent.planner.bounds[1] > agent.q_values(HERE)[0]
+    assert agent.act(HERE, explore=False) == 1
+
+
+def test_an_evaluation_takes_a_known_end_that_is_worth_as_much_as_optimism(line_agent):
+    agent = line_agent()
+    learn_to_move(agent)
+    assert agent.act(HERE, explore=False) == 0, "action 1 is optimistic: where it leads is not known"
+    for _ in range(3):
+        agent.update(HERE, 1, 0.0, np.array([0.32]), True)
+    assert agent.q_values(HERE)[1] == 0.0 == agent.planner.bounds[1] and agent.act(HERE, explore=False) == 1
+
+
+# Visits where all is known end the optimism of grid points around them that nothing comes near to.
+GRIDS = [((3,), 1), ((2, 2), 0), ((2, 1), 1), ((2,), 0, (True,)), ((2, 2), 0, (True, False)), ((1, 1, 1), 0)]
+THRESHOLD = 0.7
+
+
+def note_many(grid, visits, n_optimistic):
+    """Note visits, each a (state, weights); what they return, and the counts in the end."""
+    resolution, margin, periodic = *grid, *(None,) * (3 - len(grid))
+    made = StateGrid(len(resolution), resolution, margin, periodic)
+    counter = Visits(made.n_variables, made.n_points)
+    found = [counter.note(state, weight, THRESHOLD, n_optimistic, made.plain).copy() for state, weight in visits]
+    return found, counter.counts
+
+
+@settings(deadline=None, derandomize=True, max_examples=25)
+@given(st.sampled_from(GRIDS), st.integers(0, 10**6), st.integers(1, 30))
+def test_visits_are_counted_at_the_optimistic_points_around_where_every_action_is_known(grid, seed, n):
+    rng = np.random.default_rng(seed)
+    naive, d = NaiveGrid(*grid), len(grid[0])
+    n_optimistic = rng.integers(0, 3, len(naive.coordinates))
+    states = [rng.uniform(-0.1, 1.1, d) if rng.random() < 0.7 else rng.integers(0, 5, d) / 4 for _ in range(4)]
+    visits = [(states[rng.integers(4)], rng.uniform(0.6, 1.5, 2)) for _ in range(n)]
+    found, counts = note_many(grid, visits, n_optimistic)
+    expected = np.zeros(len(n_optimistic), dtype=int)
+    for points, (state, weight) in zip(found, visits, strict=True):
+        around = [p for p in naive.corners(state) if n_optimistic[p] > 0] if (weight >= THRESHOLD).all() else []
+        expected[around] += 1
+        assert sorted(points) == sorted(p for p in around if expected[p] >= ENOUGH_VISITS)
+    np.testing.assert_array_equal(counts, expected)
+
+
+STATE = np.array([0.5625, 0.5])
+
+
+def agent_beside_unknown_points():
+    """Both actions are known at STATE, but the narrow kernel leaves the grid points on both sides of it optimistic."""
+    agent = make_agent(2, 2, degree=1, resolution=3, model_breadth=0.08, min_weight=0.4, n_neighbors=4, max_backups=10)
+    for action in range(2):
+        agent.update(STATE, action, -1.0, STATE + 0.02, False)
+    return agent
+
+
+@pytest.mark.filterwarnings("ignore:resolution")
+def test_the_agent_makes_pairs_known_that_it_has_visited_often_enough():
+    agent, points = agent_beside_unknown_points(), list(NaiveGrid((3, 3), 1).corners(STATE))
+    pairs = [action * agent.grid.n_points + point for action in range(2) for point in points]
+    agent.model.known[pairs] = False
+    agent.model.fits.total[pairs] = 0.3
+    agent.model.update_rows(np.array(pairs))
+    prediction, _ = agent.model.predict_at(STATE)
+    assert (prediction.weight >= agent.model.exploration_threshold).all()
+    for visit in range(1, ENOUGH_VISITS + 1):
+        assert not agent.model.known[pairs].any()
+        agent.act(STATE)
+        assert agent.visits.counts[points].tolist() == [visit] * len(points)
+    assert agent.model.known[pairs].all()
+    assert (agent.mdp.arrays.n_optimistic[points] == 2).all(), "rows are written when the agent plans"
+    agent.update(np.array([0.1, 0.1]), 0, -1.0, np.array([0.1, 0.2]), False)
+    assert agent.mdp.arrays.modelled[pairs].all() and (agent.mdp.arrays.n_optimistic[points] == 0).all()
+    agent.act(STATE)
+    assert agent.visits.counts[points].tolist() == [ENOUGH_VISITS] * len(points), "they are not optimistic any more"
+
+
+@pytest.mark.filterwarnings("ignore:resolution")
+def test_evaluating_counts_no_visits():
+    agent = agent_beside_unknown_points()
+    agent.model.known[:] = False
+    agent.model.update_rows(np.arange(len(agent.model.known)))
+    agent.act(STATE, explore=False)
+    agent.q_values(STATE)
+    agent.sample_action(STATE)
+    assert not agent.visits.counts.any()
+    agent.act(STATE)
+    assert agent.visits.counts.any()
+
+
+@pytest.mark.filterwarnings("ignore:resolution")
+def test_visits_are_saved_with_the_agents_state():
+    agent, restored = agent_beside_unknown_points(), agent_beside_unknown_points()
+    agent.visits.counts[::3] = 2
+    agent.end_episode(False)
+    restored.set_state(agent.get_state())
+    assert restored.visits.counts.any()
+    assert_same_state(agent, restored)

@@ -1,0 +1,174 @@
+"""get_parameters and set_parameters, as SB3's own tests use them with every algorithm; wrong ones change nothing."""
+
+import inspect
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch as th
+from helpers.walk import METHODS, OBSERVATIONS, Walk, same_parameters, small
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_checker import check_env
+
+from sb3_combrel import FittedRMax
+from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+
+
+def test_get_and_set_parameters_round_trip(make):
+    """Random values of any kind must load without an error."""
+    model, other = make().learn(60), make(seed=1).learn(30)
+    parameters = model.get_parameters()
+    assert list(parameters) == ["policy"]
+    other.set_parameters(parameters, exact_match=True)
+    assert same_parameters(model, other)
+    th.manual_seed(0)
+    randomized = {"policy": {k: th.rand_like(v) for k, v in parameters["policy"].items()}}
+    assert all(v.dtype == th.float64 for v in parameters["policy"].values())
+    model.set_parameters(randomized, exact_match=True)
+    model.predict(OBSERVATIONS)
+    model.learn(20)
+    other.learn(20)
+
+
+def test_a_policy_can_be_saved_and_loaded_by_itself(make, tmp_path):
+    model = make().learn(100)
+    model.policy.save(tmp_path / "policy.pth")
+    policy = FittedRMaxPolicy.load(tmp_path / "policy.pth")
+    np.testing.assert_array_equal(
+        policy.predict(OBSERVATIONS, deterministic=True)[0], model.predict(OBSERVATIONS, deterministic=True)[0]
+    )
+
+
+@pytest.fixture(scope="module")
+def learned():
+    return small(transfer=METHODS["COMBREL"]()).learn(60)
+
+
+KINDS = [None, 7, True, [], {1: {}}, {"policy": 3}, {"policy": None}, {"stranger": {}}, {"policy": {"values": 3}}]
+
+
+@pytest.mark.parametrize("exact_match", [True, False])
+@pytest.mark.parametrize("wrong", KINDS)
+def test_parameters_of_another_kind_are_refused_by_the_name_of_the_argument(learned, wrong, exact_match):
+    with pytest.raises(ValueError, match="load_path_or_dict") as error:
+        learned.set_parameters(wrong, exact_match=exact_match)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        *[("instances", lambda t: t[:, :-1]), ("instances", lambda t: t[0]), ("instances", lambda t: t * th.nan)],
+        *[("values", lambda t: t[:-1]), ("values", lambda t: t.to(th.int64)), ("values", lambda t: t / 0.0)],
+        *[("known", lambda t: t[1:]), ("lowest_value", lambda t: t[:0]), ("corrections", lambda t: th.zeros(4))],
+        *[("transfer_instances_used", lambda t: None), ("stranger", lambda t: th.zeros(3))],
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused_by_name_and_change_nothing(learned, name, spoil):
+    """``None``: left out."""
+    before = learned.get_parameters()["policy"]
+    spoilt = spoil(before.get(name))
+    damaged = {**before, name: spoilt} if spoilt is not None else {k: v for k, v in before.items() if k != name}
+    # As PyTorch raises, and as this package does.
+    for kind in (RuntimeError, ValueError):
+        with pytest.raises(kind, match=name) as error:
+            learned.set_parameters({"policy": damaged})
+        assert "\n" not in str(error.value)
+    after = learned.get_parameters()["policy"]
+    assert all(th.equal(after[key], before[key]) for key in before)
+
+
+def test_exact_match_is_true_or_false(learned):
+    with pytest.raises(ValueError, match="exact_match must be True or False, got"):
+        learned.set_parameters(learned.get_parameters(), exact_match="yes")
+
+
+def test_parameters_come_from_a_file_too_and_a_file_that_is_none_is_named(learned, tmp_path):
+    learned.save(tmp_path / "model")
+    for given in (tmp_path / "model", str(tmp_path / "model.zip"), io.BytesIO((tmp_path / "model.zip").read_bytes())):
+        model = small(transfer=METHODS["COMBREL"]())
+        model.set_parameters(given)
+        assert same_parameters(model, learned)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        learned.set_parameters(tmp_path / "nowhere")
+    (tmp_path / "text.zip").write_text("no archive")
+    with pytest.raises(ValueError, match=r"text\.zip is not the file of a model"):
+        learned.set_parameters(tmp_path / "text.zip")
+
+
+def test_without_exact_match_what_is_not_given_stays_and_what_is_unknown_is_ignored(learned):
+    model = small(transfer=METHODS["COMBREL"]()).learn(30)
+    before, values = model.get_parameters()["policy"], learned.get_parameters()["policy"]["values"]
+    model.set_parameters({"policy": {"values": values, "stranger": th.zeros(3)}}, exact_match=False)
+    after = model.get_parameters()["policy"]
+    assert th.equal(after["values"], values)
+    assert all(th.equal(after[name], before[name]) for name in before if name != "values")
+    model.set_parameters({}, exact_match=False)
+    assert all(th.equal(model.get_parameters()["policy"][name], after[name]) for name in after)
+
+
+# Making a model and running it, as people who know SB3 type it.
+@pytest.mark.parametrize("name", ["learn", "save", "load", "set_env"])
+def test_the_methods_take_what_those_of_sb3_take(name):
+    assert list(inspect.signature(getattr(FittedRMax, name)).parameters) == list(
+        inspect.signature(getattr(BaseAlgorithm, name)).parameters
+    )
+
+
+@pytest.mark.parametrize(
+    "make_it",
+    [
+        lambda env: FittedRMax(env),
+        lambda env: FittedRMax("FittedRMaxPolicy", env),
+        lambda env: FittedRMax(FittedRMaxPolicy, env),
+        lambda env: FittedRMax(env, "MlpPolicy"),
+        lambda env: FittedRMax(env=env, policy="MlpPolicy"),
+    ],
+)
+def test_environment_and_policy_come_in_either_order(make_it):
+    model = make_it(Walk())
+    assert isinstance(model.policy, FittedRMaxPolicy) and model.n_envs == 1
+    model.learn(10)
+
+
+def test_an_environment_can_be_named():
+    for model in (FittedRMax("MountainCar-v0"), FittedRMax("MlpPolicy", "MountainCar-v0")):
+        assert model.env.get_attr("spec")[0].id == "MountainCar-v0"
+
+
+@pytest.mark.filterwarnings("error::DeprecationWarning", "error::UserWarning", "error::RuntimeWarning")
+def test_the_walk_of_these_tests_is_a_proper_environment():
+    check_env(Walk(), warn=False)
+
+
+def test_learning_counts_steps_and_episodes(make):
+    model = make().learn(70)
+    assert model.num_timesteps == model.agent.model.n_instances == 70 and model._episode_num >= 2
+    model.learn(30, reset_num_timesteps=False)
+    assert model.num_timesteps == model.agent.model.n_instances == 100
+    model.learn(30)
+    assert model.num_timesteps == 30, "steps are counted from 0 again"
+    assert model.agent.model.n_instances == 130, "what was learned is kept"
+    assert model.learn(1e1).num_timesteps == 10, "as it is often written"
+
+
+def test_the_learned_policy_walks_to_the_goal(make):
+    np.testing.assert_array_equal(make().learn(400).predict(OBSERVATIONS[3:18], deterministic=True)[0], 1)
+
+
+@pytest.mark.long
+def test_importing_is_light_and_compiles_nothing():
+    code = (
+        "import sys, sb3_combrel\n"
+        "heavy = {'mujoco', 'dm_control', 'rl_zoo3', 'matplotlib', 'pandas', 'minari', 'optuna'} & set(sys.modules)\n"
+        "from numba.core.dispatcher import Dispatcher\n"
+        "import gc\n"
+        "ours = [d for d in gc.get_objects() if isinstance(d, Dispatcher) and 'sb3_combrel' in d.py_func.__module__]\n"
+        "assert ours\n"
+        "compiled = [d for d in ours if d.signatures]\n"
+        "sys.exit(f'{heavy} {compiled}' if heavy or compiled else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

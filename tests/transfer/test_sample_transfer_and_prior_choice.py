@@ -1,0 +1,353 @@
+"""Transfer of samples: compliance of every virtual source task, what is drawn, and what is transferred, by plain loops."""
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import factored as f
+from helpers import naive_transfer as naive
+from helpers.asking import bound, changed_pairs, pairs_of, show, transferred_to_all, transferred_to_pairs
+from helpers.factored import measured, predicted_by
+from helpers.naive_transfer import source_of, transitions_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel import InterTaskMapping, MappingSet, SampleTransfer
+from sb3_combrel.transfer import equations
+from sb3_combrel.transfer.candidates import Candidates, stacked_instances
+from sb3_combrel.transfer.equations import Bandwidths, division_score, prediction_compliances, running_scales
+from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
+from sb3_combrel.transfer.methods.sample_transfer import candidate_compliances, draw_instances
+from sb3_combrel.transfer.prior import prior_choice
+from sb3_combrel.transfer.prior.copy_sums import CopySums
+
+POINTS = np.random.default_rng(5).random((12, 3))
+BANDWIDTHS = (0.05, 0.02, 1.0)
+LISTED = [
+    InterTaskMapping([0, None, 1], [1, 0]),
+    InterTaskMapping([1, 0, None], [0, 0], [1, -1, 1]),
+    InterTaskMapping([0, None, 1], [1, 1]),
+]
+SETS = {
+    "injective": MappingSet.injective(2, 3, 2, 2),
+    "signed_surjective": MappingSet.surjective(2, 3, 2, 2, signs=True),
+    "balanced": MappingSet.balanced(2, 3, 2, 2),
+    "listed": LISTED,
+    "repeated": MappingSet([[0, 1, -1], [1, -1, 0], [0, 1, -1]], MappingSet.injective(2, 3, 2, 2).actions),
+}
+IDENTITY = InterTaskMapping([0, 1], [0, 1])
+
+
+def observed(method, transitions, task):
+    bound(method, task)
+    for transition in transitions:
+        show(method, transition)
+    return method
+
+
+def eq_6(transitions, source, mapping):
+    """The compliance of one virtual source task by the equations."""
+    given = naive.as_sample(transitions, 3), naive.as_transitions(source), mapping, Bandwidths(*BANDWIDTHS)
+    return equations.task_compliance(equations.sample_compliance(*given, DEFAULT_MIN_EVIDENCE))
+
+
+def naive_candidate_compliances(sources, sets, transitions):
+    """Of each (source, target action, state mapping, signs, source action) by going through all tasks."""
+    found = Counter()
+    for number, (source, mappings) in enumerate(zip(sources, sets, strict=True)):
+        for mapping in mappings:
+            own = eq_6(transitions, source, mapping) / len(mappings) / len(sources)
+            for action, source_action in enumerate(mapping.action):
+                found[number, action, mapping.state, mapping.sign, source_action] += own
+    return found
+
+
+def key_of(method, candidate):
+    number, action, state_index, source_action = method.candidates.origins[candidate]
+    of = method.candidates.sets[number]
+    signs = tuple(int(s) for s in of.state_signs[state_index])
+    return number, action, tuple(None if k < 0 else int(k) for k in of.state_mappings[state_index]), signs, source_action
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_compliances_are_those_of_all_tasks_that_have_a_candidate_added_up(name):
+    source, transitions = source_of(), transitions_of(15, seed=10)
+    method = observed(SampleTransfer(source, SETS[name], bandwidths=BANDWIDTHS), transitions, naive.target_task(POINTS, 2))
+    found = candidate_compliances(method.candidates, method._tasks.sums, 15)
+    expected = naive_candidate_compliances([source], [list(SETS[name])], transitions)
+    assert len(found) == len(expected) and max(found) > 0.0
+    for candidate, value in enumerate(found):
+        assert value == pytest.approx(expected[key_of(method, candidate)], rel=1e-9, abs=1e-15)
+
+
+def test_every_mapping_to_every_source_is_a_task():
+    sources, transitions = [source_of(3), source_of(4, 1, 3)], transitions_of(20)
+    method = SampleTransfer(sources, "surjective", bandwidths=BANDWIDTHS)
+    observed(method, transitions, naive.target_task(POINTS, 2))
+    sets = [MappingSet.surjective(each.n_variables, 3, each.n_actions, 2) for each in sources]
+    expected = naive_candidate_compliances(sources, sets, transitions)
+    found = candidate_compliances(method.candidates, method._tasks.sums, 20)
+    assert {key_of(method, candidate): pytest.approx(each, rel=1e-9) for candidate, each in enumerate(found)} == expected
+    for number, mappings in enumerate(sets):
+        for mapping in list(mappings)[::7]:
+            expected = eq_6(transitions, sources[number], mapping)
+            assert method.task_compliance(mapping, number) == pytest.approx(expected, rel=1e-9)
+    with pytest.raises(ValueError, match="mapping must have a state mapping of the set of source 0, got"):
+        method.task_compliance(InterTaskMapping([0, None, None], [0, 0]))
+    # What all candidates of an action have together is the mean compliance of all tasks.
+    first = method.candidates.arrays.first
+    totals = [found[begin:end].sum() for begin, end in itertools.pairwise(first)]
+    assert totals == pytest.approx([totals[0]] * 2)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_drawn_are_as_many_of_each_action_as_can_be_and_none_twice_nor_of_those_that_cannot(seed):
+    rng = np.random.default_rng(seed)
+    candidates = Candidates(source_of(seed, n=20), SETS["injective"], naive.target_task(POINTS, 2))
+    size = candidates.instances.size[candidates.arrays.action]
+    compliances = rng.random(len(candidates)) * (rng.random(len(candidates)) < 0.5)
+    relevances = rng.random((len(candidates), size.max())) * (rng.random((len(candidates), size.max())) < 0.7)
+    drawn = draw_instances(candidates, compliances, relevances, 30, rng)
+    assert len({tuple(row) for row in drawn.tolist()}) == len(drawn)
+    possible = (np.arange(size.max()) < size[:, None]) & (compliances[:, None] * relevances > 0.0)
+    assert possible[drawn[:, 0], drawn[:, 1]].all()
+    for begin, end in itertools.pairwise(candidates.arrays.first):
+        assert int(((begin <= drawn[:, 0]) & (drawn[:, 0] < end)).sum()) == min(30, int(possible[begin:end].sum()))
+
+
+def test_one_is_drawn_in_proportion_to_compliance_and_of_a_candidate_to_relevance():
+    rng = np.random.default_rng(0)
+    candidates = Candidates(source_of(n=8), LISTED, naive.target_task(POINTS, 2))
+    size = candidates.instances.size[candidates.arrays.action]
+    compliances, relevances = rng.random(len(candidates)), rng.random((len(candidates), size.max()))
+    n, counts = 4000, Counter()
+    for seed in range(n):
+        drawn = draw_instances(candidates, compliances, relevances, 1, np.random.default_rng(seed))
+        counts.update(map(tuple, drawn.tolist()))
+    for begin, end in itertools.pairwise(candidates.arrays.first):
+        for candidate in range(begin, end):
+            of_candidate = compliances[candidate] / compliances[begin:end].sum()
+            for j in range(size[candidate]):
+                expected = of_candidate * relevances[candidate, j] / relevances[candidate, : size[candidate]].sum()
+                # Five standard deviations.
+                assert abs(counts[candidate, j] / n - expected) < 5.0 * np.sqrt(expected * (1.0 - expected) / n)
+
+
+def rows_of(source, rows):
+    names = ("states", "actions", "rewards", "next_states", "terminated")
+    return replace(source, **{name: getattr(source, name)[rows] for name in names})
+
+
+@pytest.mark.parametrize("relevance", [True, False, "near"])
+def test_the_nearest_of_those_drawn_are_transferred(relevance):
+    sources, task = [source_of(0), source_of(1, 1, 3)], naive.target_task(POINTS, 2)
+    method = SampleTransfer(
+        sources, "injective", n_instances=80, min_transitions=30, breadth=0.3, relevance=relevance, bandwidths=BANDWIDTHS
+    )
+    observed(method, transitions_of(30), task)
+    assert Counter(method.candidates.origins[c].target_action for c in method.drawn[:, 0]) == {0: 40, 1: 40}
+    drawn_from, expected = ([], []), []
+    for candidate in np.unique(method.drawn[:, 0]).tolist():
+        number, action, state, signs, source_action = key_of(method, candidate)
+        # Instances are held by source action in an order of their own.
+        source = sources[number]
+        places = naive.places_of(source, stacked_instances([source]))
+        rows = (source.actions == source_action) & np.isin(places, method.drawn[method.drawn[:, 0] == candidate, 1])
+        drawn_from[action].append((rows_of(source, rows), InterTaskMapping(state, [source_action] * 2, signs), action))
+    for action in range(2):
+        expected += [naive.transferred(point, 0.0, drawn_from[action], task, 0.3) for point in POINTS]
+    found = transferred_to_all(method, task)
+    assert any(weights for weights, *_ in found)
+    for (weights, effects, rewards), naively in zip(found, expected, strict=True):
+        assert weights == pytest.approx([each[0] for each in naively])
+        np.testing.assert_allclose(effects, np.reshape([each[1] for each in naively], np.shape(effects)), atol=1e-12)
+        assert rewards == [each[2] for each in naively]
+
+
+def test_nothing_is_transferred_before_the_first_draw_and_draws_follow_growth():
+    task = naive.target_task(POINTS, 2)
+    method = bound(SampleTransfer(source_of(), min_transitions=20, max_transitions=30), task)
+    pairs, drawn_at = pairs_of(task), []
+    for i, transition in enumerate(transitions_of(60), start=1):
+        show(method, transition)
+        if i < 20:
+            assert not transferred_to_pairs(method, pairs, np.zeros(len(pairs))).length[: len(pairs)].any()
+        if len(changed_pairs(method)):
+            drawn_at.append(i)
+    assert drawn_at == [20, 24, 29] and method.mapping_steps() == 20
+    figures = method.statistics()
+    assert figures["transfer/draws"] == 3 and figures["transfer/instances_drawn"] == len(method.drawn) > 0
+    assert sum(n for _, n in method.drawn_counts()) == len(method.drawn)
+    assert len(method.drawn_counts()) == figures["transfer/candidates_drawn"]
+
+
+def test_most_of_what_is_drawn_by_compliance_alone_stays_when_there_are_a_few_more_transitions():
+    method = SampleTransfer(source_of(n=200), n_instances=100, min_transitions=100, relevance=False)
+    observed(method, transitions_of(100), naive.target_task(POINTS, 2))
+    before = {tuple(row) for row in method.drawn.tolist()}
+    for transition in transitions_of(20, seed=9):
+        show(method, transition)
+    after = {tuple(row) for row in method.drawn.tolist()}
+    assert method.statistics()["transfer/draws"] == 2 and len(before & after) > 0.8 * len(after)
+
+
+# The sums by which copies are judged, and the division that is chosen by them, against the equations and a full search.
+def all_divisions(members):
+    """Every set of disjoint copies."""
+    for size in range(members.shape[1] + 1):
+        for chosen in itertools.combinations(range(len(members)), size):
+            if (members[list(chosen)].sum(axis=0) <= 1).all():
+                yield chosen
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 9))
+def test_the_best_division_is_the_best_of_all(seed, n_variables, n_copies):
+    rng = np.random.default_rng(seed)
+    members = rng.random((n_copies, n_variables)) < 0.4
+    members[~members.any(axis=1), rng.integers(n_variables)] = True
+    scores, stays = rng.normal(size=n_copies), rng.normal(size=n_variables)
+
+    def total(chosen):
+        left = ~members[list(chosen)].any(axis=0) if chosen else np.ones(n_variables, dtype=bool)
+        return scores[list(chosen)].sum() + stays[left].sum()
+
+    found = prior_choice.best_division(members, scores, stays)
+    assert (members[found].sum(axis=0) <= 1).all()
+    assert total(tuple(found)) == pytest.approx(max(map(total, all_divisions(members))))
+
+
+def test_the_division_found_has_the_highest_score_of_all():
+    _, copies, sums, (states, actions, effects) = f.measured(2, 30, noise=0.02)
+    scales = running_scales(effects)
+    parts, stays = {}, {}
+    for copy in range(len(copies)):
+        has = copies.state[copy] >= 0
+        found = [f.predicted_by(copies, copy, u, states)[:, has] for u in range(3)]
+        each = np.array([prediction_compliances(effects[:, has], p, scales[:, has]) for p in found])
+        # The best source action of each target action, on its own.
+        part = np.empty(len(actions))
+        for a in np.unique(actions):
+            rows = actions == a
+            part[rows] = each[each[:, rows].mean(axis=1).argmax()][rows]
+        parts[copy] = part
+    for v in range(4):
+        stays[v] = prediction_compliances(effects[:, [v]], np.zeros((len(actions), 1)), scales[:, [v]])
+
+    def score(chosen):
+        left = [v for v in range(4) if not (copies.state[list(chosen), v] >= 0).any()]
+        return division_score(
+            [*(parts[c] for c in chosen), *(stays[v] for v in left)], actions, 4 - len(left), prior_choice.MIN_GAIN
+        )
+
+    found = prior_choice.choose_factored(copies, sums)
+    chosen = tuple(sorted({c for c in found.copies[0].tolist() if c >= 0}))
+    assert score(chosen) == pytest.approx(max(score(d) for d in all_divisions(copies.state >= 0)), rel=1e-6)
+
+
+@pytest.mark.parametrize(("n_copies", "order"), [(1, None), (2, (0, 2, 1, 3)), (2, (3, 0, 2, 1)), (3, (4, 1, 0, 5, 3, 2))])
+def test_copies_of_exact_dynamics_are_found_with_their_actions(n_copies, order):
+    mapping, copies, sums, _ = f.measured(n_copies, 100 * n_copies, order=order)
+    choice = prior_choice.choose_factored(copies, sums)
+    chosen = {tuple(copies.state[c].tolist()): u.tolist() for c, u in zip(choice.copies[0], choice.actions.T, strict=True)}
+    assert chosen == {tuple(copy.state_index.tolist()): list(copy.action) for copy in mapping.copies}
+
+
+def test_an_action_that_was_never_taken_has_no_source_action():
+    _, copies, _, (states, actions, effects) = f.measured(2, 200)
+    fresh = CopySums.zero(len(copies), 3, 5, 4)
+    for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
+        if action != 3:
+            copies.measure(state, action, effect, fresh, False)
+    choice = prior_choice.choose_factored(copies, fresh)
+    assert (choice.actions[3] == -1).all() and (np.delete(choice.actions, 3, axis=0) >= 0).all()
+    assert copies.uses(*choice).complete.tolist() == [True, True, True, False, True]
+    single = prior_choice.choose_mapping(copies, fresh, np.ones((len(copies), 5, 3), dtype=bool))
+    assert (single.copies[3], single.actions[3]) == (-1, -1)
+
+
+def test_one_mapping_for_each_action_is_the_best_that_is_allowed():
+    _, copies, sums, _ = f.measured(2, 200, noise=0.01, whole=True)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        allowed = rng.random((len(copies), 5, 3)) < 0.2
+        choice = prior_choice.choose_mapping(copies, sums, allowed)
+        mean = np.where(allowed, sums.compliance / sums.n[:, None], -1.0)
+        for a, (copy, u) in enumerate(zip(choice.copies[:, 0], choice.actions[:, 0], strict=True)):
+            assert mean[copy, a, u] == mean[:, a].max()
+
+
+def test_what_is_drawn_is_allowed_and_of_every_kind():
+    _, copies, _, _ = f.measured(2, 1)
+    allowed = np.zeros((len(copies), 5, 3), dtype=bool)
+    allowed[[2, 4], :, 1] = allowed[4, 2] = True
+    rng = np.random.default_rng(0)
+    drawn = [prior_choice.draw_mapping(copies, allowed, rng) for _ in range(50)]
+    assert {(int(c), int(u)) for each in drawn for c, u in zip(each.copies[2], each.actions[2], strict=True)} == {
+        *((2, 1), (4, 0), (4, 1), (4, 2))
+    }
+    seen = set()
+    for _ in range(150):
+        choice = prior_choice.draw_factored(copies, 5, rng)
+        assert choice.copies.shape == choice.actions.shape == (5, 2)
+        assert ((copies.state[choice.copies[0]] >= 0).sum(axis=0) == 1).all()
+        seen.add(frozenset(choice.copies[0].tolist()))
+        assert (choice.copies == choice.copies[0]).all() and (choice.actions >= 0).all()
+    # Three ways to make pairs of four variables, and each pair either way round.
+    assert len(seen) == 12
+
+
+def test_compliances_are_those_of_the_equations():
+    _, copies, sums, (states, actions, effects) = measured(2, 40, noise=0.01)
+    scales = running_scales(effects)
+    for copy in (0, 3, 11, 12, 19):
+        has = copies.state[copy] >= 0
+        for u in range(3):
+            predicted = predicted_by(copies, copy, u, states)[:, has]
+            each = prediction_compliances(effects[:, has], predicted, scales[:, has])
+            errors = (predicted - effects[:, has]) ** 2
+            for a in range(5):
+                rows = actions == a
+                np.testing.assert_allclose(sums.compliance[copy, a, u], each[rows].sum(), rtol=1e-6)
+                np.testing.assert_allclose(sums.error[copy, a, u, has], errors[rows].sum(axis=0), rtol=1e-5)
+    for a in range(5):
+        stays = [
+            prediction_compliances(effects[:, [v]], np.zeros((40, 1)), scales[:, [v]])[actions == a].sum() for v in range(4)
+        ]
+        np.testing.assert_allclose(sums.stay[a], stays)
+
+
+def test_with_whole_mappings_compliance_is_over_all_variables_those_unmapped_stay():
+    _, copies, sums, (states, actions, effects) = measured(2, 25, noise=0.01, whole=True)
+    scales = running_scales(effects)
+    each = prediction_compliances(effects, np.nan_to_num(predicted_by(copies, 3, 1, states)), scales)
+    np.testing.assert_allclose(sums.compliance[3, :, 1], [each[actions == a].sum() for a in range(5)], rtol=1e-6)
+
+
+def test_what_is_unexplained_is_compared_with_what_the_target_moves_so_far_within_what_the_source_does():
+    _, copies, sums, (states, actions, effects) = measured(2, 40, noise=0.01)
+    [source] = copies.sources
+    sizes = np.abs(source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))
+    low = np.median(sizes, axis=0)
+    high = np.max([np.median(sizes[source.actions == u], axis=0) for u in range(3)], axis=0)
+    for copy, u in ((0, 0), (3, 2), (11, 1), (12, 1), (19, 0)):
+        v = int(np.flatnonzero(copies.state[copy] >= 0)[-1])
+        k, predicted = copies.state[copy, v], predicted_by(copies, copy, u, states)[:, v]
+        expected = np.zeros(5)
+        for i, action in enumerate(actions.tolist()):
+            seen = [np.abs(effects[: i + 1, v][actions[: i + 1] == a]) for a in range(5)]
+            motion = max(each.mean() for each in seen if len(each))
+            compared = max(effects[i, v] ** 2, (0.25 * min(max(motion, low[k]), high[k])) ** 2)
+            expected[action] += covered(copies, states[[i]], copy, u) * min(
+                2.0, (effects[i, v] - predicted[i]) ** 2 / compared
+            )
+        np.testing.assert_allclose(sums.unexplained[copy, :, u, v], expected, rtol=1e-4, err_msg=str((copy, v, u)))
+
+
+def covered(copies, state, copy, u):
+    """The weight of the source's data at a state, at most 1."""
+    uses = copies.uses(np.array([[copy]]), np.array([[u]]))
+    return min(1.0, copies.predict(uses, copies.work_space(uses), state, np.array([0]))[3][0])
