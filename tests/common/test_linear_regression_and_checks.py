@@ -63,17 +63,6 @@ def test_a_fit_is_the_one_of_least_squares_also_without_an_instance_that_was_tak
 
 
 @repeatable
-@given(st.integers(0, 10**6), st.integers(1, 6))
-def test_effects_that_are_linear_are_found_exactly_if_there_are_more_instances_than_variables(seed, d):
-    rng = np.random.default_rng(seed)
-    weights, states, _ = random_list(seed, d, 4 * d + 4)
-    slopes, intercept = rng.normal(size=(d, d)), rng.normal(size=d)
-    found_intercept, found_slopes = linear_fit(weights, states, intercept + states @ slopes, 1e-12)
-    np.testing.assert_allclose(found_slopes, slopes, atol=1e-6)
-    np.testing.assert_allclose(found_intercept, intercept, atol=1e-6)
-
-
-@repeatable
 @given(problems)
 def test_what_a_fit_leaves_unexplained_is_the_narrower_mean_of_the_residuals(problem):
     seed, d, n, ridge = problem

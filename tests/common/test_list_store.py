@@ -81,19 +81,6 @@ def test_a_list_store_has_the_lists_of_a_dict_of_lists(steps, capacity):
     assert_slots_are_apart(store)
 
 
-def test_a_store_without_room_stays_as_it_is_until_it_has_grown():
-    store = ListStore.empty(2, 4)
-    assert len(store.entries(0)[0]) == 0
-    for item in range(4):
-        assert append(store, 0, item, float(item)) and store.with_room() is store
-    assert not append(store, 1, 9, 9.0) and not append(store, 0, 9, 9.0)
-    larger = store.with_room()
-    assert larger is not store and larger.with_room() is larger
-    for one in (store, larger):
-        np.testing.assert_array_equal(one.entries(0), (np.arange(4), np.arange(4.0)))
-        assert len(one.entries(1)[0]) == 0
-
-
 def test_slots_that_longer_lists_have_left_are_used_again():
     n = 10
     store = ListStore.empty(2 * n, 256)

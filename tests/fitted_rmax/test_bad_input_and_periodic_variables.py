@@ -17,7 +17,7 @@ from sb3_combrel import FittedRMax
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.loop_detection import small_cell
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
-from sb3_combrel.planning.grid import StateGrid, fitting_grid
+from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.tensorboard.plane import plane_through
 
 
@@ -80,19 +80,6 @@ def test_infinite_observation_bounds_need_the_bounds_argument():
     assert model.agent.grid.n_points == 9**4
 
 
-@pytest.mark.parametrize(
-    ("bounds", "expected"),
-    [
-        *[(([-1.0, 0.0], [1.0]), "2"), (("low", "high"), "bounds"), ((False, True), "bounds must be")],
-        (([-1.0, False], [1.0, 2.0]), "bounds must be"),
-    ],
-)
-def test_bounds_that_do_not_fit_are_refused(bounds, expected):
-    with pytest.raises(ValueError, match="bounds") as error:
-        FittedRMax(Scripted(), bounds=bounds)
-    assert expected in str(error.value) and "\n" not in str(error.value)
-
-
 def states_and_effects(model):
     """Of all instances, unit coordinates."""
     rows = model.agent.model.instances.rows()
@@ -108,12 +95,6 @@ def test_observations_outside_the_bounds_count_as_the_boundary_with_one_warning(
     states, effects = states_and_effects(model)
     assert len(states) == 40 and ((states >= 0.0) & (states <= 1.0)).all()
     assert (np.abs(states + effects - 0.5) <= 0.5 + 1e-12).all()
-
-
-def test_observations_within_the_bounds_give_no_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        FittedRMax(Scripted(), seed=0).learn(40)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -137,6 +118,7 @@ def test_what_is_not_finite_is_refused(what, value):
         *[("model_breadth", -0.1), ("gamma", "three"), ("degree", 2), ("max_value", None), ("resolution", [2, 2, 2])],
         *[("periodic", [True]), ("seed", 2**32), ("seed", -1), ("stats_window_size", 0), ("stats_window_size", 1.5)],
         *[("verbose", "loud"), ("verbose", None), ("tensorboard_log", 3)],
+        *[("bounds", (False, True)), ("bounds", ([-1.0, False], [1.0, 2.0]))],
     ],
 )
 def test_wrong_arguments_of_the_constructor_are_refused_by_name(name, value):
@@ -346,12 +328,6 @@ def test_an_attribute_of_that_name_that_means_something_else_is_not_used(of_no_u
     env = Ring()
     env.periodic = of_no_use
     assert FittedRMax(env, seed=0, resolution=4).agent.periodic == (False, False)
-
-
-def test_a_grid_has_no_end_and_no_margin_along_a_periodic_variable():
-    grid = fitting_grid(2, 2, 3, 0.2, 0.01, (True, False))
-    assert grid.arrays.shape.tolist() == [8, 8 + 1 + 2] and grid.arrays.margin.tolist() == [0.0, 1.0]
-    assert grid.points()[:, 0].max() == 7 / 8
 
 
 @pytest.mark.parametrize(("across", "up"), [(0, 1), (1, 0)])

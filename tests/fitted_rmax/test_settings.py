@@ -52,12 +52,6 @@ def test_an_agent_refuses_a_resolution_that_does_not_fit_its_task(value):
         make_agent(2, 4, resolution=value)
 
 
-@pytest.mark.parametrize("flags", [True, [True], [True, 0], "ab"])
-def test_an_agent_refuses_flags_that_do_not_fit_its_task(flags):
-    with pytest.raises(ValueError, match="periodic must be None or 2 booleans"):
-        make_agent(2, 2, periodic=flags)
-
-
 def test_an_agent_refuses_a_transfer_method_that_does_not_fit_its_task():
     with pytest.raises(ValueError, match="target"):
         make_agent(3, 4, TIMBREL(square_source(), SAME))

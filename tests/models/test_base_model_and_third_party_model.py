@@ -1,6 +1,5 @@
 """The defaults of the base class of models, which need ``predict`` alone, against the kernel average and plain loops."""
 
-import inspect
 
 import numpy as np
 import pytest
@@ -204,12 +203,6 @@ def transfer(request):
 
 def third_party(transfer, env=None, **kwargs):
     return small(env, transfer=transfer(), policy_kwargs={"model_class": NearestNeighbour}, **kwargs)
-
-
-def test_a_third_party_model_has_at_most_forty_lines():
-    assert len(inspect.getsource(NearestNeighbour).splitlines()) <= 40
-    assert NearestNeighbour.__abstractmethods__ == frozenset() and Model.__abstractmethods__ == {"predict"}
-    assert [name for name in vars(NearestNeighbour) if not name.startswith("_")] == ["predict"]
 
 
 def test_a_third_party_model_learns_the_shortest_plan(transfer):

@@ -70,17 +70,6 @@ def test_a_transition_or_a_lower_threshold_changes_the_rows_of_the_pairs_that_ar
     ]
 
 
-def test_a_pair_stays_known_when_a_nearer_instance_shortens_its_list_below_the_threshold():
-    model, naive = kernel_models.model_and_definition(((1,), 0), dict(breadth=0.5, min_weight=0.01, min_fraction=0.6))
-    pair = 1  # the grid point 0.5, action 0
-    kernel_models.learn_both(model, naive, [(np.array([0.1]), 0, -1.0, np.array([0.2]), False)] * 2)
-    assert model.known[pair] and model.own_weight[pair] > 1.0
-    kernel_models.learn_both(model, naive, [(np.array([0.45]), 0, -2.0, np.array([0.95]), False)])
-    assert model.own_weight[pair] < 1.0, "the case that this test is about"
-    assert model.known[pair] and model.mdp.arrays.modelled[pair]
-    assert model.mdp.arrays.reward[pair] == pytest.approx(-2.0), "its row is that of the instance now kept"
-
-
 BREADTH, MIN_FRACTION = 0.2, 0.1
 STATE = np.array([0.5, 0.5])
 
@@ -93,19 +82,6 @@ def add_weighing(model, weight, angle=0.0):
     """An instance of action 0 that weighs so much at ``STATE``."""
     start = STATE + BREADTH * np.sqrt(-np.log(weight)) * np.array([np.cos(angle), np.sin(angle)])
     model.add(start, 0, -weight, start + 0.05, False)
-
-
-def test_an_exact_state_is_known_when_a_nearer_instance_shortens_its_list():
-    model = new_model()
-    # Then 0.8535 + 0.12 is below the threshold, and 0.0965 below a tenth of it: the list is cut there.
-    for weight in (0.8535, 0.0965, 0.096, 0.12):
-        add_weighing(model, weight)
-    prediction, _ = model.predict_at(STATE)
-    assert prediction.modelled[0] and prediction.weight[0] == 1.0
-    kept = np.array([0.8535, 0.12])
-    assert prediction.length[0] == 2
-    np.testing.assert_allclose(prediction.probability[0, :2], kept / kept.sum())
-    np.testing.assert_allclose(prediction.reward[0], -(kept**2).sum() / kept.sum())
 
 
 @settings(deadline=None, derandomize=True, max_examples=50)

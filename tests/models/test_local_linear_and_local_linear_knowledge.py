@@ -54,22 +54,6 @@ def test_the_prediction_at_any_state_is_that_of_the_definition(problem, claims, 
             np.testing.assert_array_equal(predictions.effect[action, 0], prediction.effect[action, 0])
 
 
-def test_what_was_asked_for_before_does_not_change_a_prediction():
-    grid, kernel = ((2, 2), 1, (True, False)), linear_models.LINEAR_KERNELS[0]
-    rng, states = np.random.default_rng(0), []
-    model = linear_models.make_linear_model(grid, kernel)
-    for transition in random_transitions(5, 2, 90):
-        model.add(*transition)
-        states.append(rng.random(2))
-        model.predict_at(states[-1])
-    fresh = linear_models.make_linear_model(grid, kernel)
-    for transition in random_transitions(5, 2, 90):
-        fresh.add(*transition)
-    for state in states[::-10]:
-        for one, other in zip(model.predict_at(state)[0], fresh.predict_at(state)[0], strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
 @slow_and_repeatable
 @given(problems, all_claims, st.sampled_from([1.0, 0.9]), st.sampled_from([1, 3, 50]), st.booleans())
 def test_what_is_known_sums_fits_and_rows_are_those_of_the_definition(problem, claims, gamma, max_model_steps, small):
@@ -96,17 +80,6 @@ def test_what_is_known_sums_fits_and_rows_are_those_of_the_definition(problem, c
     modelled = (model.known | model.fits.claimed).reshape(N_ACTIONS, -1)
     np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
     assert len(model.end_episode()) == 0, "nothing has happened since"
-
-
-@pytest.mark.parametrize("grid", [((3,), 0), ((2, 2), 0, (True, False))], ids=str)
-def test_sums_and_rows_are_right_after_arrays_have_grown(grid):
-    model, naive = linear_models.linear_model_and_definition(grid, linear_models.LINEAR_KERNELS[1])
-    capacity = model.instances.capacity
-    linear_models.learn_linear(model, naive, random_transitions(2, len(grid[0]), 150))
-    assert model.instances.capacity > capacity
-    linear_models.finish_episode(model)
-    linear_models.assert_same_sums(model, naive)
-    assert linear_models.assert_same_fits(model, naive) > 10
 
 
 @slow_and_repeatable
@@ -151,9 +124,6 @@ def test_most_instances_that_agree_with_the_fit_change_no_row():
     for state in rng.random((400, 2)):
         n_changed.append(len(model.add(state, 0, -1.0, state + 0.1 + 0.05 * state, False)))
     assert np.mean(n_changed[200:]) < 0.2 * np.mean(n_changed[:20])
-
-
-BROAD = dict(breadth=0.5, min_weight=0.05, n_neighbors=20, outcome_breadth=0.05)
 
 
 # What decides what the local linear model knows narrows as long as no outcome has told states apart.

@@ -41,13 +41,6 @@ def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_eve
     assert_same_as_definition(model, naive)
 
 
-@pytest.mark.parametrize("grid", [((3,), 1), ((2, 2), 0, (False, True))], ids=str)
-def test_sums_and_rows_stay_right_over_many_replacements(grid):
-    model, naive = linear_models.linear_model_and_definition(grid, linear_models.LINEAR_KERNELS[1], max_instances=12)
-    linear_models.learn_linear(model, NaiveReplacement(naive, 12), random_transitions(4, len(grid[0]), 150))
-    assert assert_same_as_definition(model, naive) > 0
-
-
 def test_sums_and_rows_stay_right_where_many_instances_have_the_same_state():
     rng = np.random.default_rng(1)
     states = rng.random((3, 2))
@@ -59,30 +52,6 @@ def test_sums_and_rows_stay_right_where_many_instances_have_the_same_state():
             model, expected, [(state, 0, rng.normal(), state + 0.1 * rng.normal(size=2), rng.random() < 0.2)]
         )
     assert assert_same_as_definition(model, naive) > 0
-
-
-def test_pairs_that_lose_all_their_instances_become_unknown_and_can_be_known_again():
-    kernel = dict(breadth=0.1, min_weight=0.05, n_neighbors=2, outcome_breadth=0.05)
-    model = linear_models.make_linear_model(((3,), 0), kernel, max_instances=4, n_actions=1)
-    point = 4  # at 0.5
-
-    def add(at, terminated=False):
-        learn(model, [(np.array([at]), 0, -1.0, np.array([at + 0.1]), terminated)])
-
-    for number in range(4):
-        # An end, so that a part of the threshold is enough from then on.
-        add(0.5, terminated=number == 0)
-    assert model.known[point] and model.mdp.arrays.modelled[point] and model.fits.reach[point] == 0.0
-    # One after the other is replaced by one farther away.
-    for at in (0.9, 0.1, 0.45, 0.56, 0.3):
-        add(at)
-        assert model.known[point], "an instance within reach is left"
-    add(0.72)
-    np.testing.assert_allclose(np.sort(model.instances.state[0, :4, 0]), [0.1, 0.3, 0.72, 0.9])
-    assert not model.known[point] and not model.mdp.arrays.modelled[point]
-    assert model.own_weight[point] == 0.0 and (model.fits.sums[point] == 0.0).all()
-    add(0.51)
-    assert model.known[point] and model.mdp.arrays.modelled[point], "the narrow kernel of former times is forgotten"
 
 
 def test_rewards_are_those_of_the_instances_left_however_little_these_weigh():

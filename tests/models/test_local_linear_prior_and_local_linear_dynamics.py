@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.kernel_models import N_ACTIONS, learn, make_model, random_transitions
-from helpers.linear_models import LinearDynamics, StubPrior, finish_episode, make_linear_model, nothing, renew
+from helpers.kernel_models import N_ACTIONS, learn, make_model
+from helpers.linear_models import LinearDynamics, StubPrior, finish_episode, make_linear_model, renew
 
 from sb3_combrel.models.linear_fits import PRIOR_OUTCOME_WEIGHT
 
@@ -65,14 +65,6 @@ def test_a_prior_is_asked_again_when_its_version_has_grown_and_only_then():
         left_over = [one.effect(state, action) - other.effect(state, action) for state in states]
         np.testing.assert_allclose(model.fits.target[action, :size], left_over, atol=1e-12)
     assert len(model.renew_prior()) == 0
-
-
-def test_a_model_with_a_prior_asks_for_no_transferred_instances():
-    # The stub has no such methods.
-    model = model_with_prior(StubPrior(LinearDynamics(0, 2).effect, nothing))
-    learn(model, random_transitions(0, 2, 20))
-    assert model.predict_at(np.array([0.5, 0.5]))[1] is None and len(model.outdated()) > 0
-    model.update_rows(model.outdated())
 
 
 # What the local linear model makes of dynamics of a known kind: linear ones, and a wall.

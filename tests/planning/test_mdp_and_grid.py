@@ -9,7 +9,7 @@ from helpers.naive_fitted_rmax import NaiveGrid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel.planning.grid import StateGrid, fitting_grid
+from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
 
 
@@ -120,23 +120,6 @@ def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, exp
     assert mdp.arrays.reward[2] == pytest.approx(2 * reward)
 
 
-def test_the_stores_grow_and_keep_the_rows_that_were_written_before():
-    mdp, naive = make_mdp(((4, 4), 0))
-    rows, predecessors = len(mdp.arrays.rows.item), len(mdp.arrays.predecessors.item)
-    rng, pairs = np.random.default_rng(0), np.arange(N_ACTIONS * mdp.grid.n_points)
-    probability, effect, reward = random_predictions(rng, len(pairs), 40, 2)
-    for some in np.array_split(pairs, 7):
-        write(mdp, some, probability[some], effect[some], reward[some])
-    assert len(mdp.arrays.rows.item) > rows and len(mdp.arrays.predecessors.item) > predecessors
-    for pair in rng.choice(pairs, 60, replace=False).tolist():
-        action, point = divmod(pair, mdp.grid.n_points)
-        expected_reward, others = without_staying(
-            reward[pair], naive_row(naive, point, probability[pair], effect[pair]), point, gamma=1.0
-        )
-        assert mdp.arrays.reward[pair] == pytest.approx(expected_reward, abs=1e-9)
-        assert_same_row(row_of(mdp, point, action), others)
-
-
 # The grid of states against plain loops: its points, interpolation between them, and its size.
 @settings(deadline=None, derandomize=True, max_examples=20)
 @given(st.sampled_from(GRIDS), st.integers(0, 10**6))
@@ -149,10 +132,6 @@ def test_interpolation_is_multilinear_between_grid_points_and_constant_beyond_th
     for state in rng.uniform(-0.8, 1.8, (10, own.n_variables)):
         expected = sum(weight * values[point] for point, weight in naive.corners(state).items())
         assert own.interpolate(values, state) == pytest.approx(expected, abs=1e-12)
-
-
-def test_one_resolution_counts_for_all_variables():
-    np.testing.assert_array_equal(StateGrid(3, 2).points(), StateGrid(3, (2, 2, 2)).points())
 
 
 @pytest.mark.parametrize(("n_variables", "breadth"), [(1, 0.09), (2, 0.09), (2, 0.02), (3, 0.15), (4, 0.2)])

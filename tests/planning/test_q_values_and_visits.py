@@ -101,20 +101,6 @@ def test_below_the_threshold_an_action_has_the_bound_interpolated_between_grid_p
     assert (line.q_values(0.3) == 0.0).all()
 
 
-def test_staying_is_worth_the_state_s_own_q_and_not_the_interpolated_value(line):
-    line.learn(0.5, 0.0)
-    line.learn(0.5, 0.1)
-    # q = -1 + q / 2 + V(0.6) / 2
-    assert line.q(0.5) == pytest.approx(2 * (-1.0 - 0.5 * (4 * 0.6 + 1)))
-
-
-def test_staying_for_ever_is_worth_the_bound_on_the_side_of_the_reward(line):
-    line.learn(0.5, 0.0)
-    assert line.q(0.5) == -100.0
-    line.learn(0.5, 0.0, reward=0.0, action=1)
-    assert line.q_values(0.5)[1] == 0.0
-
-
 def test_pushing_against_the_edge_of_the_grid_is_staying():
     agent, _ = agent_and_definition(3, 1, breadth=0.5, min_fraction=0.01)
     agent.planner.bounds = (-100.0, 0.0)
@@ -132,20 +118,6 @@ def test_asking_for_q_changes_nothing_and_gives_an_array_of_the_caller_s_own(lin
     np.testing.assert_array_equal(first, expected)
     np.testing.assert_array_equal(line.q_values(0.52), expected)
     assert_same_state(line.agent, before)
-
-
-def test_q_does_not_depend_on_the_states_asked_for_before():
-    """A search starts from what the last one found; wherever that was, the result is the same bit for bit."""
-    rng = np.random.default_rng(3)
-    agent, _ = agent_and_definition(2, 3, breadth=0.15, min_fraction=0.05)
-    for state in np.round(rng.random((150, 2)) * 12) / 12:
-        agent.model.add(state, int(rng.integers(N_ACTIONS)), -1.0, np.clip(state + 0.05, 0, 1), False)
-    values, untouched = rng.normal(size=len(agent.planner.values)) - 5.0, copy.deepcopy(agent)
-    queries = np.round(rng.random((20, 2)) * 24) / 24
-    first = [agent.q_values(state, values) for state in queries]
-    for number in rng.permutation(len(queries)):
-        np.testing.assert_array_equal(agent.q_values(queries[number], values), first[number])
-    np.testing.assert_array_equal(untouched.q_values(queries[7], values), first[7])
 
 
 HERE, ELSEWHERE = np.array([0.3]), np.array([0.7])
@@ -259,19 +231,6 @@ def test_the_agent_makes_pairs_known_that_it_has_visited_often_enough():
     assert agent.mdp.arrays.modelled[pairs].all() and (agent.mdp.arrays.n_optimistic[points] == 0).all()
     agent.act(STATE)
     assert agent.visits.counts[points].tolist() == [ENOUGH_VISITS] * len(points), "they are not optimistic any more"
-
-
-@pytest.mark.filterwarnings("ignore:resolution")
-def test_evaluating_counts_no_visits():
-    agent = agent_beside_unknown_points()
-    agent.model.known[:] = False
-    agent.model.update_rows(np.arange(len(agent.model.known)))
-    agent.act(STATE, explore=False)
-    agent.q_values(STATE)
-    agent.sample_action(STATE)
-    assert not agent.visits.counts.any()
-    agent.act(STATE)
-    assert agent.visits.counts.any()
 
 
 @pytest.mark.filterwarnings("ignore:resolution")

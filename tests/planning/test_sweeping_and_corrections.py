@@ -382,15 +382,6 @@ def test_a_value_that_is_not_too_high_is_not_corrected():
     assert len(corrections.rows()) == 0 and not corrections.visits.any()
 
 
-def test_each_visit_renews_the_correction_of_its_cell():
-    values = np.zeros(GRID.n_points)
-    corrections = visit(values, CorrectionArrays.empty(2), (0.3, 0.4), -3.0, times=MAX_VISITS + 1)
-    for best_q in (-4.0, -7.5, -5.0):
-        corrections = visit(values, corrections, (0.3, 0.4), best_q)
-        assert value_at(values, corrections, (0.3, 0.4)) == pytest.approx(best_q)
-    assert len(corrections.rows()) == 1
-
-
 def test_a_correction_counts_in_its_cell_only_and_never_raises_a_value():
     rng = np.random.default_rng(0)
     values, corrected = -10.0 * rng.random(GRID.n_points), np.array([0.3, 0.4])

@@ -7,7 +7,7 @@ import threading
 
 import numpy as np
 import pytest
-from helpers.walk import GOAL, METHODS, OBSERVATIONS, STRIDE, Walk, same_parameters, small, stored
+from helpers.walk import GOAL, METHODS, OBSERVATIONS, STRIDE, Walk, same_parameters, small
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -285,15 +285,6 @@ def test_pairs_that_are_known_by_history_alone_are_saved(tmp_path):
     assert (agent_model.known & (agent_model.own_weight < 1.0)).any(), "the case that this test is about"
     model.save(tmp_path / "model")
     np.testing.assert_array_equal(FittedRMax.load(tmp_path / "model").agent.model.known, agent_model.known)
-
-
-def test_a_full_model_with_a_cap_on_instances_survives_saving(make, tmp_path):
-    model = make(max_instances=10).learn(100)
-    assert model.agent.model.n_instances <= 20
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk())
-    np.testing.assert_array_equal(stored(loaded), stored(model))
-    assert loaded.learn(100).agent.model.n_instances <= 20
 
 
 def test_a_saved_model_can_be_loaded_for_more_environments(tmp_path):

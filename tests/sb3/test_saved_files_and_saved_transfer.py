@@ -313,31 +313,6 @@ def transferred_by(method):
     return [array[: 2 * len(points)][there] for array in (found.weight, found.effect, found.reward)]
 
 
-@pytest.mark.parametrize(
-    ("name", "steps"), [("COMBREL", 0), ("first episode", 13), *((n, 47) for n in ("TIMBREL", "two sources", "drawn"))]
-)
-def test_choices_compliance_and_transferred_instances_are_the_same_at_once(name, steps, tmp_path):
-    model = small(transfer=VARIANTS[name]())
-    if steps:
-        model.learn(steps)
-    model.save(tmp_path / "model")
-    ours, theirs = model.policy.transfer, FittedRMax.load(tmp_path / "model").policy.transfer
-    pairs = np.arange(2 * model.agent.grid.n_points)
-    np.testing.assert_array_equal(ours.choices(), theirs.choices())
-    if isinstance(ours, COMBREL):
-        np.testing.assert_array_equal(ours.chosen_compliance(pairs), theirs.chosen_compliance(pairs))
-        assert (ours.choices() >= 0).any() == (steps == 47 or (steps > 0 and ours.measured == "online"))
-    for method in (ours, theirs):
-        method.changed(np.zeros((2, model.agent.grid.n_points), dtype=bool))
-    for one, other in zip(transferred_by(ours), transferred_by(theirs), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert ours.statistics() == theirs.statistics()
-    for one, other in zip(ours.sources, theirs.sources, strict=True):
-        np.testing.assert_array_equal(one.states, other.states)
-        np.testing.assert_array_equal(one.rewards, other.rewards)
-        assert (one.state_names, one.action_names, one.origin) == (other.state_names, other.action_names, other.origin)
-
-
 def test_the_file_of_a_model_contains_the_source(tmp_path):
     path = walk_source().save(tmp_path / "source.npz")
     model = small(transfer={"sb3_combrel.COMBREL": {"source": str(path), "n_neighbors": 2}}).learn(40)

@@ -78,17 +78,6 @@ def test_of_normalized_rewards_the_original_ones_are_stored(tmp_path):
     assert (stored(model.learn(50))[:, 4] == -1.0).all()
 
 
-def test_get_vec_normalize_env_returns_the_normalizing_environment(tmp_path):
-    env = VecNormalize(DummyVecEnv([Walk]), norm_obs=False)
-    model = small(env).learn(10)
-    assert model.get_vec_normalize_env() is env
-    model.save(tmp_path / "model")
-    assert FittedRMax.load(tmp_path / "model").get_vec_normalize_env() is None
-    assert FittedRMax.load(tmp_path / "model", env=env).get_vec_normalize_env() is env
-    model.set_env(DummyVecEnv([Walk]))
-    assert model.get_vec_normalize_env() is None
-
-
 def test_set_env_goes_on_with_what_was_learned():
     model, other = small().learn(20), DummyVecEnv([Walk])
     model.set_env(other)
