@@ -1,6 +1,5 @@
 """The defaults of the base class of models, which need ``predict`` alone, against the kernel average and plain loops."""
 
-
 import numpy as np
 import pytest
 import torch as th

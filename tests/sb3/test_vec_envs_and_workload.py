@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers.walk import METHODS, Recorder, Walk, small, stored
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_combrel import FittedRMax
@@ -41,13 +40,6 @@ def test_the_true_last_observation_is_stored_and_a_time_limit_is_not_terminal(n_
     np.testing.assert_array_equal(rows[:, 5] > 0, rows[:, 2] > 0.9 - 1e-6)
     assert rows[:, 5].any(), "some episodes reached the goal"
     assert model._episode_num > rows[:, 5].sum(), "and some ran into the limit"
-
-
-def test_monitors_episodes_are_those_of_the_model(tmp_path):
-    model = small(Monitor(Walk(), str(tmp_path / "monitor"))).learn(100)
-    lengths = [int(line.split(",")[1]) for line in (tmp_path / "monitor.monitor.csv").read_text().splitlines()[2:]]
-    assert sum(lengths) <= 100 < sum(lengths) + 30
-    assert [info["l"] for info in model.ep_info_buffer] == lengths and len(lengths) == model._episode_num
 
 
 def test_normalized_observations_are_refused_by_constructor_set_env_and_load(tmp_path):
