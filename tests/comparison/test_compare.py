@@ -160,7 +160,6 @@ GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
         (dict(seeds=[]), "seeds must be different whole numbers"),
         (dict(seeds=[1, 1]), "seeds must be different whole numbers"),
         (dict(seeds=[-1]), "seeds must be a whole number from 0"),
-        (dict(seeds="ten"), "seeds must be a whole number"),
         (dict(steps=0), "steps must be a whole number"),
         (dict(n_jobs=0), "n_jobs must be a whole number"),
         (dict(threshold=np.inf), "threshold must be a finite number"),

@@ -51,19 +51,6 @@ def test_rows_of_different_lengths_are_filled_with_nan():
     assert CURVES.first_episodes(2).returns.shape == (3, 2)
 
 
-def test_measures_of_an_example():
-    np.testing.assert_allclose(initial_return(CURVES, 2), [-7.0, -8.0, -4.5])
-    np.testing.assert_allclose(asymptotic_return(CURVES, 2), [-3.0, -2.0, -1.5])
-    np.testing.assert_allclose(total_reward(CURVES), [-15.0, -18.0, -12.0])
-    np.testing.assert_allclose(total_reward(CURVES, 1), [-9.0, -8.0, -6.0])
-    # Fifteen steps: the whole first run, 8 + 7 at -8 of the second, 6 + 3 + 3 + 3 of the third.
-    np.testing.assert_allclose(total_reward_by_steps(CURVES), [-81 - 25 - 1, -8 * 15, -36 - 9 - 9 - 0])
-    np.testing.assert_allclose(total_reward_by_steps(CURVES, 10), [-81 - 5, -80, -36 - 9 - 3])
-    np.testing.assert_allclose(time_to_threshold(CURVES, -3.0, 3), [INF, 20.0, 12.0])
-    np.testing.assert_allclose(time_to_threshold(CURVES, -3.0, 1), [15.0, 18.0, 9.0])
-    np.testing.assert_allclose(time_to_threshold(CURVES, -2.0, 4), [INF, 22.0, INF])
-
-
 @quick
 @given(learning_curves(), st.integers(-60, 60), st.integers(1, 4))
 def test_measures_are_those_of_a_slow_computation(rows, threshold, window):
@@ -75,10 +62,10 @@ def test_measures_are_those_of_a_slow_computation(rows, threshold, window):
     for run, (own_returns, own_steps) in enumerate(zip(returns, steps, strict=True)):
         assert first[run] == pytest.approx(sum(own_returns[:3]) / 3)
         assert last[run] == pytest.approx((own_returns[-1] + own_returns[-2]) / 2)
-        assert areas[run] == sum(own_returns[:shortest])
+        assert areas[run] == sum(own_returns[:shortest]) and total_reward(curves, 2)[run] == sum(own_returns[:2])
         # One environment step after the other.
         at_step = [value for value, n in zip(own_returns, own_steps, strict=True) for _ in range(n)]
-        assert by_steps[run] == sum(at_step[:fewest])
+        assert by_steps[run] == sum(at_step[:fewest]) and total_reward_by_steps(curves, 2)[run] == sum(at_step[:2])
         expected = INF
         for end in range(len(own_returns), window - 1, -1):
             if np.median(own_returns[end - window : end]) >= threshold:
@@ -93,20 +80,6 @@ def simulated(rng, rate, n_runs=10, n_episodes=30):
     return LearningCurves(-steps, steps)
 
 
-def test_faster_learning_shows_in_every_measure_but_the_last_performance():
-    rng = np.random.default_rng(0)
-    fast, slow = simulated(rng, 0.8), simulated(rng, 0.1)
-    measures = compare_learning(fast, slow, threshold=-40.0)
-    for name in ("jumpstart", "total_reward", "total_reward_by_steps", "transfer_ratio", "transfer_ratio_by_steps"):
-        comparison = getattr(measures, name)
-        assert comparison.higher_is_better and 0.0 < comparison.low < comparison.effect < comparison.high, name
-        assert comparison.p_value < 0.001, name
-    time = measures.time_to_threshold
-    assert not time.higher_is_better and time.low < time.effect < time.high < 0.0
-    # At the end, the slow ones still have 80 * exp(-2.45) = 7 steps more.
-    assert 0.0 < measures.asymptotic_performance.effect < 12.0
-
-
 def test_effects_are_tested_and_measured_by_the_statistics_of_the_package():
     rng = np.random.default_rng(1)
     first, second = simulated(rng, 0.3, n_runs=7), simulated(rng, 0.2, n_runs=6)
@@ -115,6 +88,13 @@ def test_effects_are_tested_and_measured_by_the_statistics_of_the_package():
     jumpstart = measures.jumpstart
     assert jumpstart[2:5] == tuple(bootstrap_difference(one, other, "mean", 500, 9))
     assert jumpstart.p_value == p_value_of_difference(one, other, "permutation", 9)
+    last = bootstrap_difference(asymptotic_return(first, 10), asymptotic_return(second, 10), "mean", 500, 9)
+    assert measures.asymptotic_performance[2:5] == tuple(last)
+    assert {
+        name
+        for name in measures._fields
+        if hasattr(getattr(measures, name), "higher_is_better") and not getattr(measures, name).higher_is_better
+    } == {"time_to_threshold"}
     one, other = time_to_threshold(first, -40.0), time_to_threshold(second, -40.0)
     assert measures.time_to_threshold[2:5] == tuple(bootstrap_difference(one, other, "median", 500, 9))
     assert measures.time_to_threshold.p_value == p_value_of_difference(one, other, "mann-whitney")
@@ -206,15 +186,6 @@ def test_a_folder_in_a_list_is_one_run_in_parallel_environments_as_sb3_reads_it(
         np.testing.assert_array_equal(curves.returns[run], theirs["r"])
         timesteps, _ = ts2xy(theirs, X_TIMESTEPS)
         np.testing.assert_array_equal(np.cumsum(curves.steps[run]), timesteps)
-
-
-def test_episodes_of_parallel_environments_are_merged_in_order_of_time(tmp_path):
-    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 100.0, "env_id": "a"}\nr,l,t\n1,10,1.0\n3,30,3.5\n')
-    (tmp_path / "1.monitor.csv").write_text(
-        '#{"t_start": 101.0, "env_id": "a"}\nr,l,t,is_success\n2,20,1.0,True\n4,40,9.0,False\n'
-    )
-    curves = read_monitor_logs([tmp_path])
-    assert curves.returns.tolist() == [[1.0, 2.0, 3.0, 4.0]] and curves.steps.tolist() == [[10.0, 20.0, 30.0, 40.0]]
 
 
 def test_a_log_that_learning_was_resumed_into_keeps_its_order(tmp_path):

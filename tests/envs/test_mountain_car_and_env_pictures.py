@@ -43,33 +43,6 @@ class TestDynamics:
             assert env.step(action)[2] == done
             np.testing.assert_allclose(env.unwrapped.state, reference.state, rtol=0, atol=1e-12)
 
-    @pytest.mark.parametrize("env_id", CARS)
-    @settings(max_examples=20, deadline=None)
-    @given(data=st.data())
-    def test_states_and_observations_stay_within_the_bounds(self, env_id, data):
-        env = gymnasium.make(env_id, start="random")
-        env.reset(seed=data.draw(st.integers(0, 1000)))
-        n_actions = int(env.action_space.n)
-        runs = data.draw(st.lists(st.tuples(st.integers(0, n_actions - 1), st.integers(1, 40)), max_size=10))
-        for action in (action for action, length in runs for _ in range(length)):
-            observation, *_ = env.step(action)
-            assert env.observation_space.contains(observation)
-            positions, velocities = np.split(env.unwrapped.state, 2)
-            assert np.all((positions >= -1.2) & (positions <= 0.6) & (np.abs(velocities) <= 0.07))
-
-    @pytest.mark.parametrize(
-        ("state", "action", "expected"),
-        [
-            *[([-1.19, -0.05], 1, [-1.2, 0.0]), ([0.0, -0.0699], 1, [-0.07, -0.07]), ([-1.1, 0.0699], 2, [-1.03, 0.07])],
-            # From rest at the left wall gravity and engine push it to the right.
-            ([-1.2, 0.0], 2, [-1.2 + 0.001 - 0.0025 * math.cos(3.6), 0.001 - 0.0025 * math.cos(3.6)]),
-        ],
-    )
-    def test_walls_and_limits_of_the_speed(self, state, action, expected):
-        env = env_in(CAR_2D, state)
-        env.step(action)
-        assert env.unwrapped.state == pytest.approx(expected, abs=1e-15)
-
     @pytest.mark.parametrize("env_id", [CAR_4D, CAR_6D])
     def test_every_axis_must_be_at_the_goal(self, env_id):
         n_axes = N_AXES[env_id]

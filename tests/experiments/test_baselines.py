@@ -174,18 +174,6 @@ def test_where_nothing_is_transferred_nothing_is_translated(source):
     assert [column.shape for column in found[:5]] == [(0, 3), (0,), (0,), (0, 3), (0,)]
 
 
-def test_what_is_translated_stays_within_the_bounds():
-    states, ends = np.array([[0.9]]), np.array([[1.0]])
-    one = np.ones(1)
-    instances = SourceInstances(states, np.array([0]), -one, ends, one > 2, 0 * one, one, 1)
-    transfer = TIMBREL(instances, InterTaskMapping(state=(0, None, None), action=(0, 0, 0)), breadth=0.5, use="instances")
-    low, high = np.zeros(3), np.array([5.0, 1.0, 1.0])
-    transfer.bind(target_task(low, high), np.random.default_rng(0))
-    at = np.array([[4.75, 0.5, 0.5]])
-    visited = Transitions(at, np.zeros(1, dtype=np.int64), -one, at, one > 2, low, high, 3, (), (), {})
-    np.testing.assert_allclose(baselines.translate(transfer, visited).next_states, [[5.0, 0.5, 0.5]] * 3)
-
-
 def test_combrels_translations_are_source_instances_seen_through_some_mapping(prefilled_job, source):
     _, found = baselines.prefill(prefilled_job)
     own = baselines.prefill(replace(prefilled_job, method=baselines.OWN))[1]

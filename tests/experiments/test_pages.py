@@ -3,15 +3,11 @@
 import pytest
 
 from sb3_combrel.experiments import pages
-from sb3_combrel.experiments.pages import fill_in, tables_in
+from sb3_combrel.experiments.pages import fill_in
 
 TABLES = "**First**\n\n| a | b |\n| --- | ---: |\n| 1 | 2 |\n\n**Second**\n\n| c |\n| --- |\n| 3 |\n"
 FIRST, SECOND = "| a | b |\n| --- | ---: |\n| 1 | 2 |", "| c |\n| --- |\n| 3 |"
 MARKS = "<!-- table: results/t.md, {} -->\n{}<!-- end of table -->"
-
-
-def test_tables_are_found_without_their_titles():
-    assert tables_in(TABLES) == [FIRST, SECOND] and tables_in("no table | here") == []
 
 
 def test_tables_are_filled_in_and_what_is_around_stays(tmp_path):

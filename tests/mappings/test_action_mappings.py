@@ -25,28 +25,6 @@ class TestActionMappings:
         found = BalancedActionMappings(n_source, n_target)
         assert [found[i] for i in range(found.n_mappings)] == expected
 
-    @pytest.mark.parametrize(
-        "actions",
-        [
-            *[AllActionMappings(3, 4), BalancedActionMappings(3, 5), BalancedActionMappings(3, 4)],
-            *[BalancedActionMappings(4, 2), ListedActionMappings([[0, 2, 2], [2, 0, 2], [0, 0, 1]], n_source_actions=4)],
-        ],
-    )
-    def test_counts_and_first_members(self, actions):
-        listed = [actions[i] for i in range(actions.n_mappings)]
-        with pytest.raises(IndexError):
-            actions[actions.n_mappings]
-        for a in range(actions.n_target_actions):
-            assert actions.source_actions_for(a).tolist() == sorted({action[a] for action in listed})
-            for b in range(actions.n_source_actions + 1):
-                members = [i for i, action in enumerate(listed) if action[a] == b]
-                assert actions.count(a, b) == len(members)
-                if members:
-                    assert actions.first(a, b) == members[0]
-                else:
-                    with pytest.raises(ValueError, match=f"no mapping of the set maps target action {a}"):
-                        actions.first(a, b)
-
     @pytest.mark.parametrize(("factor", "largest"), [(AllActionMappings, "1,000"), (BalancedActionMappings, "100")])
     @pytest.mark.parametrize("number", [10**5, 10**400, 0, float("inf"), float("nan"), 2.0, True, "3", None])
     def test_impossible_numbers_of_actions_are_refused(self, factor, largest, number):

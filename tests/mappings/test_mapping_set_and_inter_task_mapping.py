@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import InterTaskMapping, MappingSet
-from sb3_combrel.mappings import AllActionMappings
+from sb3_combrel.mappings import AllActionMappings, ListedActionMappings
 
 
 def check_against_members(mapping_set, n_source_actions):
@@ -44,13 +44,15 @@ class TestMappingSet:
         "mapping_set",
         [
             *[MappingSet.injective(2, 3, 2, 3), MappingSet.all(1, 2, 2, 2, signs=True), MappingSet.balanced(2, 2, 2, 3)],
+            *[MappingSet.balanced(1, 1, 3, 5), MappingSet.balanced(1, 1, 3, 4), MappingSet.balanced(1, 1, 4, 2)],
+            MappingSet([[0]], ListedActionMappings([[0, 2, 2], [2, 0, 2], [0, 0, 1]], n_source_actions=4)),
             # Equal state mappings in several rows, as in the paper's layings.
             MappingSet([[0, -1], [-1, 0], [0, -1]], [[0, 1], [1, 1]], signs=[[1, -1], [1, 1], [1, 1]]),
         ],
     )
     def test_lookups_agree_with_a_search_through_the_members(self, mapping_set):
         assert len(mapping_set) == len(list(mapping_set)) == mapping_set.n_state_mappings * mapping_set.n_action_mappings
-        check_against_members(mapping_set, 2)
+        check_against_members(mapping_set, mapping_set.actions.n_source_actions)
 
     @settings(max_examples=20, deadline=None)
     @given(st.lists(mappings(n_source=2, n_target=2), min_size=1, max_size=8))

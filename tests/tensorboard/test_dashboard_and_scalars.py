@@ -14,7 +14,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_combrel import FittedRMax
 from sb3_combrel.callbacks import DashboardCallback
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
 from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
@@ -92,15 +91,6 @@ def test_a_dashboard_that_is_given_is_the_only_one(tmp_path):
     walker(tmp_path).learn(100, CallbackList([DashboardCallback(picture_freq=50, variables=[("height", "place")])]))
     assert events(run_folder(tmp_path)).Tags()["images"] == ["value_and_policy/height_place"]
     assert image_steps(tmp_path, "value_and_policy/height_place") == [50, 100]
-
-
-def test_a_model_is_saved_without_the_dashboard(transfers, tmp_path):
-    model = walker(tmp_path / "log", transfers["COMBREL"]).learn(150)
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=NamedWalk())
-    assert "ashboard" not in str(model.__dict__)
-    loaded.learn(50, DashboardCallback(), reset_num_timesteps=False)
-    assert image_steps(tmp_path / "log")[-1] == 200
 
 
 def test_learning_goes_on_in_the_same_log_after_an_interrupt(transfers, tmp_path):

@@ -18,15 +18,6 @@ from sb3_combrel.tensorboard.plane import numbered, plane_through
 from sb3_combrel.tensorboard.readings import action_values
 
 
-def test_pictures_come_at_the_asked_steps_and_at_the_end(transfers, tmp_path, drawn):
-    walker(tmp_path, transfers["COMBREL"]).learn(80, DashboardCallback(picture_freq=50), log_interval=1)
-    found = events(run_folder(tmp_path))
-    for tag in ("value_and_policy/place_height", "source_action/place_height", "state_mappings/chosen"):
-        assert [image.step for image in found.Images(tag)] == [50, 80]
-    assert [text.step for text in found.Tensors("transfer/most_chosen_mappings/text_summary")] == [50, 80]
-    assert all(image.width > 300 and image.encoded_image_string.startswith(b"\x89PNG") for image in found.Images(tag))
-
-
 def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(tmp_path, monkeypatch, clock):
     def slowly(self, step):
         shown.append(clock[0])

@@ -1,7 +1,5 @@
 """What users write: methods and mappings by name, and whether instances or a prior are transferred where nothing says so."""
 
-import importlib
-
 import numpy as np
 import pytest
 from helpers import factored as f
@@ -39,13 +37,6 @@ def test_a_method_of_ones_own_is_imported_from_where_the_name_says():
         made = make_transfer({written: {"reward": -3.0}})
         assert type(made) is Mine and made.reward == -3.0
     assert type(make_transfer(Mine)) is Mine
-
-
-def test_methods_of_the_package_are_known_without_importing_it(monkeypatch, path):
-    """The package imports this module: the other way round would be an arrow up."""
-    monkeypatch.setattr(importlib, "import_module", None)
-    assert type(make_transfer({"sb3_combrel.COMBREL": {"source": path}})) is COMBREL
-    assert type(make_transfer({"TIMBREL": {"source": path}})) is TIMBREL
 
 
 def test_a_name_that_is_wrong_is_refused_with_those_that_are_known():
@@ -209,7 +200,6 @@ def one_row(**changes):
         (None, "Mine must return TransferredInstances, got None"),
         (one_row(weight=[[1.0, 1.0]]), "weight of type list; it must be a C-contiguous array of float64"),
         (one_row(weight=np.ones(2)), r"weight of shape \(2,\); it must be"),
-        (one_row(weight=np.ones((1, 2), dtype=np.float32)), "weight of type float32"),
         (one_row(effect=np.zeros((3, 2, 1)).T), "effect of type float64; it must be a C-contiguous"),
         (one_row(effect=np.zeros((1, 2, 2))), r"with 3 state variables it must be \(1, 2, 3\)"),
         (one_row(length=np.zeros(0, dtype=np.int64)), r"length of shape \(0,\)"),
@@ -217,7 +207,6 @@ def one_row(**changes):
         (one_row(length=np.array([-1])), "length=-1 for row 0; it must be from 0 to 2"),
         (one_row(length=np.array([3])), "length=3 for row 0; it must be from 0 to 2"),
         (one_row(weight=np.array([[0.0, 1.0]])), "must be finite and above 0"),
-        (one_row(weight=np.array([[np.inf, 1.0]])), "must be finite and above 0"),
         (one_row(weight=np.array([[np.nan, 1.0]])), "must be finite and above 0"),
         (one_row(weight=np.full((1, 2), 1e-6)), "add up to 1e-06 for row 0, with 0.25 .* threshold of 1,"),
         (one_row(reward=np.full((1, 2), np.nan)), "an effect or a reward that is not finite for row 0"),

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from helpers import asking
 from helpers import naive_transfer as naive
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
-from stable_baselines3.common.env_util import make_vec_env
 
 import combrel_envs  # noqa: F401 - registers the Mountain Cars
 from combrel_envs.mountain_car_dynamics import PUSHES, step_axis
-from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+from sb3_combrel import COMBREL, SourceInstances
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.transfer.equations import Bandwidths
 
@@ -188,14 +186,6 @@ def test_each_action_of_the_larger_car_gets_the_axis_that_it_drives():
     for action, row in enumerate(chosen):
         by_number = Counter((choice[1], choice[3]) for choice in row).most_common(2)
         assert {way for way, _ in by_number} == fitting[action] and sum(n for _, n in by_number) > 0.6 * len(row)
-
-
-def test_a_source_that_is_the_target_saves_the_exploration():
-    """Without transfer the first episode takes 400 steps and more."""
-    env = make_vec_env("combrel/MountainCar2D-v0", seed=0, env_kwargs=dict(max_episode_steps=500))
-    model = FittedRMax(env, transfer=COMBREL(mountain_car(1000, 0)), model_breadth=1 / 16, resolution=4, seed=0)
-    model.learn(1000, callback=StopTrainingOnMaxEpisodes(2))
-    assert max(episode["l"] for episode in model.ep_info_buffer) < 250
 
 
 @pytest.mark.parametrize("relevance", [False, True, "near"])

@@ -6,12 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
-from helpers.asking import bound, choices_of, show
 from helpers.naive_transfer import as_sample, as_transitions, problem
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel import COMBREL
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer import equations
@@ -274,14 +272,3 @@ def test_an_instance_as_far_along_each_variable_weighs_the_same_whatever_their_n
         two, all_mapped = (along * np.sqrt(n) for n in (2, n_mapped))
         assert equations.phi(all_mapped, found) == pytest.approx(equations.phi(two, usual), rel=1e-12)
     assert n_mapped != 2 or found == usual, "to the last bit"
-
-
-def test_min_evidence_is_the_sum_of_kernels_below_which_nothing_counts():
-    source, transition = line([[0.3], [0.3]], [[0.1], [0.1]]), naive.Transition(np.array([0.4]), 0, -1.0, np.array([0.5]))
-    evidence, task = 2 * np.exp(-0.01 / 0.005), naive.target_task(np.array([[0.4]]), 1)
-    for least, expected in ((0.0, 1.0), (0.99 * evidence, 1.0), (1.01 * evidence, np.nan)):
-        arguments = dict(bandwidths=(0.005, 0.01, 1.0), min_evidence=least, min_compliance=0.0)
-        method = bound(COMBREL(source, InterTaskMapping([0], [0]), **arguments), task)
-        show(method, transition)
-        choices_of(method)
-        np.testing.assert_allclose(method.chosen_compliance(np.zeros(1, dtype=int)), [expected], rtol=1e-9)

@@ -71,12 +71,6 @@ def test_values_are_those_of_the_steps_to_the_goal(stride, reward_at_goal, gamma
         assert q[1] == pytest.approx(expected, rel=rel) and q[0] < q[1]
 
 
-def test_without_data_an_action_has_no_value():
-    policy = SourcePolicy(walk_source(), 0.9, 0.05)
-    assert (policy.q_values(np.array([0.5, 0.0])) == -np.inf).all()
-    assert np.isfinite(policy.q_values(np.array([0.5, 0.5]))).all()
-
-
 def experts_of(mappings, source=None, **arguments):
     method = bound(MappingExperts(walk_source() if source is None else source, mappings, **arguments), TASK)
     method.action(np.full(2, 0.5))

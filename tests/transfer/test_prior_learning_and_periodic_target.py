@@ -15,7 +15,6 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.candidates import stacked_instances
 
 LOW, HIGH = np.array([-1.2, -0.07]), np.array([0.6, 0.07])
 ACTIONS_4D = ("Neutral", "West", "East", "South", "North")
@@ -221,15 +220,6 @@ def test_with_another_origin_the_same_is_transferred(method, cells=11):
     np.testing.assert_array_equal(by_point[1], np.roll(by_point[0], cells, axis=0))
     one, other = (bound_and_shown(method, each, (False, False)) for each in (0, cells))
     assert np.abs(given_at(one, states) - given_at(other, shifted(states, cells, N_CELLS))).max() > 1e-3
-
-
-def test_effects_of_a_periodic_source_go_the_short_way():
-    source = ring_source(0)
-    instances = stacked_instances([source])
-    for action, n in enumerate(instances.size):
-        assert np.abs(instances.effect[action, :n, 0]).max() < 0.3
-    flat = stacked_instances([dataclasses.replace(source, periodic=())])
-    assert max(np.abs(flat.effect[action, :n, 0]).max() for action, n in enumerate(flat.size)) > 0.7
 
 
 def test_the_flags_of_source_instances_are_kept_and_wrong_ones_refused(tmp_path):

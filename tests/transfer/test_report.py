@@ -8,9 +8,9 @@ from helpers import factored as f
 from helpers.dashboard import NamedWalk
 from helpers.own_method import Mine
 from helpers.walk import METHODS as ON_WALK
-from helpers.walk import Walk, small, walk_source
+from helpers.walk import small, walk_source
 
-from sb3_combrel import COMBREL, MASTER, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances
+from sb3_combrel import COMBREL, MASTER, TIMBREL, InterTaskMapping, SourceInstances
 from sb3_combrel.transfer.outcome_evidence import MIN_IN_PART, N_PARTS, RegionErrors
 from sb3_combrel.transfer.report import NotBoundError
 
@@ -219,15 +219,3 @@ def test_dir_has_what_is_for_the_user():
     assert {"report", "describe_prior", "mapping_counts", "source", "mappings", "use"} <= names
     assert not {"bind", "observe", "transferred", "set_state", "note_use"} & names
     assert not any(name.startswith("_") for name in names)
-
-
-def test_the_model_holds_the_method_in_use():
-    given = COMBREL(SOURCE)
-    model = small(transfer=given).learn(20)
-    assert model.transfer is model.policy.transfer is not given and given.task is None
-    assert FittedRMax(Walk()).transfer is None
-    # One model's method may be given to another, which then has a copy that has learned nothing.
-    other = small(transfer=model.transfer)
-    assert other.transfer is not model.transfer
-    with pytest.raises(ValueError, match="nothing to report before learning"):
-        other.transfer.report()

@@ -270,21 +270,6 @@ def test_far_from_all_instances_the_nearest_predict_with_next_to_no_weight():
     assert (low <= found.effect[0]).all() and (found.effect[0] <= high).all()
 
 
-def test_at_the_edge_of_its_data_a_source_knows_less_than_amid_them():
-    """The same number of instances at the same distances: all around, or all on one side."""
-    ring = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)]) * 0.1
-    half = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(-1.0, 1.0, 16)]) * 0.1
-
-    def weight_amid(offsets):
-        n = len(offsets)
-        none = np.zeros(n)
-        instances = Instances.of_rows(1, np.zeros(n, dtype=np.int64), 0.5 + offsets, np.zeros((n, 2)), none, none > 0)
-        return SourceModel(instances, 0.2).predict(np.array([[0.5, 0.5]]), np.array([0])).weight[0]
-
-    assert weight_amid(ring) == pytest.approx(16 * np.exp(-0.25), rel=1e-6)
-    assert weight_amid(half) < 0.2 * weight_amid(ring)
-
-
 # What a source as a prior claims to know: how far it is trusted, and which of its ends and rewards count.
 @pytest.mark.parametrize(
     ("unexplained", "n_covered", "trust"),

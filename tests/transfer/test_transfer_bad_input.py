@@ -130,7 +130,6 @@ def test_an_argument_out_of_its_range_is_refused_at_once_by_name_and_value(metho
         (lambda s: TIMBREL(s, TWO, use="prior", relevance=True), "relevance must be False"),
         (lambda s: TIMBREL(s, f.copies_mapping(3), use="prior"), "state must have 4 entries"),
         (lambda s: TIMBREL(s, {"copies": [{"state": [0, 1, None, 2], "action": [0] * 5}]}, use="prior"), "from 0 to 1"),
-        (lambda s: TIMBREL(s, {"copies": [], "more": 1}, use="prior"), "dict of copies"),
         (lambda s: TIMBREL(s, {"copies": []}, use="prior"), "at least one"),
         (lambda s: TIMBREL(s, [InterTaskMapping([0, 1, None, None], [0] * 5)] * 2, use="prior"), "one for each of the 5"),
         (lambda s: COMBREL(s, "factorised", use="prior"), "mappings must be one of"),

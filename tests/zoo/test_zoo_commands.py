@@ -58,7 +58,6 @@ def test_a_model_is_trained_and_watched_without_the_file_of_its_source(tmp_path)
 @pytest.mark.parametrize(
     ("entry", "change", "message"),
     [
-        ({"breadth": 0.1}, {}, "'breadth'"),
         ({"transfer": {"sb3_combrel.COMBREL": {"source": "nowhere.npz"}}}, {}, "nowhere.npz"),
         ({"normalize": True}, {}, "VecNormalize"),
         ({}, {"env": "combrel/MountainCar3D-v0"}, "MountainCar3D"),
