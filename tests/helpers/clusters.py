@@ -114,10 +114,3 @@ def free_port():
         with socket.socket() as probe:
             if probe.connect_ex((HOST, port)):
                 return port
-
-
-@contextmanager
-def silent_port():
-    """A port where something listens that never says anything."""
-    with socket.create_server((HOST, 0)) as server:
-        yield server.getsockname()[1]
