@@ -156,7 +156,6 @@ class TestOptions:
         [
             ({"begin": (0, 0)}, "options of reset must be empty or have a 'start', got {'begin'"),
             ({"start": (10, -2)}, "start must leave the ball untouched"),
-            ({"start": (0, 51)}, "torso_yaw must lie between"),
         ],
     )
     def test_wrong_reset_options_are_errors_and_do_not_change_the_next_episode(self, options, message):

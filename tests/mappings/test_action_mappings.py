@@ -39,6 +39,8 @@ class TestActionMappings:
             assert actions[0] == ((0,) * n if isinstance(actions, AllActionMappings) else tuple(range(n)))
             assert actions.source_actions_for(n - 1).tolist() == list(range(n))
             assert actions[actions.n_mappings - 1][0] == n - 1
+            with pytest.raises(IndexError):
+                actions[actions.n_mappings]
 
     def test_listed_source_actions_are_looked_up_however_large_their_numbers(self):
         actions = ListedActionMappings([[0, 10**9], [10**9, 5]])

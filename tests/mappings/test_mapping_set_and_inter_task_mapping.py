@@ -52,7 +52,7 @@ class TestMappingSet:
     )
     def test_lookups_agree_with_a_search_through_the_members(self, mapping_set):
         assert len(mapping_set) == len(list(mapping_set)) == mapping_set.n_state_mappings * mapping_set.n_action_mappings
-        check_against_members(mapping_set, mapping_set.actions.n_source_actions)
+        check_against_members(mapping_set, mapping_set.actions.n_source_actions + 1)
 
     @settings(max_examples=20, deadline=None)
     @given(st.lists(mappings(n_source=2, n_target=2), min_size=1, max_size=8))

@@ -67,7 +67,6 @@ def any_mapped(state):
         ({"state": {"x": "x", 0: "v"}}, "each of the target's variables once, got 0 twice"),
         ({"state": {7: "x"}}, "state must have keys from 0 to 3 or names, .* got 7"),
         ({"state": {"x": None}}, "state must map at least one target variable"),
-        ({"state": {"x": -1}}, "state must hold integers from 0 on or None, got the entry -1"),
         ({"action": ("Up",) * 5}, "action must hold names of the source's actions, Neutral, Left, Right, got 'Up'"),
         ({"action": {"West": "Left"}}, "source action for each target action, got none for Neutral, East, South, North"),
         ({"sign": {"x": 2}}, r"sign must have 4 entries, \+1 or -1"),

@@ -76,19 +76,13 @@ def source():
 
 @pytest.mark.parametrize("method", [TIMBREL, COMBREL])
 def test_by_name_and_by_number_are_the_same(method, source, tmp_path):
-    transfers = [method(source, FactoredMapping([mapping]), use="prior") for mapping in (BY_NAME, BY_NUMBER)]
-    ours, theirs = (small(NamedWalk(), transfer=each).learn(40) for each in transfers)
-    assert same_parameters(ours, theirs)
+    given = {"copies": [AS_DICT]}, FactoredMapping([BY_NAME]), FactoredMapping([BY_NUMBER])
+    transfers = [method(source, mapping, use="prior") for mapping in given]
+    ours, *others = (small(NamedWalk(), transfer=each).learn(40) for each in transfers)
+    assert all(same_parameters(ours, theirs) for theirs in others)
     ours.save(tmp_path / "model")
     # Names of the target are not needed any more.
     assert same_parameters(ours, FittedRMax.load(tmp_path / "model", custom_objects={"_names": {}}))
-
-
-@pytest.mark.parametrize("mapping", [AS_DICT, {"copies": [AS_DICT]}], ids=["mapping", "factored mapping"])
-def test_a_dict_as_in_a_yaml_file_may_have_names(mapping, source):
-    use = "prior" if "copies" in mapping else "instances"
-    model = small(NamedWalk(), transfer={"sb3_combrel.TIMBREL": {"source": source, "mapping": mapping, "use": use}})
-    assert model.transfer.mapping in (BY_NUMBER, FactoredMapping([BY_NUMBER]))
 
 
 def test_a_target_without_names_is_named_in_the_error(source):

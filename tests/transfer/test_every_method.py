@@ -197,12 +197,6 @@ def test_an_argument_out_of_its_range_is_refused_by_name_and_value(kind, argumen
         kind(walk_source(), **arguments)
 
 
-@pytest.mark.parametrize(("kind", "unknown"), [(MASTER, "relevance"), (SampleTransfer, "use"), (COMBREL, "fading")])
-def test_an_argument_that_a_method_does_not_have_is_refused(kind, unknown):
-    with pytest.raises(TypeError, match=unknown):
-        kind(walk_source(), **{unknown: True})
-
-
 @pytest.mark.parametrize("kind", [MASTER, MappingExperts, SampleTransfer])
 def test_mappings_that_do_not_fit_the_target_are_refused(kind):
     with pytest.raises(ValueError, match="action must hold indices from 0 to 1"):

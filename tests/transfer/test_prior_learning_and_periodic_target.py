@@ -245,14 +245,3 @@ def test_recorded_sources_have_the_flags_of_their_task():
     for source in (of_rmax, recorded, SourceInstances.from_q_learning(TellingRing(), 20, seed=0, total_timesteps=30)):
         assert source.periodic == tuple(PERIODIC)
     assert SourceInstances.record(None, Ring(), 20, seed=0).periodic == (False, False)
-
-
-def test_learning_with_transfer_is_saved_and_goes_on(tmp_path):
-    source = SourceInstances.record(None, TellingRing(), 300, seed=0)
-    arguments = dict(seed=0, resolution=4, model_breadth=0.12)
-    model = FittedRMax(TellingRing(0.2), transfer=METHODS["COMBREL"](source), **arguments).learn(150)
-    assert model.agent.transfer.task.periodic == tuple(PERIODIC)
-    model.save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=TellingRing(0.2))
-    assert loaded.agent.transfer.sources[0].periodic == loaded.agent.transfer.task.periodic == tuple(PERIODIC)
-    loaded.learn(20, reset_num_timesteps=False)

@@ -37,7 +37,6 @@ SETS = {
     "listed": LISTED,
     "repeated": MappingSet([[0, 1, -1], [1, -1, 0], [0, 1, -1]], MappingSet.injective(2, 3, 2, 2).actions),
 }
-IDENTITY = InterTaskMapping([0, 1], [0, 1])
 
 
 def observed(method, transitions, task):
@@ -246,14 +245,6 @@ def test_the_division_found_has_the_highest_score_of_all():
     found = prior_choice.choose_factored(copies, sums)
     chosen = tuple(sorted({c for c in found.copies[0].tolist() if c >= 0}))
     assert score(chosen) == pytest.approx(max(score(d) for d in all_divisions(copies.state >= 0)), rel=1e-6)
-
-
-@pytest.mark.parametrize(("n_copies", "order"), [(1, None), (2, (0, 2, 1, 3)), (2, (3, 0, 2, 1)), (3, (4, 1, 0, 5, 3, 2))])
-def test_copies_of_exact_dynamics_are_found_with_their_actions(n_copies, order):
-    mapping, copies, sums, _ = f.measured(n_copies, 100 * n_copies, order=order)
-    choice = prior_choice.choose_factored(copies, sums)
-    chosen = {tuple(copies.state[c].tolist()): u.tolist() for c, u in zip(choice.copies[0], choice.actions.T, strict=True)}
-    assert chosen == {tuple(copy.state_index.tolist()): list(copy.action) for copy in mapping.copies}
 
 
 def test_an_action_that_was_never_taken_has_no_source_action():

@@ -6,15 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers import factored as f
-from helpers.factored import bound, inside, naive_prediction, oscillator_source, show
+from helpers.factored import bound, inside, naive_prediction, show
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.outcome_evidence import GOES_ON
-from sb3_combrel.transfer.prior.claims import PRESUMED, part_explained, trust_in
+from sb3_combrel.transfer.prior.claims import PRESUMED, trust_in
 from sb3_combrel.transfer.source_model import SourceModel
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
@@ -260,16 +259,6 @@ def test_predictions_are_those_of_a_weighted_regression(seed, d, n, breadth, n_n
             np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
 
 
-def test_far_from_all_instances_the_nearest_predict_with_next_to_no_weight():
-    model = SourceModel(stacked_instances([oscillator_source()]), breadth=0.1)
-    inside, far = np.array([[0.5, 0.5]]), np.array([[40.0, -30.0]])
-    assert model.predict(inside, np.array([1])).weight[0] > 3.0
-    found = model.predict(far, np.array([1]))
-    assert found.weight[0] < 1e-12 and all(np.isfinite(array).all() for array in found)
-    low, high = model.plain[1][:, 1]
-    assert (low <= found.effect[0]).all() and (found.effect[0] <= high).all()
-
-
 # What a source as a prior claims to know: how far it is trusted, and which of its ends and rewards count.
 @pytest.mark.parametrize(
     ("unexplained", "n_covered", "trust"),
@@ -286,11 +275,6 @@ def test_trust_is_what_is_explained_in_steps_or_nothing(unexplained, n_covered, 
     # Of a second variable everything is explained, of a second action nothing.
     unexplained, n_covered = np.array([[unexplained, 0.0], [n_covered, 0.0]]), np.full((2, 2), n_covered)
     np.testing.assert_allclose(trust_in(unexplained, n_covered), [trust, 0.0], atol=1e-12)
-
-
-def test_what_is_explained_is_that_of_the_variable_of_which_least_is():
-    unexplained, n_covered = np.array([[1.0, 5.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[10.0, 10.0, 2.0], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(part_explained(unexplained, n_covered), [min(9.0 / 13.0, 5.0 / 13.0, 2.0 / 5.0), 0.0])
 
 
 def test_claims_are_ten_times_the_weight_of_the_data_times_trust():
