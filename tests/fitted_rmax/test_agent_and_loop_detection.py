@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from helpers.agents import assert_same_state, make_agent
-from helpers.square import FEWEST_STEPS, METHODS, START, evaluate, learn, square_agent
+from helpers.square import FEWEST_STEPS, METHODS, START, evaluate, learn, square_agent, square_source
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_combrel import COMBREL
 from sb3_combrel.fitted_rmax.agent import DECAY_AFTER_EPISODES, THRESHOLD_DECAY
 from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, ORDER, EpisodeMemory
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
@@ -157,6 +158,15 @@ def test_time_limits_lower_the_threshold_of_the_model_and_that_is_saved(degree):
     agent.end_episode(truncated=True)
     min_weight = agent.model_settings.min_weight
     assert (agent.model.known == (agent.model.own_weight >= min_weight)).all(), "in the end any instance that counts suffices"
+
+
+@pytest.mark.parametrize("use", ["prior", "instances"])
+def test_a_prior_is_not_asked_where_its_instances_have_changed(use, monkeypatch):
+    asked = []
+    monkeypatch.setattr(COMBREL, "changed", lambda self, known: asked.append(known) or False)
+    agent = make_agent(2, 4, COMBREL(square_source(), use=use), model_breadth=0.15, resolution=3)
+    learn(agent, 1)
+    assert bool(asked) == (use == "instances")
 
 
 def test_statistics_are_those_of_model_and_planner(method, degree):
