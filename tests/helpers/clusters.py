@@ -13,7 +13,6 @@ from pathlib import Path
 
 import psutil
 
-ROOT = Path(__file__).resolve().parents[2]
 HOST = "127.0.0.1"
 SECONDS_TO_START = 120
 
@@ -75,7 +74,7 @@ def short_folder():
 @contextmanager
 def running(*arguments, log):
     """A Python process in a session of its own, which is ended with all processes of that session."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # the jobs of a test are defined in its file
     with log.open("w") as file:
         options = dict(stdout=file, stderr=subprocess.STDOUT, env=environment, cwd=log.parent, start_new_session=True)
         process = subprocess.Popen([sys.executable, *map(str, arguments)], stdin=subprocess.DEVNULL, **options)
