@@ -45,6 +45,9 @@ _HOW_TO_START = {
     "dask": "Start one with: dask scheduler --port 8786, and on each worker node: "
     "dask worker tcp://SCHEDULER:8786 --nworkers -1 --nthreads 1",
 }
+# A job's name and the job, pickled; and what comes of it, as :func:`perform` returns it.
+_Packed = tuple[str, bytes]
+_Outcome = tuple[str, bytes | dict[str, str]]
 # A learning run seeds the random numbers of its whole process, so runs in several threads of one would disturb each other.
 _one_at_a_time = threading.Lock()
 
@@ -207,15 +210,15 @@ def _carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Res
             batch = list(packed)[:1] if alone else list(packed)
             try:
                 assert parallel is not None
-                for content in parallel([packed[name][1] for name in batch]):
-                    result = pickle.loads(content)
-                    yield packed.pop(result.name)[0], result
+                for name, outcome in parallel([(name, packed[name][1]) for name in batch]):
+                    job = packed.pop(name)[0]
+                    yield job, pickle.loads(outcome) if isinstance(outcome, bytes) else job.result(**outcome)
                     breakdowns = min(breakdowns, MAX_BREAKDOWNS) if alone else 0
             except Exception as error:  # of a worker that died, as the backend calls it; exceptions of jobs are results
                 breakdowns += 1
                 if breakdowns > MAX_BREAKDOWNS and alone:
                     job, _ = packed.pop(batch[0])
-                    yield job, job.result(error=f"its worker died: {type(error).__name__}: {' '.join(str(error).split())}")
+                    yield job, job.result(error=f"its worker died or failed: {_in_one_line(error)}")
 
 
 def _pack(job: Job) -> bytes:
@@ -225,20 +228,25 @@ def _pack(job: Job) -> bytes:
         raise ValueError(f"{job.title} cannot be sent to a worker, its pickling failed: {error}") from error
 
 
-def perform(packed: bytes, version: str, caller: int) -> bytes:
-    """Carry out a pickled job in one thread: what runs on the worker. An exception of the job is in its result."""
+def perform(name: str, packed: bytes, version: str, caller: int) -> _Outcome:
+    """Carry out a pickled job in one thread: what runs on the worker.
+
+    :return: its name; and its result, pickled, or error and traceback if an exception was raised, be it by loading the job
+    """
     if version != __version__:
         raise RuntimeError(f"the worker has sb3-combrel {__version__}, the caller {version}; install the same on both")
     if os.getpid() != caller and threading.current_thread() is threading.main_thread():
         # Ctrl-C reaches the workers as well; the caller ends them.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     with _one_at_a_time, _one_thread():
-        job: Job = pickle.loads(packed)
         try:
-            return pickle.dumps(job.carry_out())
+            return name, pickle.dumps(pickle.loads(packed).carry_out())
         except Exception as error:  # whatever a third party's code raises
-            line = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            return pickle.dumps(job.result(error=line, traceback=traceback.format_exc()))
+            return name, {"error": _in_one_line(error), "traceback": traceback.format_exc()}
+
+
+def _in_one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @contextmanager
@@ -253,8 +261,14 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _parallel(backend: Backend) -> Iterator[Callable[[list[bytes]], Iterator[bytes]]]:
-    """Make a function that performs packed jobs on the backend and yields their results as they finish."""
+def _parallel(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outcome]]]:
+    """Make a function that performs packed jobs on the backend and yields what comes of them as they finish."""
+    with _dask(backend) if backend.name == "dask" else _joblib(backend) as parallel:
+        yield parallel
+
+
+@contextmanager
+def _joblib(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outcome]]]:
     from joblib import Parallel, delayed, parallel_config
 
     n_jobs, options, how = backend.n_jobs or -1, {}, {"return_as": "generator_unordered", "batch_size": 1}
@@ -270,17 +284,33 @@ def _parallel(backend: Backend) -> Iterator[Callable[[list[bytes]], Iterator[byt
             n_jobs, how["return_as"] = int(ray.cluster_resources().get("CPU", 0)), "list"
             if n_jobs < 1:
                 raise ConnectionError(f"the ray cluster at {backend.address} has no workers. {_HOW_TO_START['ray']}")
-        elif backend.name == "dask":
-            options = {"scheduler_host": backend.address, "wait_for_workers_timeout": SECONDS_TO_REACH}
         else:
             options = {"inner_max_num_threads": 1}
         stack.enter_context(parallel_config(backend=backend.name, n_jobs=n_jobs, **options))
 
-        def parallel(packed: list[bytes]) -> Iterator[bytes]:
+        def parallel(packed: list[_Packed]) -> Iterator[_Outcome]:
             size = n_jobs if how["return_as"] == "list" else len(packed)
             for start in range(0, len(packed), size):
-                calls = (delayed(perform)(each, __version__, os.getpid()) for each in packed[start : start + size])
+                calls = (delayed(perform)(*each, __version__, os.getpid()) for each in packed[start : start + size])
                 yield from Parallel(**how)(calls)
+
+        yield parallel
+
+
+@contextmanager
+def _dask(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outcome]]]:
+    """Dask's own client: joblib's backend for Dask waits for ever for a job whose worker has died."""
+    from distributed import Client, as_completed
+
+    with Client(backend.address, set_as_default=False) as client:
+        try:
+            client.wait_for_workers(1, timeout=SECONDS_TO_REACH)
+        except TimeoutError as error:
+            raise ConnectionError(f"the dask cluster at {backend.address} has no workers. {_HOW_TO_START['dask']}") from error
+
+        def parallel(packed: list[_Packed]) -> Iterator[_Outcome]:
+            calls = [client.submit(perform, *each, __version__, os.getpid(), pure=False) for each in packed]
+            yield from (call.result() for call in as_completed(calls, loop=client.loop))
 
         yield parallel
 

@@ -117,7 +117,7 @@ def test_jobs_that_cannot_be_told_apart_or_sent_are_refused(tmp_path):
         runner.run_missing([locked], backend=HERE)
     assert runner.run_missing([], backend=HERE) == []
     with pytest.raises(RuntimeError, match="install the same on both"):
-        runner.perform(b"", "0.0", os.getpid())
+        runner.perform("", b"", "0.0", os.getpid())
 
 
 @pytest.mark.parametrize(
