@@ -118,6 +118,8 @@ def test_jobs_that_cannot_be_told_apart_or_sent_are_refused(tmp_path):
     assert runner.run_missing([], backend=HERE) == []
     with pytest.raises(RuntimeError, match="install the same on both"):
         runner.perform("", b"", "0.0", os.getpid())
+    name, outcome = runner.perform("lost", b"cgone\nJob\n.", runner.__version__, os.getpid())
+    assert name == "lost" and outcome["error"] == "ModuleNotFoundError: No module named 'gone'", "an error of the job, at once"
 
 
 @pytest.mark.parametrize(
