@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[experiments]'"
-OF_EXTRA = ("combrel_envs", "joblib", "matplotlib", "mujoco", "dm_control", "moviepy", "tyro")
+OF_EXTRA = ("combrel_envs", "matplotlib", "mujoco", "dm_control", "moviepy", "tyro")
 
 
 def demo(

@@ -28,6 +28,11 @@ _TAKEN = ("env", "transfer", "seed", "_init_setup_model")
 class ComparedRun(Job):
     """A run of a comparison, whose result has the transfer method's report."""
 
+    @property
+    def name(self) -> str:
+        """Name of the run. No file has it: methods may differ in case or punctuation alone."""
+        return self.title
+
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
         """Report what transfer did."""
         return {"report": None if model.transfer is None else model.transfer.report()}

@@ -241,7 +241,7 @@ def _p_value_by_permutation(first: np.ndarray, second: np.ndarray, seed: int) ->
 
     samples, rng = (first - mean, second - mean), np.random.default_rng(seed)
     found = stats.permutation_test(
-        samples, difference, n_resamples=N_PERMUTATIONS, alternative="greater", vectorized=True, random_state=rng
+        samples, difference, n_resamples=N_PERMUTATIONS, alternative="greater", vectorized=True, rng=rng
     )
     return float(found.pvalue)
 

@@ -132,7 +132,10 @@ def run_demo(
         for seed in range(n_seeds)
         for method, transfer in mountain_car.methods(source).items()
     ]
-    if not all(run.model_file.exists() for run in runs):
+    incomplete = [run for run in runs if not run.model_file.exists()]
+    for run in incomplete:
+        (output / FOLDER / f"{run.name}.json").unlink(missing_ok=True)
+    if incomplete:
         with console.status("Compiling; the first time this takes a while ..."):
             warm_up()
         console.print(f"Learning {mountain_car.TARGET_ID}: {n_seeds} runs of {n_episodes} episodes with each method ...")

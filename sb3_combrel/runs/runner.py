@@ -26,6 +26,7 @@ import cloudpickle
 import torch as th
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from threadpoolctl import threadpool_limits
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.common.files import write_whole
@@ -38,7 +39,7 @@ FOLDER = "runs"
 MAX_BREAKDOWNS = 3
 SECONDS_TO_REACH = 5.0
 
-_NEEDS = {"loky": ("joblib", "experiments"), "ray": ("ray", "ray"), "dask": ("distributed", "dask")}
+_NEEDS = {"ray": "ray", "dask": "distributed"}
 _HOW_TO_START = {
     "ray": "Start one with: ray start --head --port=6379, and on each worker node: ray start --address=HEAD:6379; "
     "run this command on one of these nodes",
@@ -79,16 +80,16 @@ class Backend:
         if self.name not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {self.name!r}")
         check_count("jobs", self.n_jobs, none_allowed=True)
-        package, extra = _NEEDS[self.name]
-        try:
-            __import__(package)
-        except ModuleNotFoundError as error:
-            message = f"backend {self.name} needs {package}, which is not installed: pip install 'sb3-combrel[{extra}]'"
-            raise ModuleNotFoundError(message, name=package) from error
         if self.name == "loky":
             if self.address is not None:
                 raise ValueError(f"address is for the backends ray and dask, got {self.address!r}")
             return
+        package = _NEEDS[self.name]
+        try:
+            __import__(package)
+        except ModuleNotFoundError as error:
+            message = f"backend {self.name} needs {package}, which is not installed: pip install 'sb3-combrel[{self.name}]'"
+            raise ModuleNotFoundError(message, name=package) from error
         if self.n_jobs is not None:
             raise ValueError(f"jobs is for the backend loky; with {self.name} the cluster decides, got {self.n_jobs}")
         self._reach()
@@ -153,7 +154,8 @@ def check_all_succeeded(results: Sequence[Result]) -> None:
     if failed:
         first = failed[0]
         others = f" ({len(failed) - 1} other runs failed, too)" if len(failed) > 1 else ""
-        raise JobError(f"{first.method}, seed {first.seed}: {first.error}{others}\n{first.traceback}".rstrip())
+        title = ", ".join(filter(None, (first.group, first.method, f"seed {first.seed}")))
+        raise JobError(f"{title}: {first.error}{others}\n{first.traceback}".rstrip())
 
 
 def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None:
@@ -202,21 +204,22 @@ def _carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Res
     """Jobs and their results, as they finish. What died with its worker is begun again."""
     # As bytes a job goes through one and the same pickler once, whatever the backend makes of it.
     packed = {job.name: (job, _pack(job)) for job in jobs}
+    if not packed:
+        return
     breakdowns = 0
-    with ExitStack() as stack:
-        parallel = stack.enter_context(_parallel(backend)) if packed else None
+    with _dask(backend) if backend.name == "dask" else _joblib(backend) as parallel:
         while packed:
             alone = breakdowns >= MAX_BREAKDOWNS
             batch = list(packed)[:1] if alone else list(packed)
             try:
-                assert parallel is not None
                 for name, outcome in parallel([(name, packed[name][1]) for name in batch]):
-                    job = packed.pop(name)[0]
-                    yield job, pickle.loads(outcome) if isinstance(outcome, bytes) else job.result(**outcome)
-                    breakdowns = min(breakdowns, MAX_BREAKDOWNS) if alone else 0
+                    job, _ = packed.pop(name)
+                    yield job, _unpack(job, outcome)
+                    # Alone until the one that kills its worker is found.
+                    breakdowns = MAX_BREAKDOWNS if alone and breakdowns == MAX_BREAKDOWNS else 0
             except Exception as error:  # of a worker that died, as the backend calls it; exceptions of jobs are results
                 breakdowns += 1
-                if breakdowns > MAX_BREAKDOWNS and alone:
+                if alone:
                     job, _ = packed.pop(batch[0])
                     yield job, job.result(error=f"its worker died or failed: {_in_one_line(error)}")
 
@@ -226,6 +229,13 @@ def _pack(job: Job) -> bytes:
         return cloudpickle.dumps(job)
     except Exception as error:  # picklers raise what they like
         raise ValueError(f"{job.title} cannot be sent to a worker, its pickling failed: {error}") from error
+
+
+def _unpack(job: Job, outcome: bytes | dict[str, str]) -> Result:
+    try:
+        return job.result(**outcome) if isinstance(outcome, dict) else pickle.loads(outcome)
+    except Exception as error:  # as above
+        return job.result(error=f"its result cannot be read: {_in_one_line(error)}")
 
 
 def perform(name: str, packed: bytes, version: str, caller: int) -> _Outcome:
@@ -240,7 +250,7 @@ def perform(name: str, packed: bytes, version: str, caller: int) -> _Outcome:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     with _one_at_a_time, _one_thread():
         try:
-            return name, pickle.dumps(pickle.loads(packed).carry_out())
+            return name, cloudpickle.dumps(pickle.loads(packed).carry_out())
         except Exception as error:  # whatever a third party's code raises
             return name, {"error": _in_one_line(error), "traceback": traceback.format_exc()}
 
@@ -255,20 +265,15 @@ def _one_thread() -> Iterator[None]:
     n_threads = th.get_num_threads()
     th.set_num_threads(1)
     try:
-        yield
+        with threadpool_limits(1):
+            yield
     finally:
         th.set_num_threads(n_threads)
 
 
 @contextmanager
-def _parallel(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outcome]]]:
-    """Make a function that performs packed jobs on the backend and yields what comes of them as they finish."""
-    with _dask(backend) if backend.name == "dask" else _joblib(backend) as parallel:
-        yield parallel
-
-
-@contextmanager
 def _joblib(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outcome]]]:
+    """Make a function that performs packed jobs on the backend and yields what comes of them as they finish."""
     from joblib import Parallel, delayed, parallel_config
 
     n_jobs, options, how = backend.n_jobs or -1, {}, {"return_as": "generator_unordered", "batch_size": 1}
@@ -299,7 +304,7 @@ def _joblib(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Ou
 
 @contextmanager
 def _dask(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outcome]]]:
-    """Dask's own client: joblib's backend for Dask waits for ever for a job whose worker has died."""
+    """Do the same by Dask's own client: joblib's backend for Dask waits for ever for a job whose worker has died."""
     from distributed import Client, as_completed
 
     with Client(backend.address, set_as_default=False) as client:
@@ -310,7 +315,14 @@ def _dask(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outc
 
         def parallel(packed: list[_Packed]) -> Iterator[_Outcome]:
             calls = [client.submit(perform, *each, __version__, os.getpid(), pure=False) for each in packed]
-            yield from (call.result() for call in as_completed(calls, loop=client.loop))
+            errors = []
+            for call in as_completed(calls, loop=client.loop):
+                if call.status == "error":
+                    errors.append(call.exception())
+                else:
+                    yield call.result()
+            if errors:
+                raise errors[0]
 
         yield parallel
 

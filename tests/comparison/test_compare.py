@@ -205,6 +205,11 @@ def test_an_error_within_a_run_is_named_with_its_run_and_traceback():
         compare(**{**GOOD, "env": Breaking})
 
 
+def test_methods_may_differ_in_case_and_punctuation_alone():
+    found = compare(Walk, dict.fromkeys(["none", "None"]), seeds=1, steps=30, baseline="none")
+    assert list(found.curves) == ["none", "None"]
+
+
 def test_it_is_exported_and_imported_only_when_asked_for():
     assert sb3_combrel.compare is compare and "compare" in sb3_combrel.__all__
     code = (

@@ -76,6 +76,9 @@ class TestDemo:
         status, written = run_tiny_demo(folder)
         assert status == 0 and "8 of 8 runs were complete already" in written
         assert {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")} == before
+        (folder / "runs" / "combrel_seed0.zip").unlink()
+        status, written = run_tiny_demo(folder)
+        assert status == 0 and "7 of 8 runs were complete already" in written, "the run whose model is lost is made again"
         status, written = run_tiny_demo(folder, "--max-episode-steps", "50")
         assert status == 1 and "max_episode_steps was 60 and is 50" in written
 

@@ -103,7 +103,7 @@ def test_a_failed_job_is_kept_with_its_error_tried_again_and_does_not_stop_the_o
     assert "toys, bad, seed 1: failed: FileNotFoundError: [Errno 2] No such file: 'lost.npz'" in printed
     assert "2 of 4 runs were complete already." in printed
     with pytest.raises(
-        runner.JobError, match=r"^bad, seed 0: FileNotFoundError.*lost.npz' \(1 other runs failed, too\)\nTrace"
+        runner.JobError, match=r"^toys, bad, seed 0: FileNotFoundError.*lost.npz' \(1 other runs failed, too\)\nTrace"
     ):
         runner.check_all_succeeded(found)
     runner.check_all_succeeded(found[2:])
