@@ -130,7 +130,9 @@ def test_numbers_are_those_of_the_file(page, kind, mark, below):
 
 def test_the_tables_of_a_pair_are_those_of_its_file():
     text = (DOCS / "results/benchmark/benchmark.md").read_text()
-    for pair, table in re.findall(r"^## ([\w-]+)$.*?((?:^\|[^\n]*\n)+)", text, flags=re.DOTALL | re.MULTILINE):
+    found = re.findall(r"^## ([\w-]+)$.*?((?:^\|[^\n]*\n)+)", text, flags=re.DOTALL | re.MULTILINE)
+    assert len(found) == 8
+    for pair, table in found:
         written = read(DOCS / f"results/benchmark/{pair}.csv")[1]
         assert cells_of(table) == (list(written), written.to_numpy().tolist()), pair
 

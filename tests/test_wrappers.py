@@ -139,5 +139,3 @@ def test_fitted_rmax_needs_no_argument_for_a_wrapped_environment(tmp_path):
     assert model.agent.periodic == (True, True, False, False)
     assert model.agent.task.state_names == ("theta1", "theta2", "theta1_dot", "theta2_dot")
     assert model.agent.grid.arrays.shape.tolist() == [4, 4, 5, 5]
-    model.save(tmp_path / "acrobot")
-    assert FittedRMax.load(tmp_path / "acrobot").agent.periodic == model.agent.periodic

@@ -19,6 +19,7 @@ class ICubStrikeEnv(DmControlEnv):
     def __init__(
         self,
         look: str = "primitives",
+        *,
         start: Sequence[float] | None = None,
         extent: float = icub_tasks.EXTENT,
         motor_noise: float = 0.0,

@@ -19,7 +19,7 @@ class MountainCarEnv(RenderedEnv):
 
     n_axes: ClassVar[int]
 
-    def __init__(self, start: str = "offset", action_noise: float = 0.0, **picture: Any) -> None:
+    def __init__(self, start: str = "offset", *, action_noise: float = 0.0, **picture: Any) -> None:
         super().__init__(**picture)
         self._start = check_choice("start", start, dynamics.STARTS)
         self._action_noise = dynamics.check_action_noise(action_noise)

@@ -115,7 +115,7 @@ class SavedAlgorithm(BaseAlgorithm):
         """Load parameters from the file of a saved model, or from what :meth:`get_parameters` returned.
 
         :param load_path_or_dict: path of the file, an open file, or a dict of a dict of tensors, ``{"policy": {...}}``
-        :param exact_match: False: those that are not given stay as they are, and unknown ones are ignored
+        :param exact_match: False: tensors that are not given stay as they are, and unknown ones are ignored
         :param device: not used; the work is done on the CPU
         :raises ValueError: if parameters are missing, unknown, of another shape or type, or not finite; nothing is changed
         """
@@ -124,14 +124,14 @@ class SavedAlgorithm(BaseAlgorithm):
         if isinstance(given, str | Path) or hasattr(given, "read"):
             with _naming(given):
                 given = load_from_zip_file(_read(given), load_data=False, device="cpu")[1]
-        if not isinstance(given, dict) or not all(map(_is_tensors, given.values())):
-            raise ParametersError(
-                "load_path_or_dict must be the file of a saved model or a dict of dicts of tensors as get_parameters returns "
-                f"it, got {given!r}"
-            )
+        known = "load_path_or_dict must be a saved model's file or a dict of dicts of tensors as get_parameters returns it"
+        if not isinstance(given, dict):
+            raise ParametersError(f"{known}, got {type(given).__name__}")
         names = self._get_torch_save_params()[0]
         if (exact_match and set(given) != set(names)) or not set(given) <= set(names):
-            raise ParametersError(f"load_path_or_dict must have parameters of {names}, got {list(given)}")
+            raise ParametersError(f"{known}, with parameters of {names}, got those of {list(given)}")
+        if not all(map(_is_tensors, given.values())):
+            raise ParametersError(f"{known}; not all of these values are tensors")
         try:
             super().set_parameters(given, exact_match, device)
         except RuntimeError as error:

@@ -49,7 +49,7 @@ def warn_if_long(work: Workload, grid: StateGrid) -> None:
         warnings.warn(
             f"resolution={list(grid.resolution)} means {work}; a lower resolution takes less time, each number less by one "
             "about half",
-            stacklevel=5,
+            stacklevel=6,
         )
 
 

@@ -43,7 +43,7 @@ _SETS: dict[str, tuple[bool, bool, type[AllActionMappings | BalancedActionMappin
 }
 _SIZED_SETS = (*_SETS, *(f"signed_{each}" for each in _SETS))
 _PAPER_SETS = ("paper_mountain_car", "paper_icub")
-_FACTORED_SETS = ("factored", "signed_factored")
+FACTORED_SETS = ("factored", "signed_factored")
 
 
 class Candidates(NamedTuple):
@@ -171,13 +171,16 @@ class MappingSet:
     ) -> MappingSet:
         """One of the sets by its name, as in a YAML file.
 
-        :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``
+        :param name: "injective", "surjective", "all" or "balanced"; "signed_injective" and so on with ``signs``;
+            "paper_mountain_car" or "paper_icub", whose numbers are the paper's
         :param n_source_variables: number of the source's state variables, and so on
         :param signs: also include every state mapping with any of its mapped variables mirrored
         :raises ValueError: for another name, if a number is below 1 or astronomically large, or if there are too many state
             mappings
         """
-        check_set_name(name, _SIZED_SETS)
+        check_set_name(name, (*_SIZED_SETS, *_PAPER_SETS))
+        if name in _PAPER_SETS:
+            return cls.paper_icub() if name == "paper_icub" else cls.paper_mountain_car()
         unsigned = name.removeprefix("signed_")
         once, allow_none, action_mappings = _SETS[unsigned]
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=once, allow_none=allow_none)
@@ -355,10 +358,10 @@ def _state(row: Ints) -> tuple[int | None, ...]:
     return tuple(None if i == UNMAPPED else i for i in row.tolist())
 
 
-def check_set_name(name: object, known: Sequence[str] = (*_SIZED_SETS, *_PAPER_SETS, *_FACTORED_SETS)) -> None:
+def check_set_name(name: object, known: Sequence[str] = (*_SIZED_SETS, *_PAPER_SETS, *FACTORED_SETS)) -> None:
     """Raise ``ValueError`` if there is no set of that name."""
     if name not in known:
-        names, factored = ", ".join((*_SIZED_SETS, *_PAPER_SETS)), ", ".join(_FACTORED_SETS)
+        names, factored = ", ".join((*_SIZED_SETS, *_PAPER_SETS)), ", ".join(FACTORED_SETS)
         raise ValueError(f'mappings must be one of {names}; with use="prior" also {factored}; got {name!r}')
 
 

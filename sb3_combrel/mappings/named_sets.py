@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Unpack
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
@@ -11,20 +11,19 @@ from sb3_combrel.mappings.mapping_set import MappingSet, check_set_name
 
 
 def resolve(
-    mappings: str | InterTaskMapping | MappingSet | Mapping[str, Any] | Sequence[InterTaskMapping | Mapping[str, Any]],
+    mappings: str | InterTaskMapping | MappingSet | Mapping[str, Any] | Iterable[InterTaskMapping | Mapping[str, Any]],
     **sizes: Unpack[TaskSizes],
 ) -> MappingSet:
     """The set of mappings that a user means, checked against the two tasks.
 
-    :param mappings: the name of a set (:meth:`MappingSet.from_name`, or "paper_mountain_car", "paper_icub"), a set, one
-        mapping or a sequence of mappings. A mapping may be given as a dict of its arguments, as in a YAML file:
+    :param mappings: the name of a set (:meth:`MappingSet.from_name`), a set, one mapping or several mappings.
+        A mapping may be given as a dict of its arguments, as in a YAML file:
         ``{"state": [0, None, 1, None], "action": [1, 0, 2, 1, 1]}``.
     :raises ValueError: if ``mappings`` is none of these or does not fit the two tasks
     """
-    papers = {"paper_mountain_car": MappingSet.paper_mountain_car, "paper_icub": MappingSet.paper_icub}
     found = _made(mappings)
     if isinstance(found, str):
-        found = papers[found]() if found in papers else MappingSet.from_name(found, **sizes)
+        found = MappingSet.from_name(found, **sizes)
     elif not isinstance(found, MappingSet):
         found = MappingSet.from_list(found if isinstance(found, list) else [found])
     found.check(**sizes)
@@ -60,8 +59,9 @@ def _made(mappings: Any) -> Any:
         if set(mappings) != {"copies"}:
             raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mappings!r}")
         return FactoredMapping(**mappings)
-    if not isinstance(mappings, Sequence):
+    if not isinstance(mappings, Iterable):
         raise ValueError(f"mappings must be a name, an InterTaskMapping, a list of them or a MappingSet, got {mappings!r}")
-    if not mappings:
+    made = [as_mapping(each, "mappings") for each in mappings]
+    if not made:
         raise ValueError("mappings must hold at least one InterTaskMapping, got an empty list")
-    return [as_mapping(each, "mappings") for each in mappings]
+    return made

@@ -167,6 +167,12 @@ def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None
         return None
 
 
+def read_results(output: Path, begins: str = "") -> list[tuple[dict[str, Any], Result]]:
+    """Read settings and results of all complete jobs in a folder whose names begin so, by name."""
+    found = (read_result(output, path.stem) for path in sorted((output / FOLDER).glob(f"{begins}*.json")))
+    return [each for each in found if each is not None and not each[1].error]
+
+
 def prepare_folder(output: Path) -> None:
     """Prepare a folder for results; those that are there are kept, other files are a ValueError."""
     if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):

@@ -26,6 +26,8 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     scaling = StateScaling.from_space(data.observation_space, bounds)
     n_actions = count_actions(data.action_space)
     parts = [(e.observations[:-1], e.actions, e.rewards, e.observations[1:], e.terminations) for e in data.iterate_episodes()]
+    if not parts:
+        raise ValueError(f"the dataset {data.id} has no episodes: there is nothing to transfer")
     states, actions, rewards, next_states, terminated = map(np.concatenate, zip(*parts, strict=True))
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     unnamed = {"env": None if data.env_spec is None else data.env_spec.id, "recorder": "Minari dataset", "dataset": data.id}

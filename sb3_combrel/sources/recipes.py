@@ -144,23 +144,25 @@ def fingerprint(env_id: str) -> str:
     except (ImportError, AttributeError):
         made = None
     modules: set[str] = set()
+    package = str(getattr(made, "__module__", "")).partition(".")[0]
     for each in inspect.getmro(made) if inspect.isclass(made) else [made]:
-        _add_modules(getattr(each, "__module__", ""), modules)
-    files = (getattr(sys.modules[name], "__file__", None) for name in sorted(modules))
-    parts += [Path(file).read_text(errors="replace") for file in files if file]
+        _add_modules(getattr(each, "__module__", ""), package, modules)
+    # What comes from a zip file or the standard input has the name of a file that is none.
+    files = (Path(getattr(sys.modules[name], "__file__", None) or "") for name in sorted(modules))
+    parts += [file.read_text(errors="replace") for file in files if file.is_file()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
 
 
-def _add_modules(name: str, modules: set[str]) -> None:
-    """Add a module and those of the same package that it uses, directly or not; of Gymnasium only environments' own."""
-    package = name.partition(".")[0]
-    if name in modules or name not in sys.modules or package in sys.stdlib_module_names or name == "gymnasium.core":
+def _add_modules(name: str, package: str, modules: set[str]) -> None:
+    """Add a module; if it is of the environment's package, not Gymnasium, also those of this that it uses, directly or not."""
+    root = name.partition(".")[0]
+    if name in modules or name not in sys.modules or root in sys.stdlib_module_names or name == "gymnasium.core":
         return
     modules.add(name)
-    for value in list(vars(sys.modules[name]).values()) if package != "gymnasium" else []:
+    for value in list(vars(sys.modules[name]).values()) if root == package != "gymnasium" else []:
         used = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None)
         if isinstance(used, str) and used.partition(".")[0] == package:
-            _add_modules(used, modules)
+            _add_modules(used, package, modules)
 
 
 def task_spec(name: str) -> EnvSpec | None:

@@ -61,24 +61,25 @@ def settings_summaries(settings: Mapping[str, Any]) -> list[Summary]:
 def hyperparameters(model: FittedRMax) -> dict[str, Plain]:
     """Collect the settings of the algorithm and, as ``transfer.NAME``, of its transfer method, with the defaults in use."""
     transfer = model.agent.transfer
+    of_transfer = {} if transfer is None else _given(transfer, type(transfer))
     method = "none" if transfer is None else type(transfer).__name__
     algorithm = type(model).__name__ if transfer is None else f"{type(model).__name__} + {method}"
     env_id = _env_id(model)
     return {
         "algorithm": algorithm,
-        **_given(model),
+        **_given(model, FittedRMax),
         "model_breadth": model.agent.model_settings.model_breadth,
         "resolution": _plain(model.agent.grid.resolution),
         "n_envs": model.n_envs,
         **({} if env_id is None else {"env": env_id}),
         "transfer": method,
-        **({} if transfer is None else {f"transfer.{name}": value for name, value in _given(transfer).items()}),
+        **{f"transfer.{name}": value for name, value in of_transfer.items()},
     }
 
 
-def _given(thing: object) -> dict[str, Plain]:
-    """Return the attributes that have the names of constructor arguments, but for those that are None."""
-    names = [name for name in inspect.signature(type(thing)).parameters if name not in LEFT_OUT and name[0] != "_"]
+def _given(thing: object, made_by: type) -> dict[str, Plain]:
+    """Return the attributes that have the names of a class's constructor arguments, but for those that are None."""
+    names = [name for name in inspect.signature(made_by).parameters if name not in LEFT_OUT and name[0] != "_"]
     return {name: _plain(getattr(thing, name)) for name in names if getattr(thing, name, None) is not None}
 
 

@@ -17,6 +17,7 @@ from sb3_combrel.zoo.plot_checks import check_window, with_evaluations
 
 PROGRAM = "python -m sb3_combrel.zoo"
 # What a configuration or an argument causes.
+OF_EXTRA = ("huggingface_hub", "huggingface_sb3", "matplotlib", "optuna", "pandas", "rl_zoo3", "sb3_contrib", "seaborn")
 USERS_ERRORS = (ValueError, AssertionError, OSError, ImportError, gymnasium.error.Error)
 FUNCTIONS = {
     "train": "rl_zoo3.train",
@@ -134,7 +135,7 @@ def _message_of(error: Exception) -> str:
         return f"the Hugging Face hub cannot be reached (benchmark does without it by --no-hub): {reason}"
     if isinstance(error, gymnasium.error.NameNotFound | gymnasium.error.NamespaceNotFound):
         return f"{error}\nIf a package of yours registers it, name that: --gym-packages my_package"
-    if isinstance(error, ModuleNotFoundError):
+    if isinstance(error, ModuleNotFoundError) and error.name in OF_EXTRA:
         return f"{error}; what RL-Zoo's commands need comes with: pip install 'sb3-combrel[zoo]'"
     return str(error) or type(error).__name__
 

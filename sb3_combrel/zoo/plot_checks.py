@@ -17,13 +17,13 @@ def with_evaluations(args: Sequence[str]) -> list[str]:
     if not (given.algos and given.env and given.exp_folders):
         return list(args)
     kept = []
+    folders = ", ".join(given.exp_folders)
     for algo in given.algos:
-        for env in given.env:
-            if not _has_evaluations(given.exp_folders, algo, env):
-                folders = ", ".join(given.exp_folders)
-                _say(f"{algo} has no evaluations of {env} in {folders}: train it first, with --eval-freq; it is left out")
-            elif algo not in kept:
-                kept.append(algo)
+        missing = [env for env in given.env if not _has_evaluations(given.exp_folders, algo, env)]
+        kept += [algo] if len(missing) < len(given.env) else []
+        becomes = "it is 0.0 in the table" if algo in kept else "it is left out"
+        for env in missing:
+            _say(f"{algo} has no evaluations of {env} in {folders}: train it first, with --eval-freq; {becomes}")
     if not kept:
         raise ValueError("there is nothing to plot: none of the algorithms has evaluations; names take a hyphen, not a slash")
     return ["-a", *kept, "-e", *given.env, "-f", *given.exp_folders, *others]

@@ -221,7 +221,9 @@ def test_files_that_are_no_whole_monitor_log_are_refused(tmp_path, text, message
 def test_a_row_ends_where_its_line_does(tmp_path):
     # Monitor's csv writer leaves such separators in the text of an info keyword unquoted.
     (tmp_path / "monitor.csv").write_text('#{"t_start": 1.0}\nr,l,t,note\n1,10,1.0,one\u2028two\n2,20,2.0,x\n', "utf-8")
-    assert read_monitor_logs(tmp_path).returns.tolist() == [[1.0, 2.0]]
+    # Its other files may have other columns.
+    (tmp_path / "1.monitor.csv").write_text('#{"t_start": 1.0}\nl,other,r,t\n15,x,3,1.5\n')
+    assert read_monitor_logs([tmp_path]).returns.tolist() == [[1.0, 3.0, 2.0]]
 
 
 def test_logs_that_are_not_there_are_named(tmp_path):

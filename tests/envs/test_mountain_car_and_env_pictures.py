@@ -159,6 +159,13 @@ class TestActionNoise:
         first, same, other = (self.executed("gymnasium_states", CAR_6D, 0.5, 0, seed).tolist() for seed in (1, 1, 2))
         assert first == same != other
 
+    def test_without_noise_no_random_numbers_are_drawn(self):
+        env = gymnasium.make(CAR_4D).unwrapped
+        env.reset(seed=0)
+        before = env.np_random.bit_generator.state
+        env.step(2)
+        assert env.np_random.bit_generator.state == before
+
     @pytest.mark.parametrize("action_noise", [-0.1, 1.1, float("nan"), True, "much", None])
     def test_only_probabilities_are_possible(self, action_noise):
         with pytest.raises(ValueError, match=r"action_noise must be a probability, .* got "):

@@ -133,24 +133,24 @@ def target_task(low, high, threshold=0.5):
 
 def test_an_instance_is_translated_as_by_hand():
     # The source's variables range over 1 and 10, the target's over 4, 100 and 2.
-    states, ends = np.array([[0.5, 2.0], [0.25, 5.0]]), np.array([[0.75, 1.0], [0.25, 5.5]])
+    states, ends = np.array([[0.95, 2.0], [0.25, 5.0]]), np.array([[1.2, 1.0], [0.25, 5.5]])
     instances = SourceInstances(
         states, np.array([0, 1]), np.array([-3.0, 7.0]), ends, np.array([False, True]), np.zeros(2), np.array([1.0, 10.0]), 2
     )
     low, high = np.array([0.0, -50.0, 1.0]), np.array([4.0, 50.0, 3.0])
     transfer = TIMBREL(instances, InterTaskMapping(state=(1, None, 0), action=(1, 0, 1)), breadth=0.1, use="instances")
     transfer.bind(target_task(low, high), np.random.default_rng(0))
-    # Unit coordinates of the first: 0.2 of the source's second variable, 0.5 of its first. The second state is that of no
-    # instance; the third one is the second instance's.
-    visited_states = np.array([[0.8, 20.0, 2.0], [3.9, 20.0, 2.9], [2.0, -10.0, 1.5]])
+    # Unit coordinates of the first: 0.2 of the source's second variable, near 0.95 of its first. The second state is that of
+    # no instance; the third one is the second instance's.
+    visited_states = np.array([[0.8, 20.0, 2.98], [3.9, 20.0, 2.9], [2.0, -10.0, 1.5]])
     ignored = np.zeros(3)
     outcomes = ignored, visited_states, ignored > 0
     found = baselines.translate(
         transfer, Transitions(visited_states, np.zeros(3, dtype=np.int64), *outcomes, low, high, 3, (), (), {})
     )
-    # Effects: 0.25 of the first variable's range, -0.1 of the second's; and 0.05 of the second's.
+    # Effects: 0.25 of the first variable's range, -0.1 of the second's; and 0.05 of the second's. Ends are within the bounds.
     expected = {
-        (0.8, 1): ([0.8 - 0.4, 20.0, 2.0 + 0.5], -3.0, False),
+        (0.8, 1): ([0.8 - 0.4, 20.0, 3.0], -3.0, False),
         (2.0, 0): ([2.0 + 0.2, -10.0, 1.5], 7.0, True),
         (2.0, 2): ([2.0 + 0.2, -10.0, 1.5], 7.0, True),
     }

@@ -1,6 +1,5 @@
 """Arguments, environments and observations that cannot work are refused in time, with an error that names what to change."""
 
-import io
 import re
 import warnings
 
@@ -308,10 +307,6 @@ def test_the_environment_may_say_which_variables_are_periodic(wrap):
     model = FittedRMax(wrap(TellingRing()), seed=0, resolution=4)
     assert model.agent.periodic == tuple(PERIODIC) and model.periodic == PERIODIC
     assert FittedRMax(wrap(TellingRing()), seed=0, resolution=4, periodic=[False, False]).agent.periodic == (False, False)
-    buffer = io.BytesIO()
-    model.save(buffer)
-    buffer.seek(0)
-    assert FittedRMax.load(buffer).agent.periodic == tuple(PERIODIC), "without the environment as well"
 
 
 @pytest.mark.long

@@ -225,8 +225,11 @@ except KeyboardInterrupt:
     printed, noise = program.communicate(timeout=60)
     assert printed == "interrupted\n" and "Traceback" not in noise
     pids = [int(file.name.split(".")[1]) for file in tmp_path.glob("toys_long*")]
-    time.sleep(1.0)
-    assert not any(Path(f"/proc/{pid}/cmdline").exists() and Path(f"/proc/{pid}/cmdline").read_bytes() for pid in pids)
+    alive = [Path(f"/proc/{pid}/cmdline") for pid in pids]
+    while alive and time.monotonic() < end + 60:
+        alive = [file for file in alive if file.exists() and file.read_bytes()]
+        time.sleep(0.1)
+    assert len(pids) == 2 and not alive
     assert [job.attempts() for job in toys(tmp_path, 1)] == [1]
     runner.run_missing(toys(tmp_path, 2), tmp_path / "out", HERE)
     assert [job.attempts() for job in toys(tmp_path, 2)] == [1, 1]

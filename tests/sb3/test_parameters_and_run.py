@@ -2,8 +2,6 @@
 
 import inspect
 import io
-import subprocess
-import sys
 
 import pytest
 import torch as th
@@ -131,19 +129,3 @@ def test_learning_counts_steps_and_episodes(make):
     assert model.num_timesteps == 30, "steps are counted from 0 again"
     assert model.agent.model.n_instances == 130, "what was learned is kept"
     assert model.learn(1e1).num_timesteps == 10, "as it is often written"
-
-
-@pytest.mark.long
-def test_importing_is_light_and_compiles_nothing():
-    code = (
-        "import sys, sb3_combrel\n"
-        "heavy = {'mujoco', 'dm_control', 'rl_zoo3', 'matplotlib', 'pandas', 'minari', 'optuna'} & set(sys.modules)\n"
-        "from numba.core.dispatcher import Dispatcher\n"
-        "import gc\n"
-        "ours = [d for d in gc.get_objects() if isinstance(d, Dispatcher) and 'sb3_combrel' in d.py_func.__module__]\n"
-        "assert ours\n"
-        "compiled = [d for d in ours if d.signatures]\n"
-        "sys.exit(f'{heavy} {compiled}' if heavy or compiled else 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr

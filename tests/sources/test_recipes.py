@@ -99,7 +99,8 @@ def test_a_changed_module_of_the_dynamics_is_noticed(tmp_path, monkeypatch):
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "dynamics.py").write_text("STRIDE = 1\n")
-    (package / "walk.py").write_text("from own_walks import dynamics\nclass OwnWalk:\n    stride = dynamics.STRIDE\n")
+    base = "from own_walks import dynamics\nfrom torch.nn import Module\n"  # Torch has modules whose files are not there.
+    (package / "walk.py").write_text(base + "class OwnWalk(Module):\n    stride = dynamics.STRIDE\n")
     monkeypatch.syspath_prepend(tmp_path)
     del gymnasium.registry[WALK]
     gymnasium.register(WALK, "own_walks.walk:OwnWalk")

@@ -245,3 +245,8 @@ def test_recorded_sources_have_the_flags_of_their_task():
     for source in (of_rmax, recorded, SourceInstances.from_q_learning(TellingRing(), 20, seed=0, total_timesteps=30)):
         assert source.periodic == tuple(PERIODIC)
     assert SourceInstances.record(None, Ring(), 20, seed=0).periodic == (False, False)
+
+
+def test_the_task_of_a_loaded_models_transfer_stays_periodic(tmp_path):
+    FittedRMax(TellingRing(), transfer=COMBREL(ring_source(0)), seed=0, resolution=3).learn(20).save(tmp_path / "ring")
+    assert FittedRMax.load(tmp_path / "ring").policy.transfer.task.periodic == tuple(PERIODIC)

@@ -105,7 +105,7 @@ class TestByRLZoo:
             assert load() == 1
             assert re.fullmatch(r"sb3_combrel\.zoo: .*no connection.*\n", capsys.readouterr().err)
         monkeypatch.delenv("TRUST_REMOTE_CODE")
-        assert load() == 1 and "TRUST_REMOTE_CODE" in capsys.readouterr().err
+        assert load() == 1 and "TRUST_REMOTE_CODE" in capsys.readouterr().err and not Path("logs").exists()
 
 
 @pytest.mark.long

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from sb3_combrel import SourceInstances
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.version import __version__
 from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
@@ -18,6 +20,7 @@ from sb3_combrel.experiments.benchmark.report import few_runs, write_report
 from sb3_combrel.experiments.benchmark.runs import jobs_of
 from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
+from sb3_combrel.experiments.suite.tasks import Source
 from sb3_combrel.runs.job import described, file_name
 from sb3_combrel.runs.runner import LOCAL, Backend, prepare_folder, run_missing
 from sb3_combrel.runs.source_files import FOLDER, load_or_learn
@@ -57,7 +60,6 @@ def benchmark(
     chosen_pairs, chosen_methods = pairs_of(pairs), methods_of(methods)
     _check_names("pairs", chosen_pairs)
     _check_names("methods", chosen_methods)
-    _check_sources(chosen_pairs)
     backend.check()
     console = console or Console()
     prepare_folder(output)
@@ -104,7 +106,7 @@ def prepare_sources(
     found: dict[str, tuple[SourceInstances, ...]] = {}
     failed = {}
     for pair in pairs:
-        files = [output / FOLDER / f"{source.name}.npz" for source in pair.sources]
+        files = [output / FOLDER / file_of(source, pair) for source in pair.sources]
         try:
             rows = zip(files, pair.sources, strict=True)
             found[pair.name] = tuple(load_or_learn(file, source.learn, console) for file, source in rows)
@@ -122,12 +124,7 @@ def _check_names(argument: str, chosen: Sequence[Pair] | Sequence[Method]) -> No
         raise ValueError(f"{argument} must be at least one, with different names, got {', '.join(names) or 'none'}")
 
 
-def _check_sources(pairs: Sequence[Pair]) -> None:
-    """Two sources that have the same file must be recorded in the same way."""
-    seen: dict[str, Any] = {}
-    for pair in pairs:
-        for source in pair.sources:
-            how = described(source.learn)
-            if seen.setdefault(source.name, how) != how:
-                other = f"another pair has a source of the name {source.name!r} that is recorded in another way"
-                raise ValueError(f"{pair.name}: {other}; rename one")
+def file_of(source: Source, pair: Pair) -> str:
+    """Name of the file of a pair's source: another one if it is recorded in another way."""
+    how = json.dumps([__version__, pair.digest, described(source.learn)])
+    return f"{source.name}-{hashlib.sha256(how.encode()).hexdigest()[:8]}.npz"

@@ -98,8 +98,7 @@ def note_of(name: str, cell: Cell) -> str:
         notes.append(f"the same as {cell.run_as}")
     if len(cell.outcomes) > 1 and len({(*each.steps, *each.returns) for each in cell.outcomes}) == 1:
         notes.append("all runs alike")
-    # In Markdown a bar would end the cell.
-    return "; ".join(notes).replace("|", "\\|")
+    return "; ".join(notes)
 
 
 def estimate_text(estimate: Estimate) -> str:

@@ -50,13 +50,13 @@ class BenchmarkRun(Job):
     def carry_out(self) -> Result:
         """Learn, if the method fits the pair; raises RuntimeError if no episode has ended."""
         with chosen_on_purpose():
-            # If the learner alone cannot be made, it is not the method that does not fit.
-            with closing(self.make_env()) as env:
-                FittedRMax(env, seed=self.seed, **self.learner)
             try:
                 with closing(self.make_env()) as env:
                     self.make_model(env)
             except ValueError as error:
+                # If the learner alone cannot be made, it is not the method that does not fit.
+                with closing(self.make_env()) as env:
+                    FittedRMax(env, seed=self.seed, **self.learner)
                 return self.result(more={"misfit": " ".join(str(error).split())})
         result = super().carry_out()
         if not result.steps:
@@ -118,9 +118,9 @@ def _mapping_steps(transfer: Any, result: Result, callbacks: list[BaseCallback])
 def jobs_of(
     pairs: Sequence[Pair], methods: Sequence[Method], seeds: Sequence[int], sources: Mapping[str, tuple[SourceInstances, ...]]
 ) -> list[BenchmarkRun]:
-    """Make the runs, seed by seed, so that methods can be compared before all are complete; equal ones once."""
+    """Make the runs, seed by seed, so that methods can be compared before all are complete; those of equal methods once."""
     by_name = {method.name: method for method in methods}
-    jobs: dict[str, BenchmarkRun] = {}
+    jobs: dict[tuple[str, str, int], BenchmarkRun] = {}
     for seed in seeds:
         for pair in pairs:
             for method in methods:
@@ -128,5 +128,5 @@ def jobs_of(
                 task: dict[str, Any] = {"env": pair.target, "n_steps": pair.n_steps, "n_episodes": pair.n_episodes}
                 own: dict[str, Any] = {"pair": pair, "of_method": by_name[name], "sources": sources[pair.name]}
                 job = BenchmarkRun(group=pair.name, method=name, seed=seed, learner=pair.learner, **task, **own)
-                jobs.setdefault(job.name, job)
+                jobs.setdefault((pair.name, name, seed), job)
     return list(jobs.values())

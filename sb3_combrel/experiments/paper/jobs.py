@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +14,6 @@ from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import Domain
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.job import Job, Result
-from sb3_combrel.runs.runner import FOLDER, read_result
 
 #: The diagnosis: what transfer saves at breadths of the learner's kernel.
 BREADTHS = (0.05, 0.1, 0.2, 0.3, 0.4)
@@ -148,12 +146,6 @@ def diagnosis_jobs(domain: Domain, setting: str, sources: m.Sources, n_runs: int
 def method_at(method: str, breadth: float) -> str:
     """Name of a method at a breadth."""
     return f"{method} at {breadth:g}"
-
-
-def results_in(output: Path, domain: str) -> list[tuple[dict[str, Any], Result]]:
-    """Read settings and results of all runs of a domain that a folder has, whichever call they are from."""
-    found = (read_result(output, path.stem) for path in sorted((output / FOLDER).glob(f"{domain}_*.json")))
-    return [each for each in found if each is not None and not each[1].error]
 
 
 def steps_by_method(results: Iterable[Result]) -> dict[str, np.ndarray]:

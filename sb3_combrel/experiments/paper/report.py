@@ -14,10 +14,11 @@ from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper import selections, tables
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
 from sb3_combrel.experiments.paper.figures import draw_baselines, draw_curves, draw_diagnosis, draw_selection, draw_times
-from sb3_combrel.experiments.paper.jobs import results_in, steps_by_method
+from sb3_combrel.experiments.paper.jobs import steps_by_method
 from sb3_combrel.experiments.paper.targets import BASELINES, CONTROLS, DIAGNOSIS, Target
 from sb3_combrel.experiments.paper.verdicts import CONTROL, PAPERS, judge, verdict_table
 from sb3_combrel.runs.job import Result, chosen_on_purpose, make_env
+from sb3_combrel.runs.runner import read_results
 
 EAST = "East"
 
@@ -29,7 +30,7 @@ def write_report(
     names = [name for name in DOMAINS if any(name in target.methods for target in targets)]
     by_domain = {name: [result for result in results if result.group == name] for name in names}
     # With the runs of earlier calls: they may have been for other figures.
-    every = {name: [result for _, result in results_in(output, name)] for name in names}
+    every = {name: [result for _, result in read_results(output, f"{name}_")] for name in names}
     made = [write_csv(tables.runs_frame(every[name]), output / f"{name}.csv") for name in names]
     for target in targets:
         have = {name: by_domain[name] for name in target.methods}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +13,21 @@ from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baselines import baseline_jobs
 from sb3_combrel.experiments.paper.domains import DOMAINS, SETTINGS, Domain
-from sb3_combrel.experiments.paper.jobs import diagnosis_jobs, jobs_of, results_in
+from sb3_combrel.experiments.paper.jobs import diagnosis_jobs, jobs_of
 from sb3_combrel.experiments.paper.mappings import most_frequent_mapping
 from sb3_combrel.experiments.paper.report import write_report
 from sb3_combrel.experiments.paper.targets import BASELINES, DIAGNOSIS, methods_of, targets_of
 from sb3_combrel.runs.job import Job, Result
-from sb3_combrel.runs.runner import LOCAL, Backend, check_all_succeeded, run_missing
+from sb3_combrel.runs.runner import (
+    FOLDER,
+    LOCAL,
+    Backend,
+    check_all_succeeded,
+    prepare_folder,
+    read_result,
+    read_results,
+    run_missing,
+)
 
 OUTPUT = "reproduction"
 
@@ -56,8 +65,7 @@ def reproduce(
     console = console or Console()
     output = output or Path(OUTPUT) / setting
     domains = [domain for domain in DOMAINS.values() if any(domain.name in each.methods for each in targets)]
-    # Checks the folder, before sources are written to it.
-    run_missing([], output)
+    prepare_folder(output)
     jobs: list[Job] = []
     sources, counts = {}, {}
     for domain in domains:
@@ -78,6 +86,7 @@ def reproduce(
             with_frequent = replace(sources[domain.name], frequent=frequent_mapping(results, domain, sources[domain.name]))
             console.print(f"{m.TIMBREL_FREQUENT}: {with_frequent.frequent!r}", markup=False)
             of_frequent = jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, *counts[domain.name])
+            forget_other_mappings(of_frequent, output)
             results += run_missing(of_frequent, output, backend, console)
             check_all_succeeded(results)
     return write_report(targets, setting, results, output, console)
@@ -86,11 +95,19 @@ def reproduce(
 def _check_folder(output: Path, domain: str, setting: str, n_episodes: int) -> None:
     """Raise an error if the folder has runs of a domain's methods that belong into other figures and tables."""
     now = {"version": __version__, "setting": setting, "n_episodes": n_episodes}
-    for before, result in results_in(output, domain):
+    for before, result in read_results(output, f"{domain}_"):
         other = [f"{key} was {before.get(key)!r} and is {now[key]!r}" for key in now if before.get(key) != now[key]]
         if result.method in m.METHODS and other:
             what = f"results of other settings ({result.name}: {'; '.join(other)})"
             raise ValueError(f"{output} has {what}; use another --output")
+
+
+def forget_other_mappings(jobs: Sequence[Job], output: Path) -> None:
+    """Remove results of the mapping that was the most frequent one in fewer runs, or other ones."""
+    for job in jobs:
+        read = read_result(output, job.name)
+        if read is not None and read[0]["transfer"] != job.settings()["transfer"]:
+            (output / FOLDER / f"{job.name}.json").unlink()
 
 
 def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:

@@ -18,6 +18,7 @@ from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.comparison.measures import episodes_to_reach
 from sb3_combrel.comparison.tables import Table, write_csv
 from sb3_combrel.experiments.tasks import icub_arm
+from sb3_combrel.experiments.warm_up import warm_up
 from sb3_combrel.runs.job import Job, Result
 from sb3_combrel.runs.runner import Backend, check_all_succeeded, run_missing
 
@@ -97,10 +98,12 @@ def breadths(
     for breadth in breadths:
         check_positive("breadths", breadth)
     console = Console()
+    warm_up()
     results = run_missing(jobs_of(seeds, episodes, breadths), output, Backend(n_jobs=workers), console)
     check_all_succeeded(results)
     summary = summary_of(results)
-    write_csv(summary.round({"ms_per_step": 2}), output / "summary.csv")
+    as_text = {"episodes_until_learnt": summary["episodes_until_learnt"].map("{:.0f}".format)}
+    write_csv(summary.round({"ms_per_step": 2}).assign(**as_text), output / "summary.csv")
     table = table_of(summary, episodes)
     (output / "tables.md").write_text(f"# {TITLE}\n\n{table.as_markdown()}")
     console.print(table.for_terminal())

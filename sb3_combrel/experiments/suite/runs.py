@@ -20,7 +20,7 @@ from sb3_combrel.experiments.suite.transfers import TRANSFERS, source_for
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.episodes import EVALUATION_SEED, Episodes, play
 from sb3_combrel.runs.job import Job, Result, file_name
-from sb3_combrel.runs.runner import FOLDER, read_result
+from sb3_combrel.runs.runner import read_results
 from sb3_combrel.sources.source_instances import SourceInstances
 
 RUNS_FILE, EPISODES_FILE = "runs.csv", "episodes.csv"
@@ -113,14 +113,14 @@ def suite_runs(
 
 def records(folder: Path) -> list[tuple[dict[str, Any], Result]]:
     """Return settings and results of all complete runs in a folder, by task, variant and seed."""
-    found = (read_result(folder, file.stem) for file in (folder / FOLDER).glob("*.json"))
-    complete = [each for each in found if each is not None and not each[1].error]
-    return sorted(complete, key=lambda each: (each[1].group, each[1].method, each[1].seed))
+    return sorted(read_results(folder), key=lambda each: (each[1].group, each[1].method, each[1].seed))
 
 
 def write_csv_files(folder: Path) -> None:
     """Write ``runs.csv``, one row a run, and ``episodes.csv``, one row an episode of learning, of all complete runs."""
     found = records(folder)
+    if not found:
+        return
     runs = pd.DataFrame([result.more["row"] for _, result in found])
     write_csv(runs.assign(settings=[json.dumps(settings) for settings, _ in found]), folder / RUNS_FILE)
     episodes = [

@@ -95,7 +95,7 @@ class MappingTransfer(Transfer):
         if self.use == "instances" and is_factored(self.mappings):
             raise ValueError(f'factored mappings need use="prior", got use="instances" with {self.mappings!r}')
         if self.use == "prior" and self.relevance:
-            raise ValueError('relevance must be False with use="prior": no instances are transferred, got True')
+            raise ValueError(f'relevance must be False with use="prior": no instances are transferred, got {self.relevance!r}')
         check_source(self.source)
         check_mappings(self.mappings)
         check_positive("source_breadth", self.source_breadth)

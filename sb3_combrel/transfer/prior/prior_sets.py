@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
+from sb3_combrel.mappings.mapping_set import FACTORED_SETS
 from sb3_combrel.mappings.named_sets import InterTaskMapping, resolve
 from sb3_combrel.mappings.state_mappings import copies_of_source, with_mirrored
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -26,7 +27,6 @@ from sb3_combrel.transfer.prior.prior_choice import (
 )
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
-FACTORED_SETS = ("factored", "signed_factored")
 # Each copy predicts every transition with each source action.
 MAX_COPIES = 2000
 

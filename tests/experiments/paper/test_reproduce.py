@@ -7,12 +7,14 @@ from functools import partial
 
 import pytest
 from helpers.paper_results import check_figure, made_up, quiet
+from helpers.walk import Walk
 
 from sb3_combrel.experiments.paper import baselines
 from sb3_combrel.experiments.paper import reproduce as command
 from sb3_combrel.experiments.paper.domains import DOMAINS
 from sb3_combrel.experiments.paper.targets import TARGETS
-from sb3_combrel.runs.runner import FOLDER, Backend, JobError
+from sb3_combrel.runs.job import Job
+from sb3_combrel.runs.runner import FOLDER, Backend, JobError, read_results, run_missing
 
 TINY = {"runs": 2, "episodes": 2, "backend": Backend(n_jobs=1)}
 TABLES = {"table2": 3, "table4": 2, "table5": 1, "table6": 4, "measures": 2}
@@ -178,6 +180,12 @@ class TestBadInput:
         with pytest.raises(JobError, match=r"COMBREL, seed 5000: ValueError: model_breadth must .*-1.0"):
             reproduce("fig4", runs=1, output=tmp_path / "output")
         assert not list((tmp_path / "output").glob("*.csv"))
+
+    def test_runs_of_a_mapping_that_was_the_most_frequent_before_are_made_again(self, tmp_path):
+        jobs = [Job(group="icub", method="m", seed=seed, env=Walk, n_steps=9) for seed in (0, 1)]
+        run_missing(jobs, tmp_path, Backend(n_jobs=1))
+        command.forget_other_mappings([jobs[0], replace(jobs[1], transfer="another")], tmp_path)
+        assert [result.seed for _, result in read_results(tmp_path)] == [0]
 
     def test_too_few_episodes_for_a_most_frequent_mapping(self):
         results = [made_up("icub", "COMBREL", 0, [9])]
