@@ -330,9 +330,9 @@ class FittedRMaxAgent:
                 self.planner.set_upper(transfer.value_bound())
             return pairs
         changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
-        if not np.any(changed):
-            return NO_PAIRS
-        return np.flatnonzero(np.broadcast_to(np.ravel(changed), self.model.known.shape) & ~self.model.known)
+        if isinstance(changed, np.ndarray):
+            return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
+        return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
 
     def _widen(self, reward: float) -> None:
         """Keep the lower bound of the values below what the worst reward seen could add up to."""

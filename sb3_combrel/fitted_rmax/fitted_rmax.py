@@ -316,19 +316,20 @@ class FittedRMax(SavedAlgorithm):
         self.num_timesteps += self.env.num_envs
         self._update_info_buffer(infos, dones)
         raw_rewards = self._raw_rewards(rewards)
-        next_obs, terminated = true_outcomes(new_obs, dones, infos)
+        ended = [e for e, done in enumerate(dones.tolist()) if done]
+        next_obs, terminated = true_outcomes(new_obs, infos, ended)
         next_states = self.policy.to_unit(next_obs)
         for e, choice in enumerate(choices):
-            self.agent.update(states[e], choice, raw_rewards[e], next_states[e], bool(terminated[e]), e)
+            self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
             self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if dones.any() else next_states
+        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if ended else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         # The end of an episode is processed even if a callback stops the learning at this step.
         going_on = callback.on_step()
-        for e in np.flatnonzero(dones).tolist():
-            self._end_episode(e, bool(terminated[e]))
+        for e in ended:
+            self._end_episode(e, terminated[e])
             if log_interval is not None and self._episode_num % log_interval == 0:
                 callback.on_rollout_end()
                 self.dump_logs()

@@ -41,10 +41,13 @@ def refuse_normalized_observations(env: VecEnv) -> None:
         )
 
 
-def true_outcomes(new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each step led before environments reset themselves, and whether that was terminal, which a time limit is not."""
-    next_obs, terminated = np.array(new_obs), np.array(dones, dtype=bool)
-    for e in np.flatnonzero(dones):
+def true_outcomes(new_obs: Any, infos: list[dict[str, Any]], ended: list[int]) -> tuple[np.ndarray, list[bool]]:
+    """Where each step led before environments reset themselves, and whether that was terminal, which a time limit is not.
+
+    :param ended: the environments whose episode has ended
+    """
+    next_obs, terminated = np.array(new_obs), [False] * len(infos)
+    for e in ended:
         next_obs[e] = infos[e]["terminal_observation"]
         terminated[e] = not infos[e].get("TimeLimit.truncated", False)
     return next_obs, terminated

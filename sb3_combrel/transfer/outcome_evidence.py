@@ -144,8 +144,9 @@ class RegionErrors:
 
     def note(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray) -> None:
         """Add a transition whose effect was ``predicted``; unit coordinates."""
-        part = np.clip((state * N_PARTS).astype(np.int64), 0, N_PARTS - 1)
-        error, moved = (float((each * each).sum()) for each in (effect - predicted, effect))
+        # At every step: for so few numbers plain Python is faster than NumPy.
+        part = [min(max(int(unit * N_PARTS), 0), N_PARTS - 1) for unit in state.tolist()]
+        error, moved = (sum(number * number for number in each.tolist()) for each in (effect - predicted, effect))
         self.sums[action, self._variables, part] += 1.0, error, moved, error > moved
 
     def forget(self) -> None:

@@ -67,16 +67,11 @@ class Method:
     def __post_init__(self) -> None:
         check_name(self.name)
 
-    def run_as(self, pair: Pair) -> str:
-        """Name of the method that makes the same in a pair, or its own; see :func:`run_as`."""
-        other = None if self.same_as is None else self.same_as(pair)
-        return self.name if other is None else other
-
 
 def run_as(method: Method, methods: Sequence[Method], pair: Pair) -> str:
     """Name of the method whose runs are those of one in a pair: its own where the one that makes the same is not chosen."""
-    name = method.run_as(pair)
-    return name if any(each.name == name for each in methods) else method.name
+    other = None if method.same_as is None else method.same_as(pair)
+    return other if other is not None and any(each.name == other for each in methods) else method.name
 
 
 def the_one(sources: Sources, name: str) -> SourceInstances:

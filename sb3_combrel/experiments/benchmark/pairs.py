@@ -9,7 +9,7 @@ from gymnasium.wrappers import DiscretizeAction
 
 from sb3_combrel import FactoredMapping, InterTaskMapping
 from sb3_combrel.experiments.benchmark.pair import Pair, recorded
-from sb3_combrel.experiments.suite.tasks import ACROBOT, CAP, CAR_2D, CART_POLE, SLIGHT_NOISE, STRIKE, TORSO, make_acrobot
+from sb3_combrel.experiments.suite.tasks import ACROBOT, CAP, CAR_2D, CART_POLE, SLIGHT_NOISE, TORSO, make_acrobot
 from sb3_combrel.experiments.tasks import cart_pole, icub_arm, mountain_car
 from sb3_combrel.experiments.tasks.cart_with_pendulum import make_cart_with_pendulum
 from sb3_combrel.experiments.tasks.disguised import disguise, disguised
@@ -55,7 +55,7 @@ ICUB = Pair(
     target=icub_arm.TARGET_ID,
     n_steps=5000,
     threshold=50.0,
-    learner=STRIKE,
+    learner=icub_arm.LEARNER,
     known=FactoredMapping(JOINT_COPIES),
     known_by_action=tuple(JOINT_COPIES[a // 2] for a in range(2 * N_JOINTS)),
 )

@@ -19,7 +19,7 @@ from sb3_combrel.experiments.suite.tasks import Source, Task
 from sb3_combrel.experiments.suite.transfers import TRANSFERS, source_for
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.episodes import EVALUATION_SEED, Episodes, play
-from sb3_combrel.runs.job import Job, Result, file_name
+from sb3_combrel.runs.job import Job, Result
 from sb3_combrel.runs.runner import read_results
 from sb3_combrel.sources.source_instances import SourceInstances
 
@@ -50,11 +50,6 @@ class SuiteRun(Job):
     task: Task
     variant: Variant
     evaluation_episodes: int
-
-    @property
-    def name(self) -> str:
-        """Name of the run in files."""
-        return file_name(self.task.name, self.variant.name, self.seed)
 
     def settings(self) -> dict[str, Any]:
         """What the result depends on besides the names."""

@@ -98,8 +98,6 @@ def make_noisy(env_id: str, **kwargs: Any) -> gym.Env:
 
 #: Steps after which an episode of combrel's Mountain Cars is cut off.
 CAP = 2000
-#: A hit by the first command returns 99.
-STRIKE: dict[str, Any] = {"max_value": 100.0}
 #: As in zoo_configs/fitted_rmax.yml: the bounds of the velocities leave out what the swing-up does not reach.
 ACROBOT: dict[str, Any] = {"gamma": 0.99, "bounds": ([-np.pi, -np.pi, -7.0, -12.0], [np.pi, np.pi, 7.0, 12.0])}
 
@@ -159,7 +157,7 @@ _ALL = (
         Task(
             f"ICubTorso{suffix}",
             partial(make_env, f"combrel/ICubTorsoStrike{noisy}-v0"),
-            STRIKE,
+            icub_arm.LEARNER,
             n_steps=4000,
             measures=(_TORSO_SETTLED, _NEAR_50),
             headline=headline,
@@ -171,7 +169,7 @@ _ALL = (
         Task(
             f"ICubArm{suffix}",
             partial(make_env, f"combrel/ICubArmStrike{noisy}-v0"),
-            STRIKE,
+            icub_arm.LEARNER,
             n_steps=10_000,
             measures=(_NEAR_50,),
             headline=_NEAR_50.name,
