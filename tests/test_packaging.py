@@ -75,7 +75,7 @@ dispatcher.Dispatcher.compile = no_compiling
 import sb3_combrel
 sb3_combrel.FittedRMax, sb3_combrel.COMBREL, sb3_combrel.TIMBREL, sb3_combrel.SourceInstances
 extras = "mujoco dm_control rl_zoo3 sb3_contrib optuna minari icub_models matplotlib pandas tyro combrel_envs".split()
-sys.exit(str([name for name in extras if name in sys.modules]).strip("[]"))
+sys.exit(" ".join(name for name in extras if name in sys.modules) or None)
 """
     run("-c", code)
 

@@ -131,7 +131,7 @@ def test_an_unbounded_cosine_is_accepted():
     np.testing.assert_allclose(env.observation_space.high, [np.pi] + [np.inf] * 3, rtol=1e-6)
 
 
-def test_fitted_rmax_needs_no_argument_for_a_wrapped_environment(tmp_path):
+def test_fitted_rmax_needs_no_argument_for_a_wrapped_environment():
     env = make_vec_env("Acrobot-v1", n_envs=2, seed=0, wrapper_class=AngleObservation)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -23,20 +23,23 @@ def ray_cluster(n_workers=2):
 
     :return: address of the head
     """
-    port = free_port()
-    common = ("--block", "--node-ip-address", HOST, "--object-store-memory", "100000000")
+    from ray.util import get_node_ip_address
+
+    # Workers look for the head at this machine's address in the network, if it has one, even where they are told HOST.
+    port, host = free_port(), get_node_ip_address()
+    common = ("--block", "--node-ip-address", host, "--object-store-memory", "100000000")
     head = ("--head", "--port", port, "--ray-client-server-port", free_port(), "--num-cpus", 0)
     quiet = ("--include-dashboard", "false", "--disable-usage-stats")
     with ExitStack() as stack:
         # Not pytest's folder: the paths of Ray's sockets would be too long.
         folder = stack.enter_context(short_folder())
         begin = ("-m", "ray.scripts.scripts", "start", *common)
-        options = [(*head, *quiet, "--temp-dir", folder)] + n_workers * [("--address", f"{HOST}:{port}", "--num-cpus", 1)]
+        options = [(*head, *quiet, "--temp-dir", folder)] + n_workers * [("--address", f"{host}:{port}", "--num-cpus", 1)]
         for number, own in enumerate(options):
             log = folder / f"start{number}.log"
             process = stack.enter_context(running(*begin, *own, log=log))
             wait_until(lambda log=log: "Ray runtime started" in log.read_text(), process, log)
-        yield f"{HOST}:{port}"
+        yield f"{host}:{port}"
 
 
 @contextmanager

@@ -224,12 +224,11 @@ except KeyboardInterrupt:
     program.send_signal(signal.SIGINT)
     printed, noise = program.communicate(timeout=60)
     assert printed == "interrupted\n" and "Traceback" not in noise
-    pids = [int(file.name.split(".")[1]) for file in tmp_path.glob("toys_long*")]
-    alive = [Path(f"/proc/{pid}/cmdline") for pid in pids]
+    alive = began = [Path("/proc", file.name.split(".")[1], "cmdline") for file in tmp_path.glob("toys_long*")]
     while alive and time.monotonic() < end + 60:
         alive = [file for file in alive if file.exists() and file.read_bytes()]
         time.sleep(0.1)
-    assert len(pids) == 2 and not alive
+    assert len(began) == 2 and not alive
     assert [job.attempts() for job in toys(tmp_path, 1)] == [1]
     runner.run_missing(toys(tmp_path, 2), tmp_path / "out", HERE)
     assert [job.attempts() for job in toys(tmp_path, 2)] == [1, 1]

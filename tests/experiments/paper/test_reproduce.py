@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -85,9 +87,11 @@ class TestChain:
 
 @pytest.mark.long
 def test_everything_from_nothing(tmp_path):
-    """The whole chain, with episodes of their full length and sources that are learned."""
-    run = partial(reproduce, "all", episodes=10, setting="paper", backend=Backend(), output=tmp_path / "output")
-    _, written = run()
+    """The whole chain, in a process of its own: with episodes of their full length, and sources that are learned."""
+    command = [sys.executable, "-m", "sb3_combrel.cli", "reproduce", "all", "--setting", "paper", "--runs", "2"]
+    command += ["--episodes", "10", "--output", str(tmp_path / "output")]
+    run = partial(subprocess.run, command, capture_output=True, text=True, check=True)
+    written = run().stdout
     for name in ("fig2", "fig3", "fig4", "fig5", "fig6"):
         check_figure(tmp_path / "output", name)
     for name, number in TABLES.items():
@@ -96,8 +100,7 @@ def test_everything_from_nothing(tmp_path):
         lines = (tmp_path / "output" / f"{name}.csv").read_text().splitlines()
         assert len(lines) == 1 + 2 * n_methods and all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
     before = files_in(tmp_path / "output")
-    _, again = run()
-    assert ", seed 50" in written and ", seed 50" not in again and files_in(tmp_path / "output") == before
+    assert ", seed 50" in written and ", seed 50" not in run().stdout and files_in(tmp_path / "output") == before
 
 
 @pytest.mark.long
