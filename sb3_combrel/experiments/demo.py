@@ -26,7 +26,7 @@ from sb3_combrel.experiments.tasks import mountain_car
 from sb3_combrel.experiments.warm_up import warm_up
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder
 from sb3_combrel.runs.job import Job, Result, chosen_on_purpose, make_env
-from sb3_combrel.runs.runner import FOLDER, Backend, check_all_succeeded, prepare_folder, run_missing
+from sb3_combrel.runs.runner import FOLDER, Backend, check_all_succeeded, prepare_folder, result_file, run_missing
 from sb3_combrel.runs.source_files import load_or_learn
 
 SOURCE, TENSORBOARD = "source.npz", "tensorboard"
@@ -134,7 +134,7 @@ def run_demo(
     ]
     incomplete = [run for run in runs if not run.model_file.exists()]
     for run in incomplete:
-        (output / FOLDER / f"{run.name}.json").unlink(missing_ok=True)
+        result_file(output, run.name).unlink(missing_ok=True)
     if incomplete:
         with console.status("Compiling; the first time this takes a while ..."):
             warm_up()

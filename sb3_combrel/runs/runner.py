@@ -158,10 +158,15 @@ def check_all_succeeded(results: Sequence[Result]) -> None:
         raise JobError(f"{title}: {first.error}{others}\n{first.traceback}".rstrip())
 
 
+def result_file(output: Path, name: str) -> Path:
+    """The file of a job's settings and result; without it the job is carried out again."""
+    return output / FOLDER / f"{name}.json"
+
+
 def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None:
     """Read the settings and the result of a job from a folder; None if it has none or a file that is not whole."""
     try:
-        content = json.loads((output / FOLDER / f"{name}.json").read_text())
+        content = json.loads(result_file(output, name).read_text())
         return dict(content["settings"]), Result(**content["result"])
     except (FileNotFoundError, ValueError, TypeError, KeyError):
         return None
@@ -203,7 +208,7 @@ def _settings(job: Job) -> dict[str, Any]:
 
 def _write(job: Job, result: Result, output: Path) -> None:
     content = {"settings": _settings(job), "result": vars(result)}
-    write_whole(output / FOLDER / f"{job.name}.json", (json.dumps(content) + "\n").encode())
+    write_whole(result_file(output, job.name), (json.dumps(content) + "\n").encode())
 
 
 def _carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Result]]:

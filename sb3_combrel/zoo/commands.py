@@ -16,8 +16,9 @@ import gymnasium
 from sb3_combrel.zoo.plot_checks import check_window, with_evaluations
 
 PROGRAM = "python -m sb3_combrel.zoo"
-# What a configuration or an argument causes.
+# Packages of the extra "zoo".
 OF_EXTRA = ("huggingface_hub", "huggingface_sb3", "matplotlib", "optuna", "pandas", "rl_zoo3", "sb3_contrib", "seaborn")
+# What a configuration or an argument causes.
 USERS_ERRORS = (ValueError, AssertionError, OSError, ImportError, gymnasium.error.Error)
 FUNCTIONS = {
     "train": "rl_zoo3.train",

@@ -19,13 +19,13 @@ from sb3_combrel.experiments.paper.report import write_report
 from sb3_combrel.experiments.paper.targets import BASELINES, DIAGNOSIS, methods_of, targets_of
 from sb3_combrel.runs.job import Job, Result
 from sb3_combrel.runs.runner import (
-    FOLDER,
     LOCAL,
     Backend,
     check_all_succeeded,
     prepare_folder,
     read_result,
     read_results,
+    result_file,
     run_missing,
 )
 
@@ -107,7 +107,7 @@ def forget_other_mappings(jobs: Sequence[Job], output: Path) -> None:
     for job in jobs:
         read = read_result(output, job.name)
         if read is not None and read[0]["transfer"] != job.settings()["transfer"]:
-            (output / FOLDER / f"{job.name}.json").unlink()
+            result_file(output, job.name).unlink()
 
 
 def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:
