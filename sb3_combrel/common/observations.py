@@ -16,11 +16,12 @@ ROUNDING = 1e-6
 
 
 @compiled
-def scale_into_box(states, low, ranges, periodic, units):
-    """``StateScaling.to_unit``, and what is outside the unit cube is moved to its boundary, or wrapped into it.
+def scale_into_box(states, low, ranges, periodic, fixed, observed, units):
+    """``StateScaling.to_unit``; what is outside fixed bounds is moved to the boundary, and periodic variables are wrapped.
 
     :param states: float64, raw units, shape (n, n_variables); ``units`` receives the unit coordinates
-    :return: whether anything was moved, or is no number
+    :param observed: float64, shape (2, n_variables) or (0, n_variables): receives the least and the largest observations
+    :return: whether anything is outside, or is no number
     """
     outside = False
     for i in range(len(states)):
@@ -29,8 +30,12 @@ def scale_into_box(states, low, ranges, periodic, units):
             if periodic[k]:
                 # Not a number if the observation is infinite.
                 unit -= np.floor(unit)
-            units[i, k] = min(max(unit, 0.0), 1.0)
-            if units[i, k] != unit:
+            if len(observed) > 0:
+                observed[0, k] = min(observed[0, k], states[i, k])
+                observed[1, k] = max(observed[1, k], states[i, k])
+            inside = min(max(unit, 0.0), 1.0)
+            units[i, k] = inside if fixed or periodic[k] else unit
+            if inside != unit:
                 outside = True
     return outside
 
@@ -41,29 +46,37 @@ _scale_into_box = EntryPoint(scale_into_box)
 class ObservationScaler:
     """Scales observations to unit coordinates; what lies outside the bounds is moved to the boundary, with one warning.
 
-    Periodic variables are wrapped instead: any angle is the same as one between the bounds.
+    Periodic variables are wrapped instead: any angle is the same as one between the bounds. Nothing is moved where the bounds
+    are not fixed: they will be wider soon.
 
     :param scaling: raw <-> unit coordinates
     :param periodic: one bool for each state variable; None: none is periodic
+    :param fixed: whether the bounds are the user's
     """
 
-    def __init__(self, scaling: StateScaling, periodic: Sequence[bool] | None = None):
-        self.scaling = scaling
+    def __init__(self, scaling: StateScaling, periodic: Sequence[bool] | None = None, fixed: bool = True):
+        self.scaling, self._fixed = scaling, fixed
         self._periodic = flag_array(periodic, scaling.n_variables)
         # Compiled code takes arrays that can be written to, and those of the scaling cannot.
         self._low, self._range = scaling.low.copy(), scaling.high - scaling.low
         self._warned = False
+        #: Whether anything was outside the bounds.
+        self.went_beyond = False
 
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        self._unnoted = np.empty((0, scaling.n_variables))
+
+    def __call__(self, observations: np.ndarray, observed: np.ndarray | None = None) -> np.ndarray:
         """:param observations: raw units, shape (..., n_variables)
-        :return: unit coordinates in [0, 1], same shape
+        :param observed: least and largest observations, raw units, shape (2, n_variables): brought up to date
+        :return: unit coordinates, in [0, 1] if the bounds are fixed, same shape
         :raises ValueError: if an observation is not finite
         """
         raw = np.ascontiguousarray(observations, dtype=np.float64)
         inside = np.empty_like(raw)
         flat = (-1, self.scaling.n_variables)
-        if _scale_into_box.call(raw.reshape(flat), self._low, self._range, self._periodic, inside.reshape(flat)):
-            excess = self.scaling.to_unit(raw) - inside
+        scales, noted = (self._low, self._range, self._periodic, self._fixed), self._unnoted if observed is None else observed
+        if _scale_into_box.call(raw.reshape(flat), *scales, noted, inside.reshape(flat)):
+            excess = self.scaling.to_unit(raw) - np.clip(inside, 0.0, 1.0)
             with np.errstate(invalid="ignore"):
                 # Whole periods are no excess; what is not finite stays so.
                 excess[..., self._periodic] *= 0.0
@@ -74,7 +87,8 @@ class ObservationScaler:
         """Refuse what is not finite, warn once of what is outside the bounds by more than rounding."""
         if not np.isfinite(excess).all():
             raise ValueError(f"the environment returned an observation that is not finite: {observations}")
-        if not self._warned and np.abs(excess).max() > ROUNDING:
+        self.went_beyond = True
+        if self._fixed and not self._warned and np.abs(excess).max() > ROUNDING:
             self._warned = True
             warnings.warn(
                 f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "

@@ -50,18 +50,23 @@ class StateScaling:
         :param bounds: ``(low, high)``, raw units, in place of the space's own, each one number, or one a variable
         :raises ValueError: if the space is not such a box or is unbounded and ``bounds`` not given, or if these do not fit it
         """
-        n_variables = _count_variables(space)
-        if bounds is not None:
-            return cls(*_check_bounds(bounds, n_variables))
-        low = np.asarray(space.low, dtype=np.float64)  # type: ignore[attr-defined]
-        high = np.asarray(space.high, dtype=np.float64)  # type: ignore[attr-defined]
+        low, high = cls.limits_of(space, bounds)
         unbounded = np.flatnonzero(~(np.maximum(np.abs(low), np.abs(high)) < _LARGEST_BOUND))
         if unbounded.size:
             raise ValueError(
                 f"the observation space {space} has no finite bounds for the state variable(s) {unbounded.tolist()}; "
-                f"pass bounds=(low, high), each a finite number or a sequence of {n_variables} finite numbers"
+                f"pass bounds=(low, high), each a finite number or a sequence of {len(low)} finite numbers"
             )
         return cls(low, high)
+
+    @staticmethod
+    def limits_of(space: spaces.Space[Any], bounds: Bounds | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As :meth:`from_space`, but the limits themselves, some of which may be infinite: (low, high)."""
+        n_variables = _count_variables(space)
+        if bounds is not None:
+            return _check_bounds(bounds, n_variables)
+        low, high = (np.asarray(limit, dtype=np.float64) for limit in (space.low, space.high))  # type: ignore[attr-defined]
+        return low, high
 
     @property
     def n_variables(self) -> int:

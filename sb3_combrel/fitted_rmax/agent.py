@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from sb3_combrel.common.checks import check_resolution
+from sb3_combrel.common.constants import LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END
 from sb3_combrel.common.periodic import periodic_flags
+from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
-from sb3_combrel.fitted_rmax.loop_detection import EXPLOIT, EXPLORE, OPTIMISTIC, EpisodeMemory, manner, small_cell
+from sb3_combrel.fitted_rmax.optimism import RewardRange
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
-from sb3_combrel.planning.corrections import MAX_VISITS, CorrectionArrays
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
-from sb3_combrel.planning.q_values import NOBODY, PlainValueFunction, Prediction, QValues
-from sb3_combrel.planning.sweeping import NOWHERE, Planner
-from sb3_combrel.planning.visits import Visits
+from sb3_combrel.planning.planner import Planner
+from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
 from sb3_combrel.transfer.base import TargetTask, Transfer
-
-# Lowest return that a state is given, in steps of the worst reward seen: far below every sensible plan.
-LONGEST_PLAN = 10_000
-
-# Backups in multiples of those of a step, passes over the grid, and backups for each pair that transfer has changed.
-AT_EPISODE_END = 400
-BEFORE_FIRST_STEP = 300
-BACKUPS_PER_CHANGED_PAIR = 2
-
-# A time limit reached this often changes nothing; each further time multiplies the threshold by the factor.
-DECAY_AFTER_EPISODES = 10
-THRESHOLD_DECAY = 0.98
 
 
 class FittedRMaxAgent:
@@ -64,7 +53,6 @@ class FittedRMaxAgent:
         self.rng = np.random.default_rng() if rng is None else rng
         self._prediction_rng = self.rng.spawn(1)[0]
         d = task.n_variables
-        self.max_backups = settings.backups_for(d)
         #: Which state variables are periodic.
         self.periodic = periodic_flags(settings.periodic, d)
         self.model_settings = settings.model_settings(d)
@@ -74,7 +62,8 @@ class FittedRMaxAgent:
         transfers = transfer is not None and transfer.informs_model
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
         warn_if_long(self.workload, self.grid)
-        self.n_truncated = self.n_backups = 0
+        self.rewards = RewardRange(settings.gamma, settings.max_value)
+        self.n_sweeps = 0
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
         #: Whether to measure the time of planning, which takes some itself.
@@ -87,11 +76,13 @@ class FittedRMaxAgent:
         self._transfer_decides = transfer is not None and type(transfer).action is not Transfer.action
         if transfer is not None:
             transfer.check_degree(1 if self.model_class.takes_prior else 0)
-            self.target = self._target_task()
-            transfer.bind(self.target, self.rng)
+        self._bind()
         self._build()
-        if transfer is not None:
-            self._widen(transfer.lowest_reward())
+
+    def _bind(self) -> None:
+        if self.transfer is not None:
+            self.target = self._target_task()
+            self.transfer.bind(self.target, self.rng)
 
     def _target_task(self) -> TargetTask:
         return TargetTask(
@@ -105,23 +96,21 @@ class FittedRMaxAgent:
             action_names=tuple(self.task.action_names),
             periodic=self.periodic,
             takes_prior=self.model_class.takes_prior,
-            gamma=self.settings.gamma,
-            max_value=float(self.settings.max_value),
+            gamma=self.rewards.gamma,
+            max_value=self.rewards.max_value,
         )
 
     def _build(self) -> None:
         """Make model and planner, without any instances."""
-        max_value, tolerance = float(self.settings.max_value), self.settings.planning_tolerance
-        self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.settings.gamma)
+        max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
+        self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
         self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
-        self._set_corrections(CorrectionArrays.empty(self.task.n_variables))
-        self.visits = Visits(self.task.n_variables, self.grid.n_points)
+        # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
-
-    def _set_corrections(self, corrections: CorrectionArrays) -> None:
-        self.corrections, self._plain_corrections = corrections, tuple(corrections)
+        if self.transfer is not None:
+            self._widen(self.transfer.lowest_reward())
 
     def reseed(self, rng: np.random.Generator) -> None:
         """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
@@ -135,31 +124,22 @@ class FittedRMaxAgent:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _lock=threading.RLock())
 
-    def act(
-        self,
-        state: np.ndarray,
-        explore: bool = True,
-        episode: int = 0,
-        memory: EpisodeMemory | None = None,
-        environment: int = 0,
-    ) -> int:
+    def act(self, state: np.ndarray, explore: bool = True, environment: int = 0) -> int:
         """Choose an action.
 
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
             first. Otherwise the best of the actions that are known, or else modelled with transferred instances; where a
             source bounds the values, of all.
-        :param episode: in learning, a number that tells the episodes of all environments apart
-        :param memory: in evaluation, what is stored of the episode so far; in a loop other actions are tried
         :param environment: in learning, the number of the environment, for a transfer method that decides actions
         :return: the action, from 0 on
         :raises ValueError: if a transfer method decides on something that is no action
         """
         with self._lock:
             if not explore:
-                return self._exploit(state, memory)
+                return self._exploit(state)
             decided = self._decided_by_transfer(state, environment) if self._transfer_decides else None
-            return self._explore(state, episode) if decided is None else decided
+            return self._explore(state) if decided is None else decided
 
     def _decided_by_transfer(self, state: np.ndarray, environment: int) -> int | None:
         """The action that the transfer method decides on; None if it leaves it to the agent."""
@@ -174,16 +154,11 @@ class FittedRMaxAgent:
             f"got {action!r}"
         )
 
-    def _explore(self, state: np.ndarray, episode: int) -> int:
-        if self.corrections.n_states[0] == len(self.corrections.key):
-            self._set_corrections(self.corrections.with_room())
+    def _explore(self, state: np.ndarray) -> int:
         prediction, given = self.model.predict_at(state)
         if given is not None and self.transfer is not None:
             self.transfer.note_use(given)
-        elif self.model.accepts_visited:
-            self._note_visit(state, prediction)
-        visitor = (episode, 5 * self.planner.tolerance, MAX_VISITS)
-        best = self._q.compute(prediction, state, self._value_function(self.planner.values), visitor)
+        best = self._q.compute(prediction, state, self._value_function(self.planner.values))
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())
             best = int(ties[self.rng.integers(len(ties))])
@@ -191,27 +166,15 @@ class FittedRMaxAgent:
             self.n_optimistic_actions += 1
         return best
 
-    def _note_visit(self, state: np.ndarray, prediction: Prediction) -> None:
-        """Let grid points beside which all has been known often enough count as known (see ``planning.visits``)."""
-        threshold, n_optimistic = self.model.exploration_threshold, self.mdp.arrays.n_optimistic
-        points = self.visits.note(state, prediction.weight, threshold, n_optimistic, self.grid.plain)
-        if len(points):
-            pairs = (np.arange(self.task.n_actions)[:, None] * self.grid.n_points + points).reshape(-1)
-            self._outdated.append(self.model.accept(pairs))
-
-    def _exploit(self, state: np.ndarray, memory: EpisodeMemory | None) -> int:
-        mode = manner(memory, self.planner.is_bounded)
-        prediction = self._evaluate(state, self.planner.exploitation_values() if mode == EXPLOIT else None)
-        q = self._q.q
+    def _exploit(self, state: np.ndarray) -> int:
+        """The best of what is known: nobody has seen what the others do."""
+        prediction = self._evaluate(state)
         eligible = prediction.weight >= self.model.exploration_threshold
         if not eligible.any():
             eligible = prediction.modelled
-        if mode == EXPLORE or (mode == OPTIMISTIC and not eligible.any()):
-            eligible = np.ones(len(q), dtype=np.bool_)
-        action = int(np.where(eligible, q, -np.inf).argmax())
-        if memory is not None:
-            memory.note(small_cell(state, self.grid), float(q[action]), float(prediction.reward[action]), self.settings.gamma)
-        return action
+        if self.planner.is_bounded or not eligible.any():
+            return int(self._q.q.argmax())
+        return int(np.where(eligible, self._q.q, -np.inf).argmax())
 
     def sample_action(self, state: np.ndarray) -> int:
         """Choose an action as in learning, optimistic ones first, but for a prediction: it does not change what is learned."""
@@ -232,12 +195,11 @@ class FittedRMaxAgent:
 
     def _evaluate(self, state: np.ndarray, values: np.ndarray | None = None) -> Prediction:
         prediction, _ = self.model.predict_at(state)
-        function = self._value_function(self.planner.values if values is None else values)
-        self._q.compute(prediction, state, function, NOBODY)
+        self._q.compute(prediction, state, self._value_function(self.planner.values if values is None else values))
         return prediction
 
-    def _value_function(self, values: np.ndarray) -> PlainValueFunction:
-        return values, self._plain_corrections, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.upper
+    def _value_function(self, values: np.ndarray) -> ValueFunction:
+        return ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.upper)
 
     def update(
         self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
@@ -250,12 +212,13 @@ class FittedRMaxAgent:
         :param environment: see :meth:`act`
         """
         with self._lock:
+            self.rewards.note(reward, terminated)
             self._widen(reward)
             self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
             if self.transfer is not None:
                 self.transfer.environment = environment
                 self.transfer.observe(state, action, reward, next_state, terminated)
-            self._plan(self.max_backups, NOWHERE if terminated else next_state)
+            self._plan(SWEEPS_A_STEP)
 
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """Plan on while no action is due.
@@ -264,63 +227,63 @@ class FittedRMaxAgent:
         :param environment: see :meth:`act`
         """
         with self._lock:
-            if truncated:
-                self.n_truncated += 1
-                self._outdated.append(self.model.lower_threshold(self._lowered_threshold()))
+            self.rewards.n_truncated += bool(truncated)
             if self.transfer is not None:
                 self.transfer.environment = environment
                 self.transfer.end_episode(truncated)
-                self._outdated.append(self.model.outdated())
             self._outdated.append(self.model.end_episode())
-            self._plan(AT_EPISODE_END * self.max_backups)
+            self._plan(SWEEPS_AT_EPISODE_END)
 
-    def complete(self) -> None:
-        """Bring the model up to date with all transitions, as at an episode's end: what is saved is what is predicted with."""
+    def rescale(self, scaling: StateScaling, keeps: bool = True) -> None:
+        """Compute all anew in other unit coordinates.
+
+        :param scaling: raw <-> unit coordinates from now on
+        :param keeps: whether to keep what has been learned
+        """
         with self._lock:
-            pairs = self.model.end_episode()
-            if len(pairs):
-                self._outdated.append(pairs)
-                self._plan(0)
-
-    def _lowered_threshold(self) -> float:
-        # Exploration would otherwise not end where a narrow kernel cannot know all that is within an episode's reach.
-        full, min_weight = self.model_settings.exploration_threshold, self.model_settings.min_weight
-        return max(full * THRESHOLD_DECAY ** max(0, self.n_truncated - DECAY_AFTER_EPISODES), min(full, min_weight))
+            before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
+            self.task = replace(self.task, scaling=scaling)
+            self._bind()
+            self._build()
+            if not keeps:
+                return
+            self._widen(min(0.0, lowest) / LONGEST_PLAN)
+            for state, action, reward, next_state, terminated in transitions:
+                state, next_state = (scaling.to_unit(before.to_raw(each)) for each in (state, next_state))
+                self.model.add(state, action, reward, next_state, terminated)
+                if self.transfer is not None:
+                    self.transfer.observe(state, action, reward, next_state, terminated)
+            self._outdated.append(self.model.end_episode())
+            self._plan(SWEEPS_AT_EPISODE_END)
 
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""
         with self._lock:
-            # Episodes are numbered from 0 again.
-            self.corrections.visits.fill(0)
-            self._plan(0)
-            if self.transfer is not None or self.model.n_instances > 0:
-                self.planner.restart()
-                self.n_backups += self.planner.sweep_all(BEFORE_FIRST_STEP)
+            if self.transfer is not None and self.model.n_instances == 0:
+                self._plan(SWEEPS_AT_EPISODE_END)
 
-    def _plan(self, max_backups: int, around: np.ndarray = NOWHERE) -> None:
-        """Update the rows of the pairs that changed, and plan; longer where transfer changed many pairs at once."""
+    def _plan(self, max_sweeps: int) -> None:
+        """Update the rows of the pairs that changed, and sweep over the grid."""
         began = perf_counter() if self.timed else None
-        changed = NO_PAIRS if self._model_transfer is None else self._changed_by(self._model_transfer)
-        passes = 0
-        if len(changed):
-            self._outdated.append(changed)
-            backups = BACKUPS_PER_CHANGED_PAIR * len(changed)
-            passes = backups // self.grid.n_points
-            max_backups += backups if passes == 0 else 0
-        # Left on the list until all is done: an interrupt in between loses no change.
+        self._follow_rewards()
+        if self._model_transfer is not None:
+            self._outdated.append(self._changed_by(self._model_transfer))
         pairs = self._outdated[0] if len(self._outdated) == 1 else np.unique(np.concatenate([NO_PAIRS, *self._outdated]))
-        while len(pairs) > MAX_PAIRS_AT_ONCE:
-            some, pairs = pairs[:MAX_PAIRS_AT_ONCE], pairs[MAX_PAIRS_AT_ONCE:]
-            self.model.update_rows(some)
-            self.n_backups += self.planner.update(some, 0)
-        if len(pairs):
-            self.model.update_rows(pairs)
-        self.n_backups += self.planner.update(pairs, max_backups, around)
+        for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
+            self.model.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
         self._outdated.clear()
-        if passes:
-            self.n_backups += self.planner.sweep_all(passes)
+        self.n_sweeps += self.planner.sweep(max_sweeps)
         if began is not None:
             self.planning_seconds += perf_counter() - began
+
+    def _follow_rewards(self) -> None:
+        """Plan with other optimism, or another discount, if what rewards have shown asks for it."""
+        gamma, max_value = self.rewards.gamma, self.rewards.max_value
+        if gamma != self.mdp.gamma:
+            self.mdp.gamma = gamma
+            self._outdated.append(np.flatnonzero(self.mdp.arrays.modelled))
+        if max_value != self.planner.bounds[1]:
+            self.planner.set_max_value(max_value)
 
     def _changed_by(self, transfer: Transfer) -> np.ndarray:
         """The pairs for which transfer has changed: all for a new prior, or those, not known, that may have new instances."""
@@ -348,28 +311,23 @@ class FittedRMaxAgent:
                 **self.model.get_state(),
                 "values": self.planner.values.copy(),
                 "lowest_value": np.array([self.planner.bounds[0]]),
-                "n_truncated": np.array([float(self.n_truncated)]),
-                "corrections": self.corrections.rows(),
-                "visits": self.visits.counts.astype(np.float64),
+                "rewards": self.rewards.get_state(),
             }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`get_state` returned; what has been learned since is forgotten."""
         with self._lock:
+            self.rewards.set_state(state["rewards"])
             self._build()
-            self.n_truncated = int(state["n_truncated"][0])
             if self.transfer is not None:
-                self.transfer.bind(self.target, self.rng)
+                self._bind()
                 prefix = "transfer_"
                 self.transfer.set_state({name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)})
-            self.model.lower_threshold(self._lowered_threshold())
             self.model.set_state(state)
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
             if self.transfer is not None and self.transfer.use == "prior":
                 self.planner.set_upper(self.transfer.value_bound())
             self.planner.restore(state["values"])
-            self._set_corrections(CorrectionArrays.of_rows(state["corrections"]))
-            self.visits.counts[:] = np.clip(state["visits"], 0, np.iinfo(np.int32).max)
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""
@@ -380,8 +338,7 @@ class FittedRMaxAgent:
                 "model/known": known,
                 "model/transferred": modelled - known,
                 "model/optimistic": 1.0 - modelled,
-                "model/threshold": self.model.exploration_threshold,
-                "planner/queued": self.planner.n_queued,
-                "planner/corrections": int(self.corrections.n_states[0]),
+                "planner/max_value": self.planner.bounds[1],
+                "planner/gamma": self.mdp.gamma,
             }
             return figures if self.transfer is None else {**figures, **self.transfer.statistics()}

@@ -52,20 +52,15 @@ class FittedRMax(SavedAlgorithm):
 
     - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables, the box for more.
     - What was known once stays known (the original falls back when a nearer instance shortens the list).
-    - Planning is bounded by ``max_backups`` a step, points around the agent first; most others are backed up at an episode's
-      end. Staying in a grid point is summed in closed form.
-    - With ``degree=1`` the planner's model leads several steps ahead, until a cell of the grid is left (``max_model_steps``):
-      values that are interpolated at every step spread over the grid.
-    - With ``degree=1``, as long as no episode has ended and all rewards were alike, what is known is decided by a kernel that
-      narrows whenever nearly all is known: otherwise a small goal might not be found.
-    - Where the agent returns to the same small cell many times in an episode, an interpolated value that is too high is
-      corrected (see ``sb3_combrel.planning.corrections``): otherwise the agent could be caught in a loop for ever.
-    - A time limit is not a terminal state. After ten of them each further one lowers the threshold by 2%, so that
-      exploration ends where a narrow kernel cannot know all that is within reach.
+    - Planning is full Gauss-Seidel sweeps over the grid, two a step, and until little changes when an episode ends. Staying
+      in a grid point is summed in closed form.
+    - With ``degree=1`` the planner's model holds an action until a cell of the grid is left: values that are interpolated at
+      every step spread over the grid.
+    - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``).
+    - A time limit is not a terminal state.
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
-    transferred instances; ``deterministic=False`` takes optimistic ones first, as in learning. Pass the state that it returns
-    to the next call, as ``evaluate_policy`` does: the policy then notices when it is caught in a loop.
+    transferred instances; ``deterministic=False`` takes optimistic ones first, as in learning.
 
     ::
 
@@ -87,16 +82,14 @@ class FittedRMax(SavedAlgorithm):
         keeps at most 11 instances a pair, 0.01 (the original's) 101
     :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach. None: 0.05 with
         ``degree=1``, 0.01 with ``degree=0``
-    :param exploration_threshold: weight of instances that makes a state-action pair known, before it is lowered
+    :param exploration_threshold: weight of instances that makes a state-action pair known
     :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: at
         least 6 for one or two variables, 4 for three, 3 for more, and finer if the breadth needs it and memory allows.
-    :param max_value: an upper bound on the return from any state, the value of what is unknown
-    :param gamma: discount factor, in (0, 1]
-    :param planning_tolerance: changes of value up to this are not propagated
-    :param max_backups: grid points backed up in a step at most, besides those whose model changed; 400 times as many when an
-        episode ends. None: 1600 / 2^d with d state variables (400 / 2^d with ``degree=0``)
-    :param max_instances: of one action; beyond, the nearest instance is replaced (with ``degree=0`` the one in the fewest
-        lists of grid points). None: no limit.
+    :param max_value: an upper bound on the return from any state, the value of what is unknown. None: found from the rewards
+        seen so far, as the largest return that they allow, see :class:`~sb3_combrel.fitted_rmax.optimism.RewardRange`
+    :param gamma: discount factor, in (0, 1]. None: found as well: 0.99, or 1 where every step costs and episodes end
+    :param planning_tolerance: sweeps end when no value changes by more
+    :param max_instances: of one action; beyond, the nearest instance is replaced. None: no limit.
     :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
         where those are infinite
     :param degree: of the local model: 1, effects are fitted as linear functions of the state to the instances near it
@@ -104,11 +97,7 @@ class FittedRMax(SavedAlgorithm):
         instances (:class:`~sb3_combrel.models.kernel_average.KernelAverage`)
     :param n_neighbors: with ``degree=1``, instances that a fit is made to. None: 16 for one or two state variables, 24 for
         three, 30 for four, 40 for five, 60 for more
-    :param outcome_breadth: with ``degree=1``, breadth of the narrower kernel by which rewards, ends, and what a fit leaves
-        unexplained are averaged
-    :param max_model_steps: with ``degree=1``, the planner follows an action from a grid point by the local fit until a cell of
-        the grid is left, but for no more than so many steps; 1: one step, as the original does. None: 3 for four or five
-        state variables, 50 for fewer or more.
+    :param outcome_breadth: with ``degree=1``, the broadest that the kernel is by which arrivals decide on ends
     :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
         Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
         says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.
@@ -143,16 +132,14 @@ class FittedRMax(SavedAlgorithm):
         min_weight: float | None = DEFAULTS.min_weight,
         exploration_threshold: float = DEFAULTS.exploration_threshold,
         resolution: int | Sequence[int] | None = DEFAULTS.resolution,
-        max_value: float = DEFAULTS.max_value,
-        gamma: float = DEFAULTS.gamma,
+        max_value: float | None = DEFAULTS.max_value,
+        gamma: float | None = DEFAULTS.gamma,
         planning_tolerance: float = DEFAULTS.planning_tolerance,
-        max_backups: int | None = DEFAULTS.max_backups,
         max_instances: int | None = DEFAULTS.max_instances,
         bounds: tuple[Any, Any] | None = DEFAULTS.bounds,
         degree: int = DEFAULTS.degree,
         n_neighbors: int | None = DEFAULTS.n_neighbors,
         outcome_breadth: float = DEFAULTS.outcome_breadth,
-        max_model_steps: int | None = DEFAULTS.max_model_steps,
         periodic: Sequence[bool] | None = DEFAULTS.periodic,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -185,13 +172,11 @@ class FittedRMax(SavedAlgorithm):
         self.max_value = max_value
         self.gamma = gamma
         self.planning_tolerance = planning_tolerance
-        self.max_backups = max_backups
         self.max_instances = max_instances
         self.bounds = bounds
         self.degree = degree
         self.n_neighbors = n_neighbors
         self.outcome_breadth = outcome_breadth
-        self.max_model_steps = max_model_steps
         self.periodic = periodic
         self._names: dict[str, Any] = {}
         self._generator_state: dict[str, Any] | None = None
@@ -223,7 +208,7 @@ class FittedRMax(SavedAlgorithm):
         # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
         self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
-        self._progress = ProgressWatch(self.max_value, self.gamma, self.planning_tolerance)
+        self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
         if self.verbose >= 1:
             print(self.agent.workload)
 
@@ -286,8 +271,7 @@ class FittedRMax(SavedAlgorithm):
         callback.on_training_start(locals(), globals())
         callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]
-        self._episode_numbers = np.arange(self.n_envs)
-        self._last_states = self.policy.to_unit(np.asarray(self._last_obs))
+        self._last_states = self.policy.note(np.asarray(self._last_obs))
         self.agent.prepare()
         try:
             while self.num_timesteps < total_timesteps:
@@ -295,7 +279,6 @@ class FittedRMax(SavedAlgorithm):
                     break
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
         finally:
-            self.agent.complete()
             callback.on_training_end()
         return self
 
@@ -307,10 +290,7 @@ class FittedRMax(SavedAlgorithm):
         """Make one step of every environment; return False if a callback stops the learning."""
         assert self.env is not None and isinstance(self._last_obs, np.ndarray)
         states = self._last_states
-        choices = [
-            self.agent.act(state, episode=number, environment=e)
-            for e, (state, number) in enumerate(zip(states, self._episode_numbers.tolist(), strict=True))
-        ]
+        choices = [self.agent.act(state, environment=e) for e, state in enumerate(states)]
         actions = np.array(choices) + self.policy._first_action
         new_obs, rewards, dones, infos = self.env.step(actions)
         self.num_timesteps += self.env.num_envs
@@ -318,12 +298,12 @@ class FittedRMax(SavedAlgorithm):
         raw_rewards = self._raw_rewards(rewards)
         ended = [e for e, done in enumerate(dones.tolist()) if done]
         next_obs, terminated = true_outcomes(new_obs, infos, ended)
-        next_states = self.policy.to_unit(next_obs)
+        next_states = self.policy.note(next_obs)
         for e, choice in enumerate(choices):
             self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
             self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._last_states = self.policy.to_unit(np.asarray(new_obs)) if ended else next_states
+        self._last_states = self.policy.note(np.asarray(new_obs)) if ended else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         # The end of an episode is processed even if a callback stops the learning at this step.
@@ -334,6 +314,8 @@ class FittedRMax(SavedAlgorithm):
                 callback.on_rollout_end()
                 self.dump_logs()
                 callback.on_rollout_start()
+        if self.policy.follow_scales(episode_ended=bool(ended)):
+            self._last_states = self.policy.to_unit(np.asarray(new_obs))
         return going_on
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
@@ -352,7 +334,6 @@ class FittedRMax(SavedAlgorithm):
 
     def _end_episode(self, env_index: int, terminated: bool) -> None:
         self._episode_num += 1
-        self._episode_numbers[env_index] += self.n_envs
         self.agent.end_episode(not terminated, env_index)
         rewards = self._episode_rewards[env_index]
         self._episode_rewards[env_index] = []
@@ -374,7 +355,7 @@ class FittedRMax(SavedAlgorithm):
         if self.logger.output_formats and self.logs_statistics:
             for name, value in self.agent.statistics().items():
                 self.logger.record(name, value)
-        self.logger.record("planner/backups", self.agent.n_backups)
+        self.logger.record("planner/sweeps", self.agent.n_sweeps)
         self.logger.dump(step=self.num_timesteps)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

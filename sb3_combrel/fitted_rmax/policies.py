@@ -12,10 +12,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.observations import ObservationScaler
+from sb3_combrel.common.periodic import flag_array, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
-from sb3_combrel.fitted_rmax.loop_detection import EpisodeMemory, memories
+from sb3_combrel.fitted_rmax.scales import FoundScales
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
@@ -54,15 +55,38 @@ class FittedRMaxPolicy(BasePolicy):
         if model_class is not None and not (isinstance(model_class, type) and issubclass(model_class, Model)):
             raise ValueError(f"model_class must be a subclass of Model or None, got {model_class!r}")
         given = FittedRMaxSettings(**settings)
-        self.scaling = StateScaling.from_space(observation_space, given.bounds)
+        n_variables = len(StateScaling.limits_of(observation_space, given.bounds)[0])
+        self.scales = FoundScales(observation_space, given.bounds, flag_array(periodic_flags(given.periodic, n_variables), n_variables))
         names = (() if given_names is None else given_names for given_names in (state_names, action_names))
-        task = Task(self.scaling, int(action_space.n), *names)
+        task = Task(self.scales.scaling, int(action_space.n), *names)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
-        #: Observations, raw units, to unit coordinates; what is outside the bounds is moved to the boundary, or wrapped.
-        self.to_unit = ObservationScaler(self.scaling, self.agent.periodic)
+        self._renew_to_unit()
         self._first_action = int(action_space.start)
         self._settings = settings
         self._model_class = model_class
+
+    def _renew_to_unit(self) -> None:
+        #: Observations, raw units, to unit coordinates; what is outside fixed bounds is moved to the boundary, or wrapped.
+        self.to_unit = ObservationScaler(self.scaling, self.agent.periodic, self.scales.fixed)
+
+    @property
+    def scaling(self) -> StateScaling:
+        """Raw <-> unit coordinates."""
+        return self.scales.scaling
+
+    def note(self, observations: np.ndarray) -> np.ndarray:
+        """Unit coordinates of observations of learning, which may ask for other scales (see :meth:`follow_scales`)."""
+        return self.to_unit(observations, self.scales.observed)
+
+    def follow_scales(self, episode_ended: bool) -> bool:
+        """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
+        if self.scales.fixed or not (episode_ended or self.to_unit.went_beyond):
+            return False
+        scaling = self.scales.renewed(episode_ended)
+        if scaling is not None:
+            self.agent.rescale(scaling)
+            self._renew_to_unit()
+        return scaling is not None
 
     @property
     def transfer(self) -> Any:
@@ -78,57 +102,20 @@ class FittedRMaxPolicy(BasePolicy):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose actions for observations.
-
-        :param observation: one, or a batch of them
-        :param state: what the last call returned, of the same environments: with it a deterministic policy notices when it
-            is caught in a loop; without, actions depend on the observation alone
-        :param episode_start: bool, one for each observation: whether an episode begins with it
-        :param deterministic: the best known action; otherwise optimistic actions first, as in learning
-        :return: actions, and the state for the next call (None if not deterministic)
-        :raises ValueError: if ``state`` is not what a call for as many observations returned
-        """
-        if state is None or not deterministic:
-            # With no state given there may be none in the next call either: what costs time begins with the next call.
-            actions, _ = super().predict(observation, None, None, deterministic)
-            episodes = memories(None, None, np.size(actions))
-        else:
-            tensor, vectorized = self.obs_to_tensor(observation)
-            episodes = memories(state, episode_start, len(tensor))  # type: ignore[arg-type]
-            actions = self._act(tensor, episodes)  # type: ignore[arg-type]
-            actions = actions if vectorized else actions.squeeze(axis=0)
-        if not deterministic:
-            return actions, None
-        next_state = np.empty(len(episodes), dtype=object)
-        next_state[:] = episodes
-        return actions, (next_state,)
-
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        n = len(observation)
-        actions = self._act(observation, [None] * n) if deterministic else self._act(observation, None)  # type: ignore[arg-type]
+        """The best known actions; without ``deterministic`` optimistic actions first, as in learning."""
+        states = self.to_unit(observation.cpu().numpy())  # type: ignore[union-attr]
+        agent = self.agent
+        chosen = [agent.act(state, explore=False) if deterministic else agent.sample_action(state) for state in states]
+        actions = np.array(chosen, dtype=np.int64) + self._first_action
         return th.as_tensor(actions, device=observation.device)  # type: ignore[union-attr]
 
-    def _act(self, observation: th.Tensor, episodes: Sequence[EpisodeMemory | None] | None) -> np.ndarray:
-        """Deterministic actions, with the memories of episodes; or sampled ones, without."""
-        states = self.to_unit(observation.cpu().numpy())
-        if episodes is None:
-            chosen = [self.agent.sample_action(state) for state in states]
-        else:
-            chosen = [
-                self.agent.act(state, explore=False, memory=memory) for state, memory in zip(states, episodes, strict=True)
-            ]
-        return np.array(chosen, dtype=np.int64) + self._first_action
+    def _learned(self) -> dict[str, np.ndarray]:
+        return {**self.agent.get_state(), "scales": self.scales.get_state()}
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name, array in self.agent.get_state().items():
+        for name, array in self._learned().items():
             # Column by column: a file of it becomes a tenth smaller.
             destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
 
@@ -152,7 +139,7 @@ class FittedRMaxPolicy(BasePolicy):
         unexpected_keys: list[str],
         error_msgs: list[str],
     ) -> None:
-        expected = self.agent.get_state()
+        expected = self._learned()
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
@@ -163,7 +150,11 @@ class FittedRMaxPolicy(BasePolicy):
         problems = [problem for name, tensor in saved.items() if (problem := _misfit(name, tensor, expected[name]))]
         error_msgs.extend(problems)
         if not problems:
-            self.agent.set_state({name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()})
+            arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
+            self.scales.set_state(arrays.pop("scales"))
+            self.agent.rescale(self.scales.scaling, keeps=False)
+            self.agent.set_state(arrays)
+            self._renew_to_unit()
 
 
 def _misfit(name: str, tensor: Any, expected: np.ndarray) -> str:

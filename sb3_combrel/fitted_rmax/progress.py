@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 
+from sb3_combrel.fitted_rmax.optimism import RewardRange
+
 # So many episodes in a row are no coincidence.
 IDLE_EPISODES = 3
 EQUAL_RETURNS = 20
@@ -20,11 +22,21 @@ class ProgressWatch:
       exploration reaches makes a difference.
     """
 
-    def __init__(self, max_value: float, gamma: float, tolerance: float):
-        self.max_value, self.gamma, self.tolerance = float(max_value), float(gamma), float(tolerance)
+    def __init__(self, rewards: RewardRange, tolerance: float):
+        self.rewards, self.tolerance = rewards, float(tolerance)
         self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
         self._warned: set[str] = set()
+
+    @property
+    def max_value(self) -> float:
+        """The value of what is unknown."""
+        return self.rewards.max_value
+
+    @property
+    def gamma(self) -> float:
+        """The discount factor."""
+        return self.rewards.gamma
 
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
         """Look at an episode.

@@ -51,9 +51,8 @@ class SavedAlgorithm(BaseAlgorithm):
         A transfer method is saved as plain data, with its source instances; one of your own by what ``Transfer.arguments``
         returns. What cannot be written so is left out, with a warning, and must be passed to :meth:`load`.
 
-        A model saved at the end of an episode and loaded learns on as this one would, bit for bit. In the middle of an episode
-        its planning is completed first. Not saved but computed again are ``TIMBREL``'s random draws, and lists shortened by an
-        instance that ``max_instances`` has since removed.
+        A loaded model predicts what this one does, and learns on as this one would, bit for bit. Not saved but computed again
+        are ``TIMBREL``'s random draws.
 
         :param path: of the file; .zip is added if it has no suffix
         :param exclude: names of attributes that are excluded as well
@@ -138,7 +137,7 @@ class SavedAlgorithm(BaseAlgorithm):
             raise ParametersError(f"load_path_or_dict: {' '.join(str(error).split())}") from error
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_episode_numbers", "_last_states", "_progress"]
+        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_last_states", "_progress"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

@@ -12,18 +12,12 @@ from sb3_combrel.models.base import Model, ModelSettings
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.models.local_linear import LocalLinear
 
-# Corners of grid cells looked at in a step by default, by degree: a backup costs as much as a cell has corners.
-CORNERS_A_STEP = {0: 400, 1: 1600}
 # By degree of the local model and number of state variables, the last one for more.
 DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
 DEFAULT_NEIGHBORS = (16, 16, 24, 30, 40, 60)
 DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
-# Of degree 1. Mountain Car 4D must change between its actions more often than once a cell.
-DEFAULT_MODEL_STEPS = (50, 50, 50, 3, 3, 50)
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
-# At an episode's end there are 400 times as many, which must fit into an int64.
-MAX_BACKUPS = 10**12
-MAX_MODEL_STEPS = MAX_NEIGHBORS = 10_000
+MAX_NEIGHBORS = 10_000
 
 
 @dataclass(frozen=True)
@@ -37,15 +31,13 @@ class FittedRMaxSettings:
     model_breadth: float | None = None
     n_neighbors: int | None = None
     outcome_breadth: float = 0.05
-    max_model_steps: int | None = None
     min_fraction: float = 0.1
     min_weight: float | None = None
     exploration_threshold: float = 1.0
     resolution: int | Sequence[int] | None = None
-    max_value: float = 0.0
-    gamma: float = 1.0
+    max_value: float | None = None
+    gamma: float | None = None
     planning_tolerance: float = 0.001
-    max_backups: int | None = None
     max_instances: int | None = 20_000
     bounds: tuple[Any, Any] | None = None
     periodic: Sequence[bool] | None = None
@@ -57,28 +49,21 @@ class FittedRMaxSettings:
             check_positive("model_breadth", self.model_breadth)
         check_count("n_neighbors", self.n_neighbors, min=2, max=MAX_NEIGHBORS, none_allowed=True)
         check_positive("outcome_breadth", self.outcome_breadth)
-        check_count("max_model_steps", self.max_model_steps, max=MAX_MODEL_STEPS, none_allowed=True)
-        if self.degree == 0 and self.max_model_steps not in (None, 1):
-            given = self.max_model_steps
-            raise ValueError(f"max_model_steps must be 1 or None with degree=0, the original algorithm, got {given}")
         check_positive("min_fraction", self.min_fraction, max=1.0)
         if self.min_weight is not None:
             check_positive("min_weight", self.min_weight, max=0.99)
         check_positive("exploration_threshold", self.exploration_threshold)
-        check_positive("gamma", self.gamma, max=1.0)
+        if self.gamma is not None:
+            check_positive("gamma", self.gamma, max=1.0)
         check_positive("planning_tolerance", self.planning_tolerance)
-        check_finite("max_value", self.max_value)
-        check_count("max_backups", self.max_backups, min=0, max=MAX_BACKUPS, none_allowed=True)
+        if self.max_value is not None:
+            check_finite("max_value", self.max_value)
         check_count("max_instances", self.max_instances, none_allowed=True)
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
         """The names of all arguments."""
         return tuple(field.name for field in fields(cls))
-
-    def backups_for(self, n_variables: int) -> int:
-        """The backups of a step with so many state variables."""
-        return int(_or(self.max_backups, max(1, CORNERS_A_STEP[self.degree] // 2**n_variables)))
 
     def model_settings(self, n_variables: int) -> ModelSettings:
         """What a model of a task with so many state variables needs of them."""
@@ -90,7 +75,6 @@ class FittedRMaxSettings:
             max_instances=self.max_instances,
             n_neighbors=int(_or(self.n_neighbors, _by_number(DEFAULT_NEIGHBORS, n_variables))),
             outcome_breadth=float(self.outcome_breadth),
-            max_model_steps=int(_or(self.max_model_steps, _by_number(DEFAULT_MODEL_STEPS, n_variables) if self.degree else 1)),
         )
 
 

@@ -28,7 +28,6 @@ class ModelSettings:
     max_instances: int | None = None
     n_neighbors: int = 40
     outcome_breadth: float = 0.05
-    max_model_steps: int = 1
 
 
 class Predictions(NamedTuple):
@@ -63,9 +62,9 @@ class Model(ABC):
     """A model of the dynamics, kept up to date transition by transition. Everything is in unit coordinates.
 
     A subclass must say what its instances predict, :meth:`predict`, and nothing else: the other methods have defaults, which
-    are slow, as they compute all pairs of an action anew with each of its transitions. A state-action pair is *known* once
-    the weight of the target's own instances reaches the threshold, and stays known. A pair that is not known can be modelled
-    with transferred instances; if it is not, it is optimistic.
+    are slow, as they compute all pairs of an action anew with each of its transitions. A state-action pair is *known* when
+    the weight of the target's own instances reaches the threshold. A pair that is not known can be modelled with transferred
+    instances; if it is not, it is optimistic.
 
     :param mdp: the finite MDP over the sample of states, which the model writes
     :param transfer: where to get instances for pairs that are not known
@@ -73,8 +72,6 @@ class Model(ABC):
 
     #: Whether a transfer method may give the mean that the target's own instances are fitted to (``use="prior"``).
     takes_prior: ClassVar[bool] = False
-    #: Whether grid points beside which all has been known often enough count as known (see ``planning.visits``).
-    accepts_visited: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp, self.grid, self.n_actions = mdp, mdp.grid, mdp.n_actions
@@ -82,7 +79,7 @@ class Model(ABC):
         self.exploration_threshold = float(settings.exploration_threshold)
         self.instances = Instances.empty(self.n_actions, self.grid.n_variables, periodic=self.grid.arrays.periodic)
         n_pairs = self.n_actions * self.grid.n_points
-        # Weight of each pair's own instances, and whether it has reached the threshold.
+        # Weight of each pair's own instances, and whether it reaches the threshold.
         self.own_weight = np.zeros(n_pairs)
         self.known = np.zeros(n_pairs, dtype=np.bool_)
         self._oldest = np.zeros(self.n_actions, dtype=np.int64)
@@ -115,12 +112,25 @@ class Model(ABC):
         put_instance_at.call(self.instances, (action, slot, state, next_state, reward, terminated))
         return np.arange(action * self.grid.n_points, (action + 1) * self.grid.n_points)
 
+    def transitions(self) -> list[tuple[np.ndarray, int, float, np.ndarray, bool]]:
+        """State, action, reward, next state and terminated of all instances, in the order in which they came."""
+        found, d = [], self.grid.n_variables
+        for number, row in zip(self._numbers(), self.instances.rows(), strict=True):
+            state = row[1 : 1 + d]
+            transition = state, int(row[0]), float(row[-2]), state + row[1 + d : 1 + 2 * d], bool(row[-1] > 0.5)
+            found.append((float(number), transition))
+        return [transition for _, transition in sorted(found, key=lambda each: each[0])]
+
+    def _numbers(self) -> np.ndarray:
+        """When each instance came, by action as in ``Instances.rows``."""
+        return np.concatenate([np.arange(n) for n in self.instances.size.tolist()])
+
     def update_rows(self, pairs: np.ndarray) -> None:
         """Bring the rows of at most ``MAX_PAIRS_AT_ONCE`` pairs up to date with the instances and with what is transferred."""
         actions, points = np.divmod(pairs, self.grid.n_points)
         predictions = self.predict(self.grid.states_of(points), actions)
         self.own_weight[pairs] = predictions.weight
-        self.known[pairs] |= predictions.weight >= self.exploration_threshold
+        self.known[pairs] = predictions.weight >= self.exploration_threshold
         modelled = self.known[pairs].copy()
         if self.transfer is not None and not modelled.all():
             given = self.transfer.transferred_to_sample(points, actions, predictions.weight)
@@ -147,29 +157,12 @@ class Model(ABC):
         arrays = map(np.ascontiguousarray, (predictions.probability, predictions.effect))
         return Prediction(modelled, weight, predictions.reward, length, *arrays), given
 
-    def lower_threshold(self, threshold: float) -> np.ndarray:
-        """Be content with less weight; the pairs that become known by that, whose rows are to be updated."""
-        self.exploration_threshold = threshold
-        newly_known = np.flatnonzero(~self.known & (self.own_weight >= threshold))
-        self.known[newly_known] = True
-        return newly_known
-
-    def accept(self, pairs: np.ndarray) -> np.ndarray:
-        """Let pairs count as known from what instances they have; those that become so, whose rows are to be updated."""
-        newly_known = pairs[~self.known[pairs] & (self.own_weight[pairs] > 0.0)]
-        self.known[newly_known] = True
-        return newly_known
-
     def renew_prior(self) -> np.ndarray:
         """Ask the transfer method for its prior again if that may have changed; the pairs whose rows are to be updated."""
         return NO_PAIRS
 
     def end_episode(self) -> np.ndarray:
         """Do what may wait until the end of an episode; the pairs whose rows are to be updated."""
-        return NO_PAIRS
-
-    def outdated(self) -> np.ndarray:
-        """The pairs that are not known and whose own weight has changed since their rows were updated; by default none."""
         return NO_PAIRS
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -179,16 +172,12 @@ class Model(ABC):
         rows = np.vstack([np.roll(some, -oldest, axis=0) for some, oldest in zip(by_action, self._oldest, strict=True)])
         return {
             "instances": np.column_stack([rows, np.ones(len(rows))]),
-            "known": self.known.astype(np.float64),
-            "total": self.own_weight.copy(),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`get_state` returned, and update all rows of the finite MDP; for a new model."""
         self.instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self._oldest[:] = 0
-        self.known[:] = state["known"] > 0.5
-        self.own_weight[:] = state["total"]
         self.update_all_rows()
 
     def update_all_rows(self) -> None:

@@ -2,154 +2,162 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.kernels import list_room
-from sb3_combrel.common.list_store import ListStore
+from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
-from sb3_combrel.models.compiled_model import MIN_CHANGE, CompiledModel
-from sb3_combrel.models.kernel_lists import IN_ITS_SLOT, TO_BE_PUT, KernelLists, ReachScratch, enter, leave_lists, update_rows
-from sb3_combrel.models.kernel_prediction import NearLists, join_transferred, predict_own
-from sb3_combrel.planning.mdp import FiniteMDP
-
-_enter, _leave_lists, _update_rows = EntryPoint(enter), EntryPoint(leave_lists), EntryPoint(update_rows)
-_predict_own, _join_transferred = EntryPoint(predict_own), EntryPoint(join_transferred)
+from sb3_combrel.models.base import InstanceTransfer, ModelSettings
+from sb3_combrel.models.grid_model import GridModel, add_to_row, total_weight
+from sb3_combrel.models.grid_points import PairArrays
+from sb3_combrel.planning.grid import GridArrays, unit_coordinates_of
+from sb3_combrel.planning.mdp import FiniteMDP, MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
+from sb3_combrel.planning.q_values import Prediction
 
 
-class KernelAverage(CompiledModel):
-    """The model of Jong & Stone (2007), one for each action, incremental.
+class NearList(NamedTuple):
+    """The kept instances at a state."""
+
+    item: np.ndarray  # int32, (list room,): instances, nearest first
+    weight: np.ndarray  # float64, the same
+    at: np.ndarray  # float64, (n_variables,)
+
+
+@inner
+def weight_ever(instances, action, state, kernel, threshold, total):
+    """``total``, the weight of the kept instances at ``state``; ``threshold`` if it had reached that before nearer ones came.
+
+    Let f be ``min_fraction`` and T the threshold. An instance with which a list reaches T weighs at least f times the sum P
+    of those before it, and T - P, hence f T / (1 + f). So lists that reach T consist, up to there, of instances of at
+    least that weight, and once all of these sum to T they always will. A nearer instance can only push such a list below T
+    when what remains has at least T / (1 + f).
+    """
+    breadth, _, min_fraction = kernel
+    if total >= threshold or total * (1.0 + min_fraction) < threshold:
+        return total
+    scale = -1.0 / (breadth * breadth)
+    farthest = np.log(min_fraction * threshold / (1.0 + min_fraction)) / scale
+    everything = 0.0
+    wraps = any_periodic(instances.periodic)
+    for i in range(instances.size[action]):
+        distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
+        if distance <= farthest:
+            everything += np.exp(distance * scale)
+    return threshold if everything >= threshold else total
+
+
+@compiled
+def predict_own(instances, state, kernel, threshold, near, prediction):
+    """Predict every action at ``state`` from the instances that the kernel keeps there; the least weight that one has.
+
+    :param kernel: (breadth, min_weight, min_fraction); plain tuples for the rest
+    """
+    instances, near, prediction = Instances(*instances), NearList(*near), Prediction(*prediction)
+    least = np.inf
+    for action in range(len(instances.size)):
+        length, total = near_instances(instances, action, state, kernel, near.item, near.weight, 0)
+        reward = 0.0
+        n = 0
+        for k in range(length):
+            i, p = near.item[k], near.weight[k] / total
+            reward += p * instances.reward[action, i]
+            if not instances.terminated[action, i]:
+                prediction.probability[action, n] = p
+                for v in range(len(state)):
+                    prediction.effect[action, n, v] = instances.effect[action, i, v]
+                n += 1
+        weight = weight_ever(instances, action, state, kernel, threshold, total)
+        prediction.reward[action], prediction.length[action] = reward, n
+        prediction.weight[action], prediction.modelled[action] = weight, weight >= threshold
+        least = min(least, weight)
+    return least
+
+
+@inlined
+def entry_distance(near, length, total, kernel):
+    """The squared distance within which a further instance would enter a list."""
+    breadth, min_weight, min_fraction = kernel
+    least = min_weight
+    if length > 0:
+        least = max(min_weight, min(near.weight[length - 1], min_fraction * total))
+    return -np.log(least) * breadth * breadth * (1 + 1e-12)
+
+
+@compiled
+def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, near):
+    """Write rows of pairs from the instances that the kernel keeps, and from transferred ones; how many are done.
+
+    :param planned: (gamma, threshold, transitions so far, renewed part); plain tuples for the rest
+    :param which: (pairs, how many of them are done)
+    :param transferred: a row for each of them, which counts only while the pair is not known
+    """
+    instances, pairs, mdp, grid = Instances(*instances), PairArrays(*pairs), MDPArrays(*mdp), GridArrays(*grid)
+    transferred, row_scratch, near = TransferredInstances(*transferred), RowScratch(*row_scratch), NearList(*near)
+    gamma, threshold, transitions, renewed_part = planned
+    which, done = which
+    n_points = len(mdp.n_optimistic)
+    while done < len(which):
+        pair = which[done]
+        point = pair % n_points
+        action = pair // n_points
+        unit_coordinates_of(point, grid, near.at)
+        length, total = near_instances(instances, action, near.at, kernel, near.item, near.weight, 0)
+        weight = weight_ever(instances, action, near.at, kernel, threshold, total)
+        known = weight >= threshold
+        pairs.weight[pair], pairs.known[pair] = weight, known
+        pairs.reach[pair] = entry_distance(near, length, total, kernel)
+        pairs.n_new[pair], pairs.fitted_at[pair] = 0, transitions
+        pairs.renewed_after[pair] = 1 if known else max(1, length // renewed_part)
+        joined = not known and transferred.length[done] > 0
+        if known or joined:
+            coordinates_of(point, grid, row_scratch.at)
+            if joined:
+                total = total_weight(total, transferred, done)
+            reward = 0.0
+            n_touched = np.int64(0)
+            for k in range(length):
+                i, p = near.item[k], near.weight[k] / total
+                reward += p * instances.reward[action, i]
+                if not instances.terminated[action, i]:
+                    n_touched = add_successor(p, instances.effect[action, i], row_scratch, grid, n_touched)
+            if joined:
+                reward, n_touched = add_to_row(reward, n_touched, transferred, done, total, row_scratch, grid)
+            if not finish_row(mdp, gamma, pair, point, reward, n_touched, row_scratch):
+                return done
+        set_modelled(mdp, pair, known or joined)
+        done += 1
+    return done
+
+
+_predict_own, _update_rows = EntryPoint(predict_own), EntryPoint(update_rows)
+
+
+class KernelAverage(GridModel):
+    """The model of Jong & Stone (2007), one for each action.
 
     An instance at distance d (unit coordinates) weighs exp(-d^2 / breadth^2). Instances that weigh less than ``min_weight``
     do not count; of the others, nearest first, one counts while its weight is at least ``min_fraction`` of the sum of those
     before it. A nearer instance can so shorten the list of a known pair, which is a better model, not less knowledge: the
-    pair stays known. With ``max_instances``, the instance in the fewest lists is replaced.
+    pair stays known.
 
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
+        self._own_room = list_room(settings.min_fraction)
         super().__init__(mdp, settings, transfer)
-        d, n_points = self.grid.n_variables, self.grid.n_points
-        lists = KernelLists(
-            lists=ListStore.empty(len(self.known), 1 << 12),
-            entry=np.zeros(len(self.known)),
-            total=self.own_weight,
-            last_total=self.last_weight,
-            known=self.known,
-            **self._of_instances(),
-        )
-        self._set_arrays(lists)
-        self._kernel = (float(settings.model_breadth), float(settings.min_weight), float(settings.min_fraction))
-        self._scratch = ReachScratch(
-            kernel=np.empty((d, int(self.grid.arrays.shape.max()))),
-            at=np.empty((3, d), dtype=np.int64),
-            point=np.empty(n_points, dtype=np.int64),
-            weight=np.empty(n_points),
-        )
-        self._plain_scratch = tuple(self._scratch)
-        self._progress = np.empty(3, dtype=np.int64)
-        self._own_room = room = list_room(settings.min_fraction)
-        near = NearLists(
-            item=np.empty((self.n_actions, room), dtype=np.int32),
-            weight=np.empty((self.n_actions, room)),
-            length=np.zeros(self.n_actions, dtype=np.int64),
-        )
-        self._plain_near = tuple(near)
-        self._make_prediction(room)
+        self._weights = float(settings.model_breadth), float(settings.min_weight), float(settings.min_fraction)
+        room = self._own_room
+        self._near = tuple(NearList(np.zeros(room, dtype=np.int32), np.empty(room), np.empty(self.grid.n_variables)))
 
-    def _set_arrays(self, arrays: KernelLists) -> None:
-        self.arrays, self._plain_arrays = arrays, arrays.plain()
-
-    def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
-        """As :meth:`Model.add`; with a transfer method, pairs of low weight that changed little may wait (``outdated``)."""
-        slot, without = self._slot_for(action)
-        changed = self._enter((action, slot, state, next_state, reward, terminated))
-        return changed if len(without) == 0 else np.union1d(without, changed)
-
-    def _slot_for(self, action: int) -> tuple[int, np.ndarray]:
-        """Where a new instance goes, and the pairs that lost one to make room."""
-        instances = self._instances
-        size = int(instances.size[action])
-        if self.settings.max_instances is not None and size >= self.settings.max_instances:
-            slot = int(self.arrays.n_lists[action, :size].argmin())
-            return slot, self._leave(action, slot)
-        if size == instances.capacity:
-            self.instances = instances.with_room(action)
-            larger = self._of_instances()
-            for name, array in larger.items():
-                array[:, : instances.capacity] = getattr(self.arrays, name)
-            self._set_arrays(self.arrays._replace(**larger))
-        return size, NO_PAIRS
-
-    def _of_instances(self) -> dict[str, Any]:
-        """Those of the arrays that have an entry for each instance, empty."""
-        d, shape = self.grid.n_variables, (self.n_actions, self.instances.capacity)
-        return dict(
-            n_lists=np.zeros(shape, dtype=np.int32),
-            corner_low=np.zeros((*shape, d), dtype=np.int32),
-            corner_offset=np.zeros((*shape, 2**d), dtype=np.int32),
-            corner_weight=np.zeros((*shape, 2**d)),
-        )
-
-    def _enter(self, transition: tuple[Any, ...], begin: int = TO_BE_PUT) -> np.ndarray:
-        """Put an instance into the lists that it reaches; the pairs whose rows are to be updated."""
-        threshold = self.exploration_threshold
-        thresholds = threshold, 0.0 if self.transfer is None else MIN_CHANGE * threshold
-        self._progress[:] = begin, 0, 0
-        instances, grid, scratch = self._plain_instances, self.grid.plain, self._plain_scratch
-        while not _enter.call(
-            instances, self._plain_arrays, grid, self._kernel, thresholds, transition, scratch, self._progress
-        ):
-            self._set_arrays(self.arrays._replace(lists=self.arrays.lists.with_room()))
-        return self._scratch.point[: self._progress[2]] + transition[0] * self.grid.n_points
-
-    def _leave(self, action: int, slot: int) -> np.ndarray:
-        if self.arrays.n_lists[action, slot] == 0:
-            return NO_PAIRS
-        anywhere, grid = np.zeros(self.grid.n_points), self.grid.arrays
-        changed = _leave_lists.call(self.instances, self.arrays, grid, self._kernel, action, slot, anywhere, self._scratch)
-        return self._scratch.point[:changed] + action * self.grid.n_points
-
-    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, own = self.mdp, (self._plain_arrays, self._plain_instances)
-        return int(_update_rows.call(*own, mdp.plain, self.grid.plain, mdp.gamma, pairs, transferred, mdp.plain_scratch))
+    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...], renewed_part: int) -> int:
+        mdp, planned = self.mdp, (self.mdp.gamma, self.exploration_threshold, self.n_added, renewed_part)
+        model = self._plain_experience[0], self._plain_pairs, mdp.plain, self.grid.plain, self._weights
+        return int(_update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
 
     def _predict_own(self, state: np.ndarray) -> float:
-        near, prediction = self._plain_near, self._plain_prediction
-        threshold = self.exploration_threshold
-        return float(_predict_own.call(self._plain_instances, state, self._kernel, threshold, near, prediction))
-
-    def _join_transferred(self, given: TransferredInstances) -> None:
-        near, prediction = self._plain_near, self._plain_prediction
-        _join_transferred.call(self._plain_instances, near, tuple(given), self.exploration_threshold, prediction)
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        state = super().get_state()
-        listed = [self.arrays.n_lists[action, :size] > 0 for action, size in enumerate(self.instances.size.tolist())]
-        state["instances"][:, -1] = np.concatenate(listed)
-        return state
-
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Rebuild all from the instances; saved weights that differ by rounding only are used, and what was known stays so."""
-        rows, known, total = state["instances"], state["known"] > 0.5, state["total"]
-        rows = rows[np.argsort(np.clip(rows[:, 0], 0, self.n_actions - 1), kind="stable")]
-        self.instances = instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
-        self._set_arrays(self.arrays._replace(**self._of_instances()))
-        slots = [(action, slot) for action, size in enumerate(instances.size.tolist()) for slot in range(size)]
-        for (action, slot), listed in zip(slots, rows[:, -1] > 0.5, strict=True):
-            if listed:
-                at = instances.state[action, slot]
-                self._enter((action, slot, at, at, 0.0, False), IN_ITS_SLOT)
-        arrays = self.arrays
-        same = np.abs(total - arrays.total) <= 1e-9 * arrays.total
-        arrays.total[same] = total[same]
-        listed_pairs = np.flatnonzero(arrays.lists.length > 0)
-        last = arrays.lists.weight[arrays.lists.start[listed_pairs] + arrays.lists.length[listed_pairs] - 1]
-        arrays.entry[listed_pairs] = np.minimum(last, self.settings.min_fraction * arrays.total[listed_pairs])
-        arrays.known[:] = (arrays.lists.length > 0) & (known | (arrays.total >= self.exploration_threshold))
-        self.update_all_rows()
+        given = state, self._weights, self.exploration_threshold, self._near, self._plain_prediction
+        return float(_predict_own.call(self._plain_experience[0], *given))

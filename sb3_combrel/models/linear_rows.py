@@ -1,21 +1,134 @@
-"""Compiled loops of the local linear model: the rows of state-action pairs, from their fits."""
+"""Compiled loops of the local linear model: predictions at exact states, and the rows of grid pairs."""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.constants import MAX_MODEL_STEPS, PRIOR_OUTCOME_WEIGHT, PRIOR_WEIGHT
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.kernels import nearest_instances, squared_distance
+from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.compiled_model import add_to_row, total_weight
-from sb3_combrel.models.fit_arrays import FitScratch, LinearFits
-from sb3_combrel.models.linear_fits import PRIOR_WEIGHT, refit
-from sb3_combrel.planning.grid import GridArrays
-from sb3_combrel.planning.mdp import RowScratch, add_successor, as_mdp, coordinates_of, finish_row, set_modelled
+from sb3_combrel.models.ends import Ends, end_at
+from sb3_combrel.models.grid_model import add_to_row, total_weight
+from sb3_combrel.models.grid_points import PairArrays
+from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, unit_coordinates_of
+from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
+from sb3_combrel.planning.q_values import Prediction
 
+import os
+GRID = float(os.environ.get("GRID", "1"))
+HOLD = int(os.environ.get("HOLD", "1"))
 # In parts of a cell: an effect of less is none.
 STAYS = 1e-6
 
 
+class LinearArrays(NamedTuple):
+    """What the local linear model has besides instances and pairs."""
+
+    target: np.ndarray  # float64, (n_actions, capacity, n_variables): effect of each instance less the prior's
+    # Effect, reward and probability of termination that the prior predicts of each pair; 0 without one.
+    prior: np.ndarray  # float64, (n_pairs, n_variables + 2)
+    claimed: np.ndarray  # bool, (n_pairs,): the prior suffices for a model
+    near: np.ndarray  # int32, (n_actions, n_neighbors): instances near the last exact state
+    n_near: np.ndarray  # int64, (n_actions,): how many these are
+
+
+class LinearScratch(NamedTuple):
+    """Work space; float64."""
+
+    at: np.ndarray  # (n_variables,): unit coordinates of a pair's point
+    away: np.ndarray  # (n_variables,): displacement by several steps
+    step: np.ndarray  # (n_variables,): the effect of a step
+    to: np.ndarray  # (n_variables,): where it leads
+    end: np.ndarray  # (2,): probability of an end there, and what it pays
+
+
 @inlined
-def prior_change(fits, pair, k, grid, at, away):
+def find_nearest(at, action, n_before, instances, kernel, fit):
+    """Find the instances that a fit around ``at`` is made to; how many."""
+    return nearest_instances(instances, action, at, kernel.reach, fit.item, fit.distance, n_before)
+
+
+@inner
+def outcome_of(to, action, length, experience, kernel, fit, end):
+    """Write to ``end`` what arriving at ``to`` means; the squared distance of some arrival."""
+    _, arrivals, ends = experience
+    near = np.inf
+    if length > 0:
+        near = squared_distance(to, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
+    end_at(to, near, kernel.outcome_breadth, arrivals, ends, end)
+    return near
+
+
+@inlined
+def with_prior(own, prior, near, kernel):
+    """A number of an outcome from own arrivals, the nearest known being so far away, and from a prior that is claimed."""
+    weight = np.exp(-near / kernel.outcome_breadth)
+    return (weight * own + PRIOR_OUTCOME_WEIGHT * prior) / (weight + PRIOR_OUTCOME_WEIGHT)
+
+
+@inlined
+def share_of_fit(length, claimed, fit):
+    """The part that a fit has in what is predicted, besides a prior that claims to know."""
+    if length == 0:
+        return 0.0
+    total = fit.factor[0, 0] * fit.factor[0, 0]
+    return total / (total + PRIOR_WEIGHT) if claimed else 1.0
+
+
+@compiled
+def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratch, prediction):
+    """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
+
+    :param experience: (instances, arrivals, ends); plain tuples all of them
+    :param prior: what it predicts at ``state``, float64, shape (n_actions, n_variables + 2); and whether that suffices for a
+        model, bool, shape (n_actions,)
+    """
+    instances = Instances(*experience[0])
+    experience = instances, Instances(*experience[1]), Ends(*experience[2])
+    linear, kernel, fit = LinearArrays(*linear), Kernel(*kernel), LocalFit(*fit)
+    scratch, prediction = LinearScratch(*scratch), Prediction(*prediction)
+    predicted, claimed = prior
+    d = len(state)
+    least = np.inf
+    for action in range(len(linear.n_near)):
+        for k in range(linear.n_near[action]):
+            fit.item[k] = linear.near[action, k]
+        length = find_nearest(state, action, linear.n_near[action], instances, kernel, fit)
+        linear.n_near[action] = length
+        for k in range(length):
+            linear.near[action, k] = fit.item[k]
+        weight = known_weight(fit, length, kernel)
+        if length > 0:
+            fit_around(state, action, length, instances, linear.target, kernel, fit)
+        share = share_of_fit(length, claimed[action], fit)
+        scratch.away[:] = 0.0
+        for v in range(d):
+            effect = predicted[action, v]
+            if length > 0:
+                effect += share * number_at(fit, v, scratch.away)
+            prediction.effect[action, 0, v] = effect
+            scratch.to[v] = state[v] + effect
+        reward = number_at(fit, d, scratch.away) if length > 0 else predicted[action, d]
+        near = outcome_of(scratch.to, action, length, experience, kernel, fit, scratch.end)
+        end = scratch.end[0]
+        reward = (1.0 - end) * reward + end * scratch.end[1]
+        if claimed[action] and weight < threshold:
+            reward = with_prior(reward, predicted[action, d], near, kernel)
+            end = with_prior(end, predicted[action, d + 1], near, kernel)
+        prediction.reward[action] = reward
+        prediction.length[action] = 1 if end < 1.0 and (length > 0 or claimed[action]) else 0
+        prediction.probability[action, 0] = 1.0 - end
+        prediction.weight[action] = weight
+        prediction.modelled[action] = weight >= threshold or claimed[action]
+        least = min(least, weight)
+    return least
+
+
+@inlined
+def prior_change(linear, pair, k, grid, at, away):
     """By how much the prior's effect ``k`` changes from a pair's point to ``away`` from there, linear between grid points."""
     change = 0.0
     for j in range(len(at)):
@@ -24,132 +137,151 @@ def prior_change(fits, pair, k, grid, at, away):
         side = 1 if away[j] > 0.0 else -1
         if not grid.periodic[j] and not 0 <= at[j] + side < grid.shape[j]:
             side = -side
-        to = at[j] + side
-        steps = (to % grid.shape[j]) - at[j]
+        steps = ((at[j] + side) % grid.shape[j]) - at[j]
         beside = pair + steps * grid.strides[j]
-        if fits.claimed[beside] == fits.claimed[pair]:
-            change += (fits.prior[beside, k] - fits.prior[pair, k]) * side * grid.cells[j] * away[j]
+        if linear.claimed[beside] == linear.claimed[pair]:
+            change += (linear.prior[beside, k] - linear.prior[pair, k]) * side * grid.cells[j] * away[j]
     return change
 
 
 @inner
-def follow(fits, pair, action, grid, at, limits, scratch):
-    """Follow a pair's model, the action held, until a variable has changed by a cell of the grid; the number of steps.
+def take_step(pair, length, linear, fit, grid, at, has_prior, scratch):
+    """Write the effect of the next step to ``scratch.step``, within the grid; the part of it until the cell is left."""
+    share = share_of_fit(length, linear.claimed[pair], fit)
+    away, step = scratch.away, scratch.step
+    inside = 1.0
+    moved = False
+    for k in range(len(at)):
+        effect = linear.prior[pair, k]
+        if length > 0:
+            effect += share * number_at(fit, k, away)
+        if has_prior:
+            effect += prior_change(linear, pair, k, grid, at, away)
+        cells = away[k] * grid.cells[k]
+        after = cells + effect * grid.cells[k]
+        if not grid.periodic[k]:
+            after = min(max(after, -float(at[k])), float(grid.shape[k] - 1 - at[k]))
+        moved = moved or abs(after - cells) > STAYS
+        if abs(after) > 1.0:
+            inside = min(inside, ((1.0 if after > 0.0 else -1.0) - cells) / (after - cells))
+        step[k] = (after - cells) / grid.cells[k]
+        scratch.to[k] = scratch.at[k] + away[k] + step[k]
+    return inside if moved else 0.0
 
-    The effect of a step is that of the pair's fit where it begins, within the range of effects; the last step is cut short.
 
-    :param at: grid coordinates of the point
-    :param limits: (max_model_steps, whether there is a prior); ``scratch.away`` receives the displacement
+@inner
+def follow(pair, action, length, known, linear, experience, kernel, fit, grid, at, planned, scratch):
+    """Follow a pair's model, the action held, until a variable has changed by a cell of the grid, or the episode ends.
+
+    :param at: grid coordinates of the point; ``planned``: (gamma, whether there is a prior, most steps)
+    :return: discounted reward, probability that the episode goes on, discount; ``scratch.away`` receives the displacement
     """
-    max_steps, has_prior = limits
     d = len(at)
-    away, step, fit = scratch.away, scratch.step, fits.fit[pair]
-    fitted = fits.n_counted[pair] > 0
-    share = fits.sums[pair, 0] / (fits.sums[pair, 0] + PRIOR_WEIGHT) if fits.claimed[pair] else 1.0
-    low, high = fits.effect_range[0, action], fits.effect_range[1, action]
+    gamma, has_prior, max_steps = planned
+    away = scratch.away
     away[:] = 0.0
-    steps = 0.0
-    fits.clipped[pair] = False
-    while steps < max_steps:
-        part_of_step = 1.0
+    total, goes_on, discount = 0.0, 1.0, 1.0
+    by_prior = linear.claimed[pair] and not known
+    for n in range(max_steps):
+        part = take_step(pair, length, linear, fit, grid, at, has_prior, scratch)
+        reward = number_at(fit, d, away) if length > 0 else linear.prior[pair, d]
+        near = outcome_of(scratch.to, action, length, experience, kernel, fit, scratch.end)
+        end, pays = scratch.end[0], scratch.end[1]
+        reward = (1.0 - end) * reward + end * pays
+        if by_prior:
+            reward = with_prior(reward, linear.prior[pair, d], near, kernel)
+            end = with_prior(end, linear.prior[pair, d + 1], near, kernel)
+        # The first step is never cut short, nor one that may end the episode.
+        taken = 1.0 if n == 0 or end > 0.0 or part == 0.0 else part
+        total += discount * goes_on * taken * reward
+        goes_on *= 1.0 - end
+        discount *= gamma**taken
+        left = False
         for k in range(d):
-            effect = fits.row[pair, k]
-            if fitted:
-                for j in range(d):
-                    effect += share * fit[d + j * d + k] * away[j]
-            if has_prior:
-                effect += prior_change(fits, pair, k, grid, at, away)
-            if effect < low[k] or effect > high[k]:
-                fits.clipped[pair] = True
-                effect = min(max(effect, low[k]), high[k])
-            cells = away[k] * grid.cells[k]
-            after = cells + effect * grid.cells[k]
-            if not grid.periodic[k]:
-                after = min(max(after, -float(at[k])), float(grid.shape[k] - 1 - at[k]))
-            if steps > 0.0 and abs(after) > 1.0:
-                part_of_step = min(part_of_step, ((1.0 if after > 0.0 else -1.0) - cells) / (after - cells))
-            step[k] = (after - cells) / grid.cells[k]
-        farthest = 0.0
-        for k in range(d):
-            away[k] += part_of_step * step[k]
-            farthest = max(farthest, abs(away[k]) * grid.cells[k])
-        steps += part_of_step
-        if part_of_step < 1.0 or farthest >= 1.0 or farthest < STAYS:
+            away[k] += taken * scratch.step[k]
+            left = left or abs(away[k]) * grid.cells[k] >= 1.0
+        if part == 0.0 or taken < 1.0 or left or end > 0.5:
             break
-    return steps
+    return total, goes_on, discount
 
 
-@inner
-def write_row(fits, mdp, grid, gamma, pair, limits, scratch, fit_scratch):
-    """Write the row of a pair whose model is its fit, the prior, or both; False if there is no room.
-
-    Where none of the instances that count has ended an episode, the row leads as many steps ahead as it takes to leave the
-    cell; otherwise one: how far away an end is matters there.
-    """
-    n_points = len(mdp.n_optimistic)
-    point, action = pair % n_points, pair // n_points
-    row = fits.row[pair]
-    d = len(row) - 2
-    reward, end, discount, steps = row[d], row[d + 1], gamma, 1.0
-    n_touched = np.int64(0)
-    if end == 0.0 and fits.n_ended[pair] == 0 and limits[0] > 1:
-        steps = follow(fits, pair, action, grid, scratch.at, limits, fit_scratch)
-        discount = gamma**steps
-        reward *= steps if gamma == 1.0 else (1.0 - discount) / (1.0 - gamma)
-        n_touched = add_successor(1.0, fit_scratch.away, scratch, grid, n_touched)
-    elif end < 1.0:
-        n_touched = add_successor(1.0 - end, row[:d], scratch, grid, n_touched)
-    return finish_row(mdp, discount, pair, point, reward, n_touched, scratch)
-
-
-@inner
-def write_row_with_transferred(fits, mdp, grid, gamma, pair, transferred, asked, scratch):
-    """Write the row of a pair that is not known from its own and transferred instances; False if there is no room."""
-    own = fits.total[pair] if fits.n_counted[pair] > 0 else 0.0
-    total = total_weight(own, transferred, asked)
-    reward = 0.0
-    n_touched = np.int64(0)
-    if own > 0.0:
-        row, d = fits.row[pair], len(grid.shape)
-        reward = own / total * row[d]
-        if row[d + 1] < 1.0:
-            n_touched = add_successor(own / total * (1.0 - row[d + 1]), row[:d], scratch, grid, n_touched)
-    reward, n_touched = add_to_row(reward, n_touched, transferred, asked, total, scratch, grid)
-    return finish_row(mdp, gamma, pair, pair % len(mdp.n_optimistic), reward, n_touched, scratch)
+@inlined
+def note_fit(pair, length, weight, threshold, transitions, renewed_part, pairs, kernel, fit):
+    """Note that a pair has been fitted to its instances."""
+    full = length == kernel.n_neighbors
+    pairs.reach[pair] = fit.distance[length - 1] if full else kernel.reach
+    pairs.n_new[pair] = 0
+    pairs.renewed_after[pair] = max(1, length // renewed_part)
+    pairs.fitted_at[pair] = transitions
+    pairs.weight[pair] = weight
+    pairs.known[pair] = weight >= GRID * threshold
 
 
 @compiled
-def update_rows(fits, mdp, grid, planned, pairs, transferred, scratch, fit_scratch):
-    """Bring rows up to date with the pairs' fits and with transferred instances; how many are done.
+def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, fit, scratch):
+    """Fit pairs anew, and write their rows, with transferred instances for what is not known; how many are done.
 
-    :param planned: (gamma, max_model_steps, whether there is a prior); plain tuples for the rest
-    :param pairs: (pairs, how many of them are done)
+    :param planned: (gamma, threshold, whether there is a prior, transitions so far, renewed part); plain tuples for the rest
+    :param which: (pairs, how many of them are done)
     :param transferred: a row for each of them, which counts only while the pair is not known
     """
-    fits, mdp, grid, transferred = LinearFits(*fits), as_mdp(mdp), GridArrays(*grid), TransferredInstances(*transferred)
-    scratch, fit_scratch = RowScratch(*scratch), FitScratch(*fit_scratch)
-    pairs, done = pairs
-    gamma, max_steps, has_prior = planned
+    instances = Instances(*experience[0])
+    experience = instances, Instances(*experience[1]), Ends(*experience[2])
+    linear, pairs, mdp, grid, kernel = LinearArrays(*linear), PairArrays(*pairs), MDPArrays(*mdp), GridArrays(*grid), Kernel(*kernel)
+    transferred, row_scratch = TransferredInstances(*transferred), RowScratch(*row_scratch)
+    fit, scratch = LocalFit(*fit), LinearScratch(*scratch)
+    gamma, threshold, has_prior, transitions, renewed_part = planned
+    which, done = which
     n_points = len(mdp.n_optimistic)
-    while done < len(pairs):
-        pair = pairs[done]
-        with_transferred = not fits.known[pair] and transferred.length[done] > 0
-        modelled = fits.known[pair] or fits.claimed[pair] or with_transferred
+    while done < len(which):
+        pair = which[done]
+        point = pair % n_points
+        action = pair // n_points
+        unit_coordinates_of(point, grid, scratch.at)
+        coordinates_of(point, grid, row_scratch.at)
+        length = find_nearest(scratch.at, action, 0, instances, kernel, fit)
+        weight = known_weight(fit, length, kernel)
+        note_fit(pair, length, weight, threshold, transitions, renewed_part, pairs, kernel, fit)
+        known = pairs.known[pair]
+        joined = not known and transferred.length[done] > 0
+        modelled = known or joined or linear.claimed[pair]
         if modelled:
-            coordinates_of(pair % n_points, grid, scratch.at)
-            if fits.n_counted[pair] == 0:
-                for k in range(fits.row.shape[1]):
-                    fits.row[pair, k] = fits.prior[pair, k]
-            elif fits.unexplained[pair] == np.inf:
-                refit(fits, pair, pair // n_points, grid, fit_scratch, 0.0)
-            if with_transferred:
-                written = write_row_with_transferred(fits, mdp, grid, gamma, pair, transferred, done, scratch)
-            else:
-                written = write_row(fits, mdp, grid, gamma, pair, (max_steps, has_prior), scratch, fit_scratch)
-            if not written:
+            if length > 0:
+                fit_around(scratch.at, action, length, instances, linear.target, kernel, fit)
+            own = 1.0
+            if joined:
+                own = weight / total_weight(weight, transferred, done)
+            how = gamma, has_prior, 1 if joined else MAX_MODEL_STEPS
+            reward, goes_on, discount = follow(
+                pair, action, length, known, linear, experience, kernel, fit, grid, row_scratch.at, how, scratch
+            )
+            n_touched = np.int64(0)
+            if own * goes_on > 0.0:
+                n_touched = add_successor(own * goes_on, scratch.away, row_scratch, grid, n_touched)
+            if joined:
+                total = total_weight(weight, transferred, done)
+                reward, n_touched = add_to_row(own * reward, n_touched, transferred, done, total, row_scratch, grid)
+            if not finish_row(mdp, discount, pair, point, reward, n_touched, row_scratch):
                 return done
-        fits.refitted[pair] = False
-        fits.last_total[pair] = fits.total[pair]
         set_modelled(mdp, pair, modelled)
         done += 1
     return done
+
+
+@compiled
+def interpolate_prior(prior, grid, states, actions, corners, found):
+    """Write the effects that a prior predicts of states and actions, multilinear between the grid points, to ``found``.
+
+    :param prior: as in ``LinearArrays``; ``corners``: work space: position, corner_index, corner_weight (see ``corners_of``)
+    """
+    grid = GridArrays(*grid)
+    position, corner, weight = corners
+    d = len(position)
+    n_points = grid.shape[0] * grid.strides[0]
+    for i in range(len(actions)):
+        grid_coordinates(states[i], grid, position)
+        found[i, :] = 0.0
+        first_pair = actions[i] * n_points
+        for c in range(corners_of(position, grid, corner, weight)):
+            for k in range(d):
+                found[i, k] += weight[c] * prior[first_pair + corner[c], k]

@@ -4,10 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
 from sb3_combrel.common.periodic import difference
-from sb3_combrel.planning.corrections import CorrectionArrays, ValueScratch, corrected_value, visit
-from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates
+from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, interpolate
 from sb3_combrel.planning.mdp import NEVER_LEAVES, infinite_reward
 
 
@@ -35,23 +34,18 @@ class Prediction(NamedTuple):
 
 
 class ValueFunction(NamedTuple):
-    """The value of any state."""
+    """The value of any state, multilinear between the grid points."""
 
-    values: np.ndarray  # float64, (n_points,), at the grid points
-    corrections: CorrectionArrays  # caps on what is interpolated between them
-    grid: GridArrays
+    values: np.ndarray  # float64, (n_points,)
+    grid: tuple[Any, ...]  # GridArrays as a plain tuple (see ``common.compiled``)
     gamma: float
     bounds: tuple[float, float]  # min_value, max_value
     upper: np.ndarray  # float64, (n_points,): value of an optimistic action at the grid points
 
 
-# The same as plain tuples (see ``common.compiled``).
-PlainValueFunction = tuple[np.ndarray, tuple[Any, ...], tuple[Any, ...], float, tuple[float, float], np.ndarray]
-
-
 @inlined
-def moves(state, effect, grid, scratch):
-    """Write where ``effect`` leads from ``state`` to ``scratch.position`` (grid coordinates); whether that is elsewhere."""
+def moves(state, effect, grid, position):
+    """Write where ``effect`` leads from ``state`` to ``position`` (grid coordinates); whether that is elsewhere."""
     moved = 0.0
     for k in range(len(state)):
         here = state[k] * grid.cells[k] + grid.margin[k]
@@ -61,74 +55,55 @@ def moves(state, effect, grid, scratch):
         else:
             there = min(max(there, 0.0), float(grid.shape[k] - 1))
             moved = max(moved, abs(there - here))
-        scratch.position[k] = there
+        position[k] = there
     return moved >= 1e-9
 
 
-@part
-def q_values(prediction, state, function, q, scratch):
-    """Q of every action at ``state``.
-
-    An effect of exactly nothing leads back to the state itself, whose value is the maximum sought, not the
-    interpolated one: as in ``finish_row``, staying is summed as a geometric series.
-    """
-    n_optimistic = 0
-    for action in range(len(q)):
-        if not prediction.modelled[action]:
-            n_optimistic += 1
-            continue
-        after = 0.0
-        stay = 0.0
-        for k in range(prediction.length[action]):
-            p = prediction.probability[action, k]
-            if moves(state, prediction.effect[action, k], function.grid, scratch):
-                after += p * corrected_value(function.values, function.corrections, function.grid, scratch)
-            else:
-                stay += p
-        leave = 1.0 - function.gamma * stay
-        reward = prediction.reward[action]
-        value = infinite_reward(reward) if leave < NEVER_LEAVES else (reward + function.gamma * after) / leave
-        q[action] = min(max(value, function.bounds[0]), function.bounds[1])
-    if n_optimistic > 0:
-        upper = optimistic_value(state, function, scratch)
-        for action in range(len(q)):
-            if not prediction.modelled[action]:
-                q[action] = upper
-
-
 @inlined
-def optimistic_value(state, function, scratch):
+def optimistic_value(state, function, grid, scratch):
     """The value of an action without a model at ``state``: exactly ``max_value`` where that is the bound all around."""
-    grid_coordinates(state, function.grid, scratch.position)
+    position, corner_index, corner_weight = scratch
+    grid_coordinates(state, grid, position)
     value = function.bounds[1]
-    for c in range(corners_of(scratch.position, function.grid, scratch.corner_index, scratch.corner_weight)):
-        value += scratch.corner_weight[c] * (function.upper[scratch.corner_index[c]] - function.bounds[1])
+    for c in range(corners_of(position, grid, corner_index, corner_weight)):
+        value += corner_weight[c] * (function.upper[corner_index[c]] - function.bounds[1])
     return value
 
 
 @compiled
-def evaluate_actions(prediction, state, function, q, visitor, scratch):
-    """See :meth:`QValues.compute`; ``q`` receives the values, shape (n_actions,), and the rest are plain tuples."""
-    prediction, scratch = Prediction(*prediction), ValueScratch(*scratch)
-    values, corrections, grid, gamma, bounds, upper = function
-    function = ValueFunction(values, CorrectionArrays(*corrections), GridArrays(*grid), gamma, bounds, upper)
-    q_values(prediction, state, function, q, scratch)
-    best = 0
-    ties = 0
-    for action in range(1, len(q)):
+def evaluate_actions(prediction, state, function, q, scratch):
+    """Q of every action at ``state``, into ``q``, shape (n_actions,); the best action, -1 if several are; plain tuples.
+
+    An effect of exactly nothing leads back to the state itself, whose value is the maximum sought, not the interpolated one:
+    as in ``finish_row``, staying is summed as a geometric series.
+    """
+    prediction, function = Prediction(*prediction), ValueFunction(*function)
+    grid = GridArrays(*function.grid)
+    position, corner_index, corner_weight = scratch
+    best, ties = 0, 0
+    for action in range(len(q)):
+        if prediction.modelled[action]:
+            after, stay = 0.0, 0.0
+            for k in range(prediction.length[action]):
+                p = prediction.probability[action, k]
+                if moves(state, prediction.effect[action, k], grid, position):
+                    after += p * interpolate(function.values, position, grid, corner_index, corner_weight)
+                else:
+                    stay += p
+            leave = 1.0 - function.gamma * stay
+            reward = prediction.reward[action]
+            value = infinite_reward(reward) if leave < NEVER_LEAVES else (reward + function.gamma * after) / leave
+            q[action] = min(max(value, function.bounds[0]), function.bounds[1])
+        else:
+            q[action] = optimistic_value(state, function, grid, scratch)
         if q[action] > q[best]:
-            best = action
-            ties = 0
-        elif q[action] == q[best]:
+            best, ties = action, 0
+        elif action > 0 and q[action] == q[best]:
             ties += 1
-    if visitor[0] >= 0:
-        visit(function.values, function.corrections, state, q[best], visitor, function.grid, scratch)
     return -1 if ties > 0 else best
 
 
 _evaluate_actions = EntryPoint(evaluate_actions)
-# An episode of -1: the agent is not there, and nothing is counted or corrected.
-NOBODY = (-1, 0.0, 0)
 
 
 class QValues:
@@ -136,21 +111,13 @@ class QValues:
 
     def __init__(self, n_actions: int, n_variables: int):
         self.q = np.empty(n_actions)
-        self._scratch = tuple(ValueScratch.for_variables(n_variables))
+        self._scratch = np.empty(n_variables), np.empty(2**n_variables, dtype=np.int64), np.empty(2**n_variables)
 
-    def compute(
-        self,
-        prediction: Prediction,
-        state: np.ndarray,
-        function: PlainValueFunction,
-        visitor: tuple[int, float, int] = NOBODY,
-    ) -> int:
+    def compute(self, prediction: Prediction, state: np.ndarray, function: ValueFunction) -> int:
         """Compute :attr:`q` at a state from what the model predicts there.
 
         :param state: unit coordinates, shape (n_variables,)
-        :param function: a ValueFunction as plain tuples
-        :param visitor: whose visit is counted: (episode, tolerance, max_visits), see ``corrections.visit``
         :return: the best action, -1 if several are
         """
-        best: int = _evaluate_actions.call(tuple(prediction), state, function, self.q, visitor, self._scratch)
+        best: int = _evaluate_actions.call(tuple(prediction), state, tuple(function), self.q, self._scratch)
         return best

@@ -159,7 +159,7 @@ class DashboardCallback(BaseCallback):
         from sb3_combrel.tensorboard.summaries import scalars_summary
 
         began = time.perf_counter()
-        scalars = {**self.agent.statistics(), **self._readings(), "planner/backups": self.agent.n_backups}
+        scalars = {**self.agent.statistics(), **self._readings(), "planner/sweeps": self.agent.n_sweeps}
         writer._get_file_writer().add_summary(scalars_summary(scalars), self.num_timesteps)
         self._scalars_at = self.num_timesteps
         self._between_logs.spend_since(began)

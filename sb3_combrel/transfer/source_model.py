@@ -8,11 +8,8 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.linear_regression import add_products, fitted_effect, products_of, solve_regression
-from sb3_combrel.common.periodic import bring_near
-from sb3_combrel.models.fit_arrays import Kernel
-from sb3_combrel.models.linear_fits import RIDGE, narrowed
-from sb3_combrel.models.linear_prediction import NearestLists, nearest_instances
+from sb3_combrel.common.kernels import nearest_instances
+from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
 
 DEFAULT_SOURCE_BREADTH = 0.2
 DEFAULT_N_NEIGHBORS = 24
@@ -30,63 +27,48 @@ class SourcePredictions(NamedTuple):
 
 @inlined
 def source_arrays(plain):
-    """Instances, range of effects, Kernel and NearestLists from ``SourceModel.plain``."""
-    return Instances(*plain[0]), plain[1], Kernel(*plain[2]), NearestLists(*plain[3])
+    """Instances, Kernel, LocalFit and the instances near the last states from ``SourceModel.plain``."""
+    return Instances(*plain[0]), Kernel(*plain[1]), LocalFit(*plain[2]), plain[3]
 
 
 @inner
-def predict_source(instances, effect_range, kernel, near, action, state, effect):
+def predict_source(instances, kernel, fit, away, action, state, effect):
     """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
-    item, distance = near.item[action], near.distance[action]
-    length = nearest_instances(instances, action, state, kernel.reach, item, distance, near.length[action])
-    near.length[action] = length
-    d = len(state)
+    length = nearest_instances(instances, action, state, kernel.reach, fit.item, fit.distance, 0)
     if length == 0:
         effect[:] = 0.0
         return 0.0, 0.0, 0.0
-    scale = narrowed(distance[length - 1], kernel) if length == kernel.n_neighbors else kernel.scale
-    sums, products = near.products[0], near.products[1]
-    sums[:] = 0.0
-    total, outcomes, reward, end = 0.0, 0.0, 0.0, 0.0
+    outcomes, reward, end = 0.0, 0.0, 0.0
     for k in range(length):
-        i = item[k]
-        bring_near(instances.state[action, i], state, instances.periodic, near.state)
-        products_of(near.state, instances.effect[action, i], products)
-        # Seen from the nearest: far from all instances the ridge would outweigh them, and a quotient could be 0 / 0.
-        beyond = distance[k] - distance[0]
-        add_products(sums, np.exp(beyond * scale), products)
-        total += np.exp(distance[k] * kernel.scale)
-        weight = np.exp(beyond * kernel.outcome_scale)
+        i = fit.item[k]
+        # Seen from the nearest: far from all instances a quotient could be 0 / 0.
+        weight = np.exp((fit.distance[0] - fit.distance[k]) / kernel.outcome_breadth)
         outcomes += weight
         reward += weight * instances.reward[action, i]
         if instances.terminated[action, i]:
             end += weight
-    solve_regression(sums, -RIDGE / scale, near.factor, near.fit)
-    for v in range(d):
-        effect[v] = min(max(fitted_effect(near.fit, state, v), effect_range[0, action, v]), effect_range[1, action, v])
-    return reward / outcomes, end / outcomes, total / (1.0 + beyond_data(sums, near.factor, state, near.fit))
+    fit_around(state, action, length, instances, instances.effect, kernel, fit)
+    for v in range(len(state)):
+        effect[v] = number_at(fit, v, away)
+    return reward / outcomes, end / outcomes, known_weight(fit, length, kernel) / (1.0 + beyond_data(fit))
 
 
-@inner
-def beyond_data(sums, factor, state, scratch):
-    """The squared distance of a state from the mean of a fit's instances, in units of their spread along that way."""
-    distance = 0.0
-    for j in range(len(state)):
-        entry = state[j] - sums[1 + j] / sums[0]
-        for m in range(j):
-            entry -= factor[j, m] * scratch[m]
-        scratch[j] = entry / factor[j, j]
-        distance += scratch[j] * scratch[j]
-    return sums[0] * distance
+@inlined
+def beyond_data(fit):
+    """The squared distance of a state from the mean of a fit's instances, in units of their spread along that way.
+
+    With the fit's total weight W and leverage h that is h W - 1: at their mean the leverage is 1 / W.
+    """
+    return max(0.0, fit.solution[0, len(fit.z)] * fit.factor[0, 0] * fit.factor[0, 0] - 1.0)
 
 
 @compiled
 def predict_many(source, states, actions, predictions):
     """Predict many states and actions; ``source``: ``SourceModel.plain``, ``predictions``: SourcePredictions as a tuple."""
-    instances, effect_range, kernel, near = source_arrays(source)
+    instances, kernel, fit, away = source_arrays(source)
     effect, reward, end, weight = predictions
     for i in range(len(actions)):
-        reward[i], end[i], weight[i] = predict_source(instances, effect_range, kernel, near, actions[i], states[i], effect[i])
+        reward[i], end[i], weight[i] = predict_source(instances, kernel, fit, away, actions[i], states[i], effect[i])
 
 
 _predict_many = EntryPoint(predict_many)
@@ -97,7 +79,7 @@ class SourceModel:
 
     The effect at a state is fitted, as a linear function of the state, to the ``n_neighbors`` nearest instances of the
     action, with the kernel exp(-d^2 / breadth^2), narrowed where they lie closer so that the last of them weighs 0.05; it
-    stays within the range of the effects seen. Rewards and ends are averages with a kernel of ``outcome_breadth``. Far from
+    stays within the range of theirs. Rewards and ends are averages with a kernel of ``outcome_breadth``. Far from
     all instances the nearest ones still predict, with a small weight.
 
     The weight of a prediction is the sum of exp(-d^2 / breadth^2) over these instances, divided by 1 + z^2, where z is how
@@ -112,18 +94,11 @@ class SourceModel:
         n_neighbors: int = DEFAULT_N_NEIGHBORS,
         outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
     ):
-        n_actions, _, d = instances.state.shape
+        d = instances.state.shape[2]
         self.n_variables, self.instances = d, instances
-        scale, outcome_scale = -1.0 / breadth**2, -1.0 / min(breadth, outcome_breadth) ** 2
-        self.kernel = Kernel(scale, np.inf, outcome_scale, n_neighbors, counting_scale=scale)
-        effect_range = np.zeros((2, n_actions, d))
-        for action, size in enumerate(instances.size.tolist()):
-            if size:
-                effect_range[0, action] = instances.effect[action, :size].min(axis=0)
-                effect_range[1, action] = instances.effect[action, :size].max(axis=0)
-        near = NearestLists.empty(n_actions, n_neighbors, d)
+        self.kernel = Kernel(-1.0 / breadth**2, np.inf, n_neighbors, min(breadth, outcome_breadth) ** 2)
         #: For compiled code, see :func:`source_arrays`.
-        self.plain = tuple(instances), effect_range, tuple(self.kernel), tuple(near)
+        self.plain = tuple(instances), tuple(self.kernel), tuple(LocalFit.empty(n_neighbors, d)), np.zeros(d)
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> SourcePredictions:
         """Predict n states and actions of the source; unit coordinates of it, and int64."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.planning.corrections import CorrectionArrays
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
-from sb3_combrel.planning.q_values import Prediction, QValues
-from sb3_combrel.planning.sweeping import Planner
+from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
+from sb3_combrel.planning.planner import Planner
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel
@@ -17,6 +16,7 @@ MIN_WEIGHT = 1.0  # weight of instances from which on a prediction counts, as by
 # An action is held until its cell of the grid is left, but for no more than so many steps: values that are interpolated at
 # every step would spread over the grid.
 MAX_STEPS = 50
+MAX_SWEEPS = 300
 # What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
 LEAST_WEIGHT_ON_GRID = 0.05
 _TOLERANCE = 0.001  # changes of value up to this part of the range of a step's rewards end the planning
@@ -57,8 +57,8 @@ def planning_tolerance(source: SourceInstances) -> float:
 class SourcePolicy:
     """What is best in a source task, as far as its instances tell: Fitted R-Max's planning, but without optimism.
 
-    An action with too few instances near a state cannot be taken there; a grid point without any action counts as the worst of
-    its neighbours. ``gamma`` is below 1: the least and the largest value follow from it.
+    An action with too few instances near a state cannot be taken there; a grid point without any action is worth the least
+    that there is. ``gamma`` is below 1: the least and the largest value follow from it.
     """
 
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):
@@ -67,11 +67,10 @@ class SourcePolicy:
         lowest, highest = float(source.rewards.min()), float(source.rewards.max())
         bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
         planner = Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=planning_tolerance(source))
-        planner.values[:] = bounds[0]  # from below: values then come from ways that exist, however few sweeps there are
-        self.values = planner.exploitation_values()  #: value of each grid point
+        self.values = planner.cautious_values(MAX_SWEEPS)  #: value of each grid point
         self.grid = mdp.grid
         n, d = source.n_actions, source.n_variables
-        self._function = self.values, tuple(CorrectionArrays.empty(d)), self.grid.plain, float(gamma), bounds, planner.upper
+        self._function = ValueFunction(self.values, self.grid.plain, float(gamma), bounds, planner.upper)
         self._q, self._actions, self._length = QValues(n, d), np.arange(n), np.ones(n, dtype=np.int64)
 
     def q_values(self, state: np.ndarray) -> np.ndarray:

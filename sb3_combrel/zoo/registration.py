@@ -26,7 +26,6 @@ def sample_fitted_rmax_params(trial: Trial, *_: Any) -> dict[str, Any]:
             "min_fraction": trial.suggest_float("min_fraction", 0.01, 0.3, log=True),
             "exploration_threshold": trial.suggest_float("exploration_threshold", 0.3, 3.0, log=True),
             "planning_tolerance": trial.suggest_float("planning_tolerance", 1e-4, 0.1, log=True),
-            "max_backups_power": trial.suggest_int("max_backups_power", 3, 10),
             "resolution": trial.suggest_categorical("resolution", [None, "coarser", "finer"]),
         }
     )
@@ -59,7 +58,6 @@ def convert_fitted_rmax_params(sampled_params: dict[str, Any]) -> dict[str, Any]
     """Convert a trial's parameters, by name, to arguments of :class:`~sb3_combrel.zoo.algorithm.ZooFittedRMax`."""
     of_transfer = {name: value for name, value in sampled_params.items() if name.startswith(OF_TRANSFER)}
     converted = {name: value for name, value in sampled_params.items() if name not in of_transfer}
-    converted["max_backups"] = 2 ** converted.pop("max_backups_power")
     if of_transfer:
         converted["transfer_kwargs"] = {name.removeprefix(OF_TRANSFER): value for name, value in of_transfer.items()}
     return converted

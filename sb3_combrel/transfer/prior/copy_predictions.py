@@ -55,7 +55,7 @@ def see_state(table, copy, state, at):
 @compiled
 def predict_pairs(source, table, uses, pairs, predicted, found):
     """Predict target states and actions, ``pairs``, see :func:`join_copies`; the structures are plain tuples."""
-    instances, effect_range, kernel, near = source_arrays(source)
+    instances, kernel, fit, away = source_arrays(source)
     table, uses, found = CopyTable(*table), Uses(*uses), UsePredictions(*found)
     states, actions = pairs
     at = found.effect[len(uses.copy)]
@@ -73,7 +73,7 @@ def predict_pairs(source, table, uses, pairs, predicted, found):
                 see_state(table, copy, states[i], at)
                 effect, outcome = found.effect[use], found.outcome[use]
                 outcome[0], outcome[1], outcome[2] = predict_source(
-                    instances, effect_range, kernel, near, uses.action[use], at, effect
+                    instances, kernel, fit, away, uses.action[use], at, effect
                 )
                 found.done[use] = True
         join_copies(table, uses, actions[i], i, found.effect, found.outcome, predicted)

@@ -97,7 +97,7 @@ def add_transition(source, table, rules, transition, sums, scratch):
 
     :param rules: (whole, see ``Copies.measure``; weight from which on the source has data)
     """
-    instances, effect_range, kernel, near = source_arrays(source)
+    instances, kernel, fit, away = source_arrays(source)
     table, sums, scratch = CopyTable(*table), CopySums(*sums), CopyScratch(*scratch)
     whole, threshold = rules
     state, action, effect = transition
@@ -112,7 +112,7 @@ def add_transition(source, table, rules, transition, sums, scratch):
         see_state(table, copy, state, scratch.at)
         for u in range(table.n_actions[copy]):
             source_action = table.first[copy] + u
-            _, _, weight = predict_source(instances, effect_range, kernel, near, source_action, scratch.at, scratch.effect)
+            _, _, weight = predict_source(instances, kernel, fit, away, source_action, scratch.at, scratch.effect)
             covered = min(1.0, weight / threshold)
             sums.n_covered[copy, action, u] += covered
             missed = 0.0

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.planning.sweeping import Planner
+from sb3_combrel.planning.planner import Planner
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.prior.copies import Copies, distinct_rows
 from sb3_combrel.transfer.prior.prior_choice import Choice
 from sb3_combrel.transfer.source_model import SourceModel
-from sb3_combrel.transfer.source_policy import MAX_STEPS, planning_tolerance, source_mdp
-
-MAX_SWEEPS = 300
+from sb3_combrel.transfer.source_policy import MAX_STEPS, MAX_SWEEPS, planning_tolerance, source_mdp
 
 
 class ValueBound:
@@ -78,5 +76,5 @@ class ValueBound:
         # Lower than so many sweeps can get.
         lowest = min(0.0, highest) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
         planner = Planner(mdp, max_value=highest, min_value=lowest, tolerance=planning_tolerance(source))
-        planner.sweep_all(MAX_SWEEPS)
+        planner.sweep(MAX_SWEEPS)
         return planner

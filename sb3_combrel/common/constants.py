@@ -1,0 +1,27 @@
+"""All constants that decide behaviour: what each means, its unit, and the gate (``docs/results/learner.md``) that it serves.
+
+What a user may choose is an argument of :class:`~sb3_combrel.FittedRMax`, with its default in ``fitted_rmax.settings``.
+Tolerances of arithmetic stand where they are used.
+"""
+
+# The kernel of a fit is so broad that the farthest of its instances weighs this: MountainCar-v0, all local linear rows.
+LAST_WEIGHT = 0.05
+# It is no narrower than this fraction of ``model_breadth``, where many instances lie at the very same state: torso.
+NARROWEST = 0.02
+# On the slopes of a fit, in weights of instances a breadth away: MountainCar4D, Acrobot.
+RIDGE = 0.001
+# A pair of the grid is fitted anew when one in so many instances of its list is new: speed alone.
+RENEWED_PART = 8
+# The same where instances are transferred to what is not known, which takes longer.
+RENEWED_PART_WITH_TRANSFER = 2
+# A prior counts as so much weight of instances that agree with it, for effects, and for ends and rewards: transfer.
+PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
+# An action is held until its cell of the grid is left, but no more steps than this: Acrobot, CartPole.
+MAX_MODEL_STEPS = 50
+# Full sweeps over the grid after each step, and at an episode's end: MountainCar4D, speed.
+SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END = 2, 300
+# Lowest return that a state is given, in steps of the worst reward seen, far below every sensible plan: all rows.
+LONGEST_PLAN = 10_000
+# Scales that are found: margin on either side, in parts of the observed range; a range that is more times as wide as what is
+# observed is too wide: CartPole, Acrobot, dm_control's pendulum and cart-pole.
+SCALE_MARGIN, TOO_WIDE = 0.1, 2.0

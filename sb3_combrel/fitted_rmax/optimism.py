@@ -1,0 +1,67 @@
+"""How optimistic to be: ``max_value`` and ``gamma`` found from rewards, where the user gives none."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# As in Stable-Baselines3.
+DISCOUNT = 0.99
+# What is unknown is worth as long as all rewards were 0: any value above that draws the agent to what it has not tried.
+WORTH_TRYING = 1.0
+
+
+class RewardRange:
+    """The rewards seen so far, and the ``gamma`` and ``max_value`` that follow from them.
+
+    - ``gamma``: a discount is needed where something may be collected for ever, so where a step that did not end the episode
+      paid 0 or more, and where no episode ends but by its time limit; otherwise every step costs, and it is 1.
+    - ``max_value``: the most that one may hope for is to end with the largest reward that an end has paid, or to collect the
+      largest of all others for ever, or 0. Where the most seen is 0, which costs nothing, it is what the worst costs for ever.
+
+    :param gamma: given by the user; None: found. ``max_value``: the same
+    """
+
+    def __init__(self, gamma: float | None, max_value: float | None):
+        self._gamma, self._max_value = gamma, max_value
+        self.largest, self.largest_end, self.lowest = -np.inf, -np.inf, np.inf
+        self.n_ended = self.n_truncated = 0
+
+    def note(self, reward: float, terminated: bool) -> None:
+        """Take in the reward of a step."""
+        self.lowest = min(self.lowest, reward)
+        if terminated:
+            self.n_ended += 1
+            self.largest_end = max(self.largest_end, reward)
+        else:
+            self.largest = max(self.largest, reward)
+
+    @property
+    def gamma(self) -> float:
+        """The discount factor."""
+        if self._gamma is not None:
+            return float(self._gamma)
+        never_ends = self.n_ended == 0 and self.n_truncated > 0
+        return DISCOUNT if self.largest >= 0.0 or never_ends else 1.0
+
+    @property
+    def max_value(self) -> float:
+        """The largest return that is possible, as far as one knows."""
+        if self._max_value is not None:
+            return float(self._max_value)
+        if self.largest == 0.0 and self.largest_end <= 0.0:
+            # What costs nothing would keep the agent from what is unknown: nothing that it can pay is too much for that.
+            return -self.lowest / (1.0 - self.gamma) if self.lowest < 0.0 else WORTH_TRYING
+        for_ever = self.largest / (1.0 - self.gamma) if self.largest > 0.0 and self.gamma < 1.0 else 0.0
+        return max(0.0, self.largest_end, for_ever)
+
+    def get_state(self) -> np.ndarray:
+        """What has been seen, float64, shape (5,), for :meth:`set_state`."""
+        seen = np.array([self.largest, self.largest_end, self.lowest, self.n_ended, self.n_truncated], dtype=np.float64)
+        return np.nan_to_num(seen, posinf=np.finfo(np.float64).max, neginf=np.finfo(np.float64).min)
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Take over what :meth:`get_state` returned."""
+        limit = np.finfo(np.float64).max
+        seen = [np.copysign(np.inf, value) if abs(value) == limit else value for value in state.tolist()]
+        self.largest, self.largest_end, self.lowest = map(float, seen[:3])
+        self.n_ended, self.n_truncated = int(seen[3]), int(seen[4])

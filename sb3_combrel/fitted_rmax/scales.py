@@ -1,0 +1,74 @@
+"""Scales of the state variables, found from what has been observed where nobody has given them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_combrel.common.constants import SCALE_MARGIN, TOO_WIDE
+from sb3_combrel.common.scaling import Bounds, StateScaling
+
+# A limit of the order of the largest float stands for "unbounded".
+_LARGEST_BOUND = 1e30
+# In parts of the range: observations beyond the bounds by less change nothing.
+_BEYOND = 0.02
+
+
+class FoundScales:
+    """The bounds between which each state variable is scaled to [0, 1].
+
+    Those that the user gives stay as they are. Otherwise it begins with the observation space's, where these are finite; a
+    variable without bounds, or one that uses less than half of them by the end of an episode, is scaled by the range of its
+    observations, with a margin, and again whenever an observation lies beyond. Periodic variables keep their bounds.
+
+    :param space: observation space
+    :param bounds: of the user; None: to be found
+    :param periodic: one bool for each state variable
+    :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, or the bounds do not fit it
+    """
+
+    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray):
+        self.fixed = bounds is not None
+        low, high = StateScaling.limits_of(space, bounds)
+        self._found = ~periodic & (bounds is None)
+        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < _LARGEST_BOUND)
+        #: What the space allows, raw units.
+        self.low, self.high = np.where(unbounded, -np.inf, low), np.where(unbounded, np.inf, high)
+        #: The least and the largest observation of each variable, raw units, shape (2, n_variables).
+        self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
+        self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
+
+    def renewed(self, episode_ended: bool) -> StateScaling | None:
+        """Return other scales if the observations ask for them, and None otherwise.
+
+        :param episode_ended: only then is a variable scaled more finely
+        """
+        least, most = self.observed
+        low, high = self.scaling.low, self.scaling.high
+        used, given = most - least, high - low
+        beyond = (least < low - _BEYOND * given) | (most > high + _BEYOND * given)
+        # A variable that never changes has no scale.
+        too_wide = (given > TOO_WIDE * used) & (used > 0.0) if episode_ended else np.zeros(len(low), dtype=np.bool_)
+        renewed = self._found & (beyond | too_wide)
+        if not renewed.any():
+            return None
+        margin = np.where(used > 0.0, SCALE_MARGIN * used, SCALE_MARGIN * given)
+        low = np.where(renewed, np.maximum(least - margin, self.low), low)
+        high = np.where(renewed, np.minimum(most + margin, self.high), high)
+        self.scaling = StateScaling(low, high)
+        return self.scaling
+
+    def get_state(self) -> np.ndarray:
+        """Bounds in use and range of the observations, float64, shape (4 * n_variables,), for :meth:`set_state`."""
+        rows = np.vstack([self.scaling.low, self.scaling.high, self.observed])
+        limit = np.finfo(np.float64).max
+        return np.nan_to_num(rows, posinf=limit, neginf=-limit).ravel()
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Take over what :meth:`get_state` returned."""
+        low, high, *observed = state.reshape(4, -1)
+        limit = np.finfo(np.float64).max
+        self.observed = np.where(np.abs(observed) == limit, np.copysign(np.inf, observed), observed)
+        self.scaling = StateScaling(low, high)

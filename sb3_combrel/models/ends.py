@@ -1,0 +1,126 @@
+"""Whether an episode ends, and what that pays, is a function of where one arrives: all arrivals of all actions decide it.
+
+Of the arrivals near a state the nearest decide, with weights exp(-(q - q_min) / b^2): q are squared distances, and the
+breadth b is no more than ``outcome_breadth`` and no more than the nearest arrival is far, so one that was made before decides
+for itself. Beyond an edge at which episodes end the nearest arrivals are ends, so states there count as ended.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.instances import BLOCK, Instances, put_instance
+from sb3_combrel.common.kernels import any_periodic, measure_blocks, squared_distance
+
+# Arrivals beyond this many squared breadths weigh less than 0.0002 of the nearest.
+NEGLIGIBLE = 9.0
+ROUNDING = 1e-7
+
+
+class Ends(NamedTuple):
+    """The arrivals that ended an episode."""
+
+    state: np.ndarray  # float64, (capacity, n_variables)
+    n: np.ndarray  # int64, (1,): how many there are
+
+    @classmethod
+    def empty(cls, n_variables: int, capacity: int = 64) -> "Ends":
+        """Make room for so many."""
+        return cls(np.empty((capacity, n_variables)), np.zeros(1, dtype=np.int64))
+
+    @classmethod
+    def of(cls, arrivals: Instances) -> "Ends":
+        """Those among some arrivals."""
+        ended = [arrivals.state[action, :n][arrivals.terminated[action, :n]] for action, n in enumerate(arrivals.size)]
+        states = np.concatenate(ended)
+        made = cls.empty(states.shape[1], max(64, 2 * len(states)))
+        made.state[: len(states)] = states
+        made.n[0] = len(states)
+        return made
+
+
+@inlined
+def put_arrival(instances, arrivals, action, slot):
+    """Write where an instance leads to the same slot of the arrivals."""
+    for k in range(len(instances.periodic)):
+        at = instances.state[action, slot, k] + instances.effect[action, slot, k]
+        if instances.periodic[k]:
+            at -= np.floor(at)
+        arrivals.state[action, slot, k] = at
+        block = slot // BLOCK
+        arrivals.block_low[action, k, block] = min(arrivals.block_low[action, k, block], at)
+        arrivals.block_high[action, k, block] = max(arrivals.block_high[action, k, block], at)
+
+
+@compiled
+def put_arrivals(instances, arrivals):
+    """Write where all instances lead."""
+    for action in range(len(instances.size)):
+        for slot in range(instances.size[action]):
+            put_arrival(instances, arrivals, action, slot)
+
+
+@compiled
+def put_transition(instances, arrivals, transition, effect):
+    """Write an instance to its slot, and where it leads; plain tuples.
+
+    :param transition: (action, slot, state, next_state, reward, terminated)
+    :param effect: counts in place of next state minus state, if it is not empty
+    """
+    instances, arrivals = Instances(*instances), Instances(*arrivals)
+    action, slot, _, _, _, _ = transition
+    put_instance(instances, transition)
+    for k in range(len(effect)):
+        instances.effect[action, slot, k] = effect[k]
+    put_arrival(instances, arrivals, action, slot)
+
+
+@inner
+def squared_distance_of_end(state, ends, periodic):
+    """The squared distance of the nearest arrival that ended an episode; infinite without any."""
+    nearest = np.inf
+    wraps = any_periodic(periodic)
+    for e in range(ends.n[0]):
+        nearest = min(nearest, squared_distance(state, ends.state[e], periodic, wraps))
+    return nearest
+
+
+@inner
+def end_at(state, near, outcome_breadth, arrivals, ends, found):
+    """Write to ``found`` the probability that arriving at ``state`` ends the episode, and what an end there pays.
+
+    :param near: squared distance of some arrival, which saves the search far from all ends
+    :param outcome_breadth: squared
+    """
+    found[0], found[1] = 0.0, 0.0
+    if ends.n[0] == 0:
+        return
+    of_end = squared_distance_of_end(state, ends, arrivals.periodic)
+    if of_end - near > NEGLIGIBLE * min(outcome_breadth, near + ROUNDING):
+        return
+    nearest = min(near, of_end)
+    wraps = any_periodic(arrivals.periodic)
+    for action in range(len(arrivals.size)):
+        for block in range(measure_blocks(arrivals, action, state)):
+            if arrivals.gap[block] < nearest:
+                for i in range(block * BLOCK, min(arrivals.size[action], (block + 1) * BLOCK)):
+                    nearest = min(nearest, squared_distance(state, arrivals.state[action, i], arrivals.periodic, wraps))
+    breadth = min(outcome_breadth, nearest + ROUNDING)
+    reach = nearest + NEGLIGIBLE * breadth
+    if of_end > reach:
+        return
+    total, ended, reward = 0.0, 0.0, 0.0
+    for action in range(len(arrivals.size)):
+        for block in range(measure_blocks(arrivals, action, state)):
+            if arrivals.gap[block] <= reach:
+                for i in range(block * BLOCK, min(arrivals.size[action], (block + 1) * BLOCK)):
+                    distance = squared_distance(state, arrivals.state[action, i], arrivals.periodic, wraps)
+                    if distance <= reach:
+                        weight = np.exp((nearest - distance) / breadth)
+                        total += weight
+                        if arrivals.terminated[action, i]:
+                            ended += weight
+                            reward += weight * arrivals.reward[action, i]
+    if ended > 0.0:
+        found[0], found[1] = ended / total, reward / ended

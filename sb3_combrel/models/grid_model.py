@@ -1,0 +1,264 @@
+"""A model in compiled loops that keeps the pairs of the grid up to date, whatever it predicts them with.
+
+What a pair's row says depends on nothing but the transitions up to the one at which it was last fitted, and when that is
+depends on the transitions alone: so a model is saved as its transitions and one number a pair, and loaded by replaying them.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.constants import RENEWED_PART, RENEWED_PART_WITH_TRANSFER
+from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.periodic import differences
+from sb3_combrel.common.regression import Kernel
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.ends import Ends, put_arrivals, put_transition
+from sb3_combrel.models.grid_points import PairArrays, PointScratch, note_instance
+from sb3_combrel.planning.mdp import FiniteMDP, add_successor
+from sb3_combrel.planning.q_values import Prediction
+
+_note_instance, _put_transition, _put_arrivals = EntryPoint(note_instance), EntryPoint(put_transition), EntryPoint(put_arrivals)
+NO_EFFECT = np.empty(0)
+
+
+@inlined
+def total_weight(own, transferred, row):
+    """Weight of a pair's own instances and of those transferred to it; ``row``: of the pair in ``transferred``."""
+    for j in range(transferred.length[row]):
+        own += transferred.weight[row, j]
+    return own
+
+
+@inlined
+def add_to_row(reward, n_touched, transferred, row, total, scratch, grid):
+    """Add transferred instances to the row of a pair; its reward, and see ``planning.mdp.add_successor``."""
+    for j in range(transferred.length[row]):
+        p = transferred.weight[row, j] / total
+        reward += p * transferred.reward[row, j]
+        if not transferred.terminated[row, j]:
+            n_touched = add_successor(p, transferred.effect[row, j], scratch, grid, n_touched)
+    return reward, n_touched
+
+
+@compiled
+def join_transferred(transferred, threshold, prediction):
+    """Let transferred instances join the prediction of actions of less weight than ``threshold``; plain tuples."""
+    transferred, prediction = TransferredInstances(*transferred), Prediction(*prediction)
+    for action in range(len(prediction.weight)):
+        own = prediction.weight[action]
+        if own >= threshold or transferred.length[action] == 0:
+            continue
+        total = total_weight(own, transferred, action)
+        n, reward = prediction.length[action], prediction.reward[action] * own / total
+        for k in range(n):
+            prediction.probability[action, k] *= own / total
+        for j in range(transferred.length[action]):
+            p = transferred.weight[action, j] / total
+            reward += p * transferred.reward[action, j]
+            if not transferred.terminated[action, j]:
+                prediction.probability[action, n] = p
+                for v in range(prediction.effect.shape[2]):
+                    prediction.effect[action, n, v] = transferred.effect[action, j, v]
+                n += 1
+        prediction.reward[action], prediction.length[action], prediction.modelled[action] = reward, n, True
+
+
+_join_transferred = EntryPoint(join_transferred)
+
+
+class GridModel(Model):
+    """A model whose loops are compiled. Plain tuples for them are made once, not at every step (see ``common.compiled``)."""
+
+    #: Successors of an action that the own instances may predict.
+    _own_room = 1
+
+    def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
+        super().__init__(mdp, settings, transfer)
+        breadth = float(settings.model_breadth)
+        self.kernel = Kernel(
+            scale=-1.0 / breadth**2,
+            reach=-np.log(settings.min_weight) * breadth**2,
+            n_neighbors=settings.n_neighbors,
+            outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
+        )
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach)
+        self.own_weight, self.known = self.pairs.weight, self.pairs.known
+        self._plain_pairs, self._plain_kernel = tuple(self.pairs), tuple(self.kernel)
+        self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known)))
+        self._nothing = TransferredInstances.empty(1, self.grid.n_variables)
+        self._make_prediction(self._own_room)
+        # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
+        self.n_added = 0
+        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
+        self._renew_arrivals()
+
+    @property
+    def _giver(self) -> InstanceTransfer | None:
+        """Where instances come from for pairs that are not known; a transfer method that is a prior gives none."""
+        transfer = self.transfer
+        return None if transfer is None or (self.takes_prior and transfer.use == "prior") else transfer
+
+    @abstractmethod
+    def _predict_own(self, state: np.ndarray) -> float:
+        """Fill the prediction from the own instances; the least weight that an action has."""
+
+    @abstractmethod
+    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...], renewed_part: int) -> int:
+        """Fit, and write the rows of, (pairs, how many of them are done); how many are done then, fewer if there is no room."""
+
+    def _make_prediction(self, room: int) -> None:
+        self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
+        self._plain_prediction = tuple(self._prediction)
+
+    def _renew_arrivals(self) -> None:
+        """Make the arrivals, which share arrays with the instances, and those among them that ended an episode."""
+        instances = self.instances
+        arrivals = Instances.empty(self.n_actions, self.grid.n_variables, instances.capacity)
+        shared = {name: getattr(instances, name) for name in ("reward", "terminated", "size", "periodic")}
+        self.arrivals = arrivals._replace(**shared)
+        _put_arrivals.call(instances, self.arrivals)
+        self._renew_ends()
+
+    def _renew_ends(self) -> None:
+        self.ends = Ends.of(self.arrivals)
+        self._plain_experience = tuple(self.instances), tuple(self.arrivals), tuple(self.ends)
+
+    def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
+        slot, removed = self._slot_for(state, action)
+        due = self._put((action, slot, state, next_state, reward, terminated))
+        return due if len(removed) == 0 else np.union1d(removed, due)
+
+    def _put(self, transition: tuple[Any, ...], effect: np.ndarray = NO_EFFECT) -> np.ndarray:
+        """Write an instance to its slot; the pairs that are due. ``effect``: in place of next state minus state."""
+        action, slot, state, _, _, terminated = transition
+        _put_transition.call(*self._plain_experience[:2], transition, effect)
+        self.n_added += 1
+        self._number[action, slot] = self.n_added
+        due = self._note(state, action, False)
+        if not terminated:
+            return due
+        self._renew_ends()
+        # What is known of ends concerns all actions.
+        arrived, due = self.arrivals.state[action, slot], due.copy()
+        others = [self._note(arrived, other, False).copy() for other in range(self.n_actions) if other != action]
+        return np.unique(np.concatenate([due, *others]))
+
+    def _note(self, state: np.ndarray, action: int, at_once: bool) -> np.ndarray:
+        """Count a new instance, or one that is removed, for the pairs that it concerns; those that are due."""
+        first, widest = action * self.grid.n_points, self.kernel.reach
+        n = _note_instance.call(state, first, self._plain_pairs, widest, at_once, self.grid.plain, self._points)
+        due: np.ndarray = self._points[2][:n]
+        return due
+
+    def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
+        """Where a new instance goes, and the pairs that lose one: with ``max_instances`` the nearest of its action goes."""
+        instances, size = self.instances, int(self.instances.size[action])
+        if self.settings.max_instances is not None and size >= self.settings.max_instances:
+            apart = differences(instances.state[action, :size], state, instances.periodic)
+            slot = int((apart**2).sum(axis=1).argmin())
+            removed = self._note(instances.state[action, slot], action, True).copy()
+            if instances.terminated[action, slot]:
+                instances.terminated[action, slot] = False
+                self._renew_ends()
+            return slot, removed
+        if size == instances.capacity:
+            self._make_room(2 * size)
+        return size, NO_PAIRS
+
+    def _make_room(self, capacity: int) -> None:
+        """Make room for so many instances of each action."""
+        while self.instances.capacity < capacity:
+            full = int(self.instances.size.argmax())
+            size = int(self.instances.size[full])
+            self.instances.size[full] = self.instances.capacity
+            self.instances = self.instances.with_room(full)
+            self.instances.size[full] = size
+        number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
+        number[:, : self._number.shape[1]] = self._number
+        self._number = number
+        self._renew_arrivals()
+
+    def end_episode(self) -> np.ndarray:
+        """The pairs that have had instances since they were fitted."""
+        return np.flatnonzero(self.pairs.n_new)
+
+    def update_rows(self, pairs: np.ndarray) -> None:
+        transferred, done = tuple(self._transferred_to(pairs)), 0
+        part = RENEWED_PART if self._giver is None else RENEWED_PART_WITH_TRANSFER
+        while done < len(pairs):
+            done = self._write_rows((pairs, done), transferred, part)
+            if done < len(pairs):
+                self.mdp.make_room()
+
+    def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
+        """Transferred instances for pairs; known ones need none."""
+        if self._giver is None:
+            if len(self._nothing.length) < len(pairs):
+                self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
+            return self._nothing
+        actions, points = np.divmod(pairs, self.grid.n_points)
+        own_weight = self.predict(self.grid.states_of(points), actions).weight
+        given = self._giver.transferred_to_sample(points, actions, own_weight)
+        self._check(given, own_weight)
+        return given
+
+    def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
+        if self._predict_own(state) >= self.exploration_threshold or self._giver is None:
+            return self._prediction, None
+        states = np.repeat(state[None], self.n_actions, axis=0)
+        given = self._giver.transferred(states, np.arange(self.n_actions), self._prediction.weight)
+        self._check(given, self._prediction.weight)
+        room = self._own_room + given.weight.shape[1]
+        if room > self._prediction.probability.shape[1]:
+            self._make_prediction(room)
+            self._predict_own(state)
+        _join_transferred.call(tuple(given), self.exploration_threshold, self._plain_prediction)
+        return self._prediction, given
+
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
+        rows = []
+        for state, action in zip(states, actions, strict=True):
+            self._predict_own(np.ascontiguousarray(state, dtype=np.float64))
+            rows.append([array[action].copy() for array in self._prediction])
+        _, weight, reward, length, probability, effect = map(np.array, zip(*rows, strict=True))
+        used = np.arange(probability.shape[1]) < length[:, None]
+        return Predictions(weight, reward, np.where(used, probability, 0.0), np.where(used[:, :, None], effect, 0.0))
+
+    def _numbers(self) -> np.ndarray:
+        return np.concatenate([self._number[action, :n] for action, n in enumerate(self.instances.size.tolist())])
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        return {
+            "instances": np.column_stack([self.instances.rows(), self._numbers()]),
+            "fitted_at": self.pairs.fitted_at.astype(np.float64),
+            "n_added": np.array([float(self.n_added)]),
+        }
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
+        self.renew_prior()
+        rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
+        actions, numbers = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64), rows[:, -1].astype(np.int64)
+        self._make_room(int(np.bincount(actions, minlength=self.n_actions).max()))
+        fitted_at = state["fitted_at"].astype(np.int64)
+        by_time = np.argsort(fitted_at, kind="stable")
+        done = int(np.searchsorted(fitted_at[by_time], 1))
+        for action, number, row in zip(actions.tolist(), numbers.tolist(), rows, strict=True):
+            slot = int(self.instances.size[action])
+            self.n_added = number - 1
+            at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
+            self._put((action, slot, at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
+            until = int(np.searchsorted(fitted_at[by_time], number, side="right"))
+            if until > done:
+                self.update_rows(np.sort(by_time[done:until]))
+                done = until
+        self.n_added = int(state["n_added"][0])
+        if self._giver is not None:
+            # What would be transferred now may be something else than when they were fitted.
+            self.update_rows(np.flatnonzero(~self.known))

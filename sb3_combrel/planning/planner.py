@@ -1,0 +1,122 @@
+"""Dynamic programming on the grid: plain Gauss-Seidel sweeps of Bellman backups, up and down in turn."""
+
+import numpy as np
+
+from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.planning.mdp import FiniteMDP
+
+
+
+
+@compiled
+def sweep(values, mdp, upper, lowest, downwards):
+    """V(point) = max over a of Q(point, a), Fitted R-Max's backup, at all grid points; the largest change.
+
+    :param values: updated in place
+    :param upper: upper bound of each value, and the value of a point while an action is optimistic
+    """
+    to, weight, length, reward, _, n_optimistic = mdp
+    n_points = len(values)
+    largest = 0.0
+    for step in range(n_points):
+        point = n_points - 1 - step if downwards else step
+        best = upper[point]
+        if n_optimistic[point] == 0:
+            best = lowest
+            for pair in range(point, len(reward), n_points):
+                q = reward[pair]
+                for k in range(length[pair]):
+                    q += weight[pair, k] * values[to[pair, k]]
+                best = max(best, q)
+            best = min(best, upper[point])
+        largest = max(largest, abs(best - values[point]))
+        values[point] = best
+    return largest
+
+
+@compiled
+def cautious_sweep(values, mdp, upper, lowest, downwards):
+    """As :func:`sweep`, over the pairs that have a model alone: what nobody has seen is worth the least there is."""
+    to, weight, length, reward, modelled, _ = mdp
+    n_points = len(values)
+    largest = 0.0
+    for step in range(n_points):
+        point = n_points - 1 - step if downwards else step
+        best = lowest
+        for pair in range(point, len(reward), n_points):
+            if modelled[pair]:
+                q = reward[pair]
+                for k in range(length[pair]):
+                    q += weight[pair, k] * values[to[pair, k]]
+                best = max(best, q)
+        best = min(best, upper[point])
+        largest = max(largest, abs(best - values[point]))
+        values[point] = best
+    return largest
+
+
+_sweep, _cautious_sweep = EntryPoint(sweep), EntryPoint(cautious_sweep)
+
+
+class Planner:
+    """The value function at the grid points, kept near the fixed point of the MDP's Bellman backups.
+
+    :param mdp: the finite MDP
+    :param max_value: value of an optimistic pair, and upper bound of all values; lower ones: see :meth:`set_upper`
+    :param min_value: lower bound of all values, reached only by states that lead nowhere
+    :param tolerance: sweeps end when no value changes by more
+    """
+
+    def __init__(self, mdp: FiniteMDP, *, max_value: float, min_value: float, tolerance: float):
+        self.mdp = mdp
+        self.tolerance = float(tolerance)
+        self.bounds = (float(min_value), float(max_value))
+        #: Upper bound of the value of each grid point, and its value while an action is optimistic.
+        self.upper = np.full(mdp.grid.n_points, float(max_value))
+        #: Whether the values of some grid points are bounded by less than ``max_value``.
+        self.is_bounded = False
+        self.values = self.upper.copy()
+        self._downwards = False
+
+    def sweep(self, max_sweeps: int) -> int:
+        """Back up all points, up and down the grid in turn, until little changes; the sweeps that this took."""
+        for n in range(max_sweeps):
+            change = _sweep.call(self.values, self.mdp.plain, self.upper, self.bounds[0], self._downwards)
+            self._downwards = not self._downwards
+            if change <= self.tolerance:
+                return n + 1
+        return max_sweeps
+
+    def cautious_values(self, max_sweeps: int) -> np.ndarray:
+        """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are."""
+        values = np.full(len(self.values), self.bounds[0])
+        for n in range(max_sweeps):
+            if _cautious_sweep.call(values, self.mdp.plain, self.upper, self.bounds[0], n % 2 == 1) <= self.tolerance:
+                break
+        return values
+
+    def set_max_value(self, max_value: float) -> None:
+        """Change the value of what is optimistic; the others follow by sweeps."""
+        before, self.bounds = self.bounds[1], (self.bounds[0], float(max_value))
+        self.upper[self.upper == before] = max_value
+        optimistic = self.mdp.arrays.n_optimistic > 0
+        self.values[optimistic] = self.upper[optimistic]
+
+    def set_upper(self, upper: np.ndarray | None) -> None:
+        """Bound the values of grid points, and so what is optimistic, by less than ``max_value``.
+
+        :param upper: shape (n_points,), no more than ``max_value`` counts; None: ``max_value`` everywhere
+        :raises ValueError: if there is not one number for each grid point
+        """
+        if upper is not None and (np.shape(upper) != self.upper.shape or not np.isfinite(upper).all()):
+            raise ValueError(
+                f"value_bound() must return None or a finite number for each of the {len(self.upper)} states of the sample, "
+                f"got an array of shape {np.shape(upper)} with {int(np.isfinite(upper).sum())} finite numbers"
+            )
+        self.upper[:] = self.bounds[1] if upper is None else np.clip(upper, *self.bounds)
+        self.is_bounded = bool((self.upper < self.bounds[1]).any())
+        self.restore(np.where(self.mdp.arrays.n_optimistic > 0, self.upper, self.values))
+
+    def restore(self, values: np.ndarray) -> None:
+        """Replace the values by saved ones."""
+        self.values[:] = np.clip(values, self.bounds[0], self.upper)
