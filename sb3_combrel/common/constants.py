@@ -10,10 +10,9 @@ LAST_WEIGHT = 0.05
 NARROWEST = 0.02
 # On the slopes of a fit, in weights of instances a breadth away: MountainCar4D, Acrobot.
 RIDGE = 0.001
-# A pair of the grid is fitted anew when one in so many instances of its list is new: speed alone.
-RENEWED_PART = 8
-# The same where instances are transferred to what is not known, which takes longer.
-RENEWED_PART_WITH_TRANSFER = 2
+# A pair of the grid is fitted anew when new instances may have changed its prediction by this part of the mean effect of its
+# action, and at an episode's end when one in so many instances of its list is new: speed, MountainCar4D.
+MAX_SURPRISE, RENEWED_PART = 0.1, 8
 # A prior counts as so much weight of instances that agree with it, for effects, and for ends and rewards: transfer.
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 # An action is held until its cell of the grid is left, but no more steps than this: Acrobot, CartPole.
@@ -25,3 +24,8 @@ LONGEST_PLAN = 10_000
 # Scales that are found: margin on either side, in parts of the observed range; a range that is more times as wide as what is
 # observed is too wide: CartPole, Acrobot, dm_control's pendulum and cart-pole.
 SCALE_MARGIN, TOO_WIDE = 0.1, 2.0
+# Grid points are known with this fraction of the weight that exact states need, once an episode has ended or rewards have
+# differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how states
+# change is not to know what is there: dm_control's pendulum, point robot.
+import os
+ON_GRID = float(os.environ.get("GRID", "0.5"))

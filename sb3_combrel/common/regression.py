@@ -87,7 +87,10 @@ def fit_around(at, action, length, instances, target, kernel, fit):
     solution[:] = 0.0
     fit.low[:] = np.inf
     fit.high[:] = -np.inf
-    reward_going_on = mean_reward(action, length, instances, scale, fit)
+    any_ended = False
+    for k in range(length):
+        any_ended = any_ended or instances.terminated[action, fit.item[k]]
+    reward_going_on = mean_reward(action, length, instances, scale, fit) if any_ended else 0.0
     for k in range(length):
         i = fit.item[k]
         # Seen from the nearest: far from all instances the ridge would outweigh them.

@@ -55,8 +55,9 @@ class FoundScales:
         if not renewed.any():
             return None
         margin = np.where(used > 0.0, SCALE_MARGIN * used, SCALE_MARGIN * given)
-        low = np.where(renewed, np.maximum(least - margin, self.low), low)
-        high = np.where(renewed, np.minimum(most + margin, self.high), high)
+        wanted_low, wanted_high = around_zero(least - margin, most + margin)
+        low = np.where(renewed, np.maximum(wanted_low, self.low), low)
+        high = np.where(renewed, np.minimum(wanted_high, self.high), high)
         self.scaling = StateScaling(low, high)
         return self.scaling
 
@@ -72,3 +73,13 @@ class FoundScales:
         limit = np.finfo(np.float64).max
         self.observed = np.where(np.abs(observed) == limit, np.copysign(np.inf, observed), observed)
         self.scaling = StateScaling(low, high)
+
+
+def around_zero(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make bounds that reach about as far on either side of 0 reach equally far: 0 is a grid point then.
+
+    There, where things are at rest, interpolated values would be too high, and keep the agent.
+    """
+    far, near = np.maximum(-low, high), np.minimum(-low, high)
+    alike = near * TOO_WIDE >= far
+    return np.where(alike, -far, low), np.where(alike, far, high)

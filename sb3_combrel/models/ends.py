@@ -86,6 +86,13 @@ def squared_distance_of_end(state, ends, periodic):
     return nearest
 
 
+@inlined
+def far_from_ends(moved, of_end, near, outcome_breadth):
+    """Whether no end decides at a place, so far from a point that has an end so far away, and some arrival so near."""
+    apart = of_end - moved
+    return apart > 0.0 and apart * apart - (moved + near) ** 2 > NEGLIGIBLE * outcome_breadth
+
+
 @inner
 def end_at(state, near, outcome_breadth, arrivals, ends, found):
     """Write to ``found`` the probability that arriving at ``state`` ends the episode, and what an end there pays.

@@ -12,19 +12,20 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
-from sb3_combrel.common.constants import RENEWED_PART, RENEWED_PART_WITH_TRANSFER
+from sb3_combrel.common.constants import ON_GRID, RENEWED_PART
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.regression import Kernel
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
 from sb3_combrel.models.ends import Ends, put_arrivals, put_transition
-from sb3_combrel.models.grid_points import PairArrays, PointScratch, note_instance
+from sb3_combrel.models.grid_points import CAME, ENDED, WENT, PairArrays, PointScratch, note_instance
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
 from sb3_combrel.planning.q_values import Prediction
 
 _note_instance, _put_transition, _put_arrivals = EntryPoint(note_instance), EntryPoint(put_transition), EntryPoint(put_arrivals)
 NO_EFFECT = np.empty(0)
+LEAST_SIZE = 0.01
 
 
 @inlined
@@ -77,6 +78,10 @@ class GridModel(Model):
 
     #: Successors of an action that the own instances may predict.
     _own_room = 1
+    #: Numbers that are fitted at each pair.
+    _n_fitted = 0
+    #: Whether grid points need less weight than exact states.
+    _fits = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
@@ -87,9 +92,19 @@ class GridModel(Model):
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )
-        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach)
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._n_fitted)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
         self._plain_pairs, self._plain_kernel = tuple(self.pairs), tuple(self.kernel)
+        # Where instances are transferred, what is not known is updated when its instances are twice as many.
+        few = 0 if self._giver is None else 1
+        self._rules = self.kernel.scale, self.exploration_threshold, few
+        # Whether an outcome has told states apart.
+        self._informed, self._first_reward = not self._fits, np.nan
+        # Sums of the sizes of effects and rewards, by action.
+        self._sizes = np.zeros((self.n_actions, self.grid.n_variables + 1))
+        self._cell = float((self.grid.arrays.cells**-2.0).sum()) ** 0.5
+        # A variable that hardly ever changes is measured by this part of a cell.
+        self._least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, 1e-9)
         self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known)))
         self._nothing = TransferredInstances.empty(1, self.grid.n_variables)
         self._make_prediction(self._own_room)
@@ -109,7 +124,7 @@ class GridModel(Model):
         """Fill the prediction from the own instances; the least weight that an action has."""
 
     @abstractmethod
-    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...], renewed_part: int) -> int:
+    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         """Fit, and write the rows of, (pairs, how many of them are done); how many are done then, fewer if there is no room."""
 
     def _make_prediction(self, room: int) -> None:
@@ -140,19 +155,40 @@ class GridModel(Model):
         _put_transition.call(*self._plain_experience[:2], transition, effect)
         self.n_added += 1
         self._number[action, slot] = self.n_added
-        due = self._note(state, action, False)
+        numbers = self._numbers_of(action, slot)
+        sizes = self._sizes[action]
+        sizes += np.abs(numbers)
+        size = np.maximum(sizes / self.instances.size[action], self._least_size)
+        state = self.instances.state[action, slot]
+        due = self._note((state, numbers, size), action, self.kernel.reach, CAME)
+        if not self._informed:
+            due = self._inform(float(transition[4]), bool(terminated), due)
         if not terminated:
             return due
         self._renew_ends()
-        # What is known of ends concerns all actions.
-        arrived, due = self.arrivals.state[action, slot], due.copy()
-        others = [self._note(arrived, other, False).copy() for other in range(self.n_actions) if other != action]
-        return np.unique(np.concatenate([due, *others]))
+        # What is known of ends concerns all actions that may lead there.
+        due, arrived = [due.copy()], self.arrivals.state[action, slot]
+        widest = (self._cell + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
+        due += [self._note((arrived, numbers, size), other, widest, ENDED).copy() for other in range(self.n_actions)]
+        return np.unique(np.concatenate(due))
 
-    def _note(self, state: np.ndarray, action: int, at_once: bool) -> np.ndarray:
-        """Count a new instance, or one that is removed, for the pairs that it concerns; those that are due."""
-        first, widest = action * self.grid.n_points, self.kernel.reach
-        n = _note_instance.call(state, first, self._plain_pairs, widest, at_once, self.grid.plain, self._points)
+    def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
+        """Note an outcome; with the first that differs grid points need less weight: the pairs that are due."""
+        self._first_reward = reward if np.isnan(self._first_reward) else self._first_reward
+        self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
+        if not self._informed:
+            return due
+        self._rules = self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2]
+        return np.union1d(due, np.flatnonzero(~self.known & (self.own_weight >= self._rules[1])))
+
+    def _numbers_of(self, action: int, slot: int) -> np.ndarray:
+        """Effect and reward of an instance."""
+        return np.append(self.instances.effect[action, slot], self.instances.reward[action, slot])
+
+    def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
+        """Note at the pairs of an action what has happened near them; those that are to be fitted."""
+        first = action * self.grid.n_points
+        n = _note_instance.call(instance, first, self._plain_pairs, widest, why, self.grid.plain, self._rules, self._points)
         due: np.ndarray = self._points[2][:n]
         return due
 
@@ -162,7 +198,9 @@ class GridModel(Model):
         if self.settings.max_instances is not None and size >= self.settings.max_instances:
             apart = differences(instances.state[action, :size], state, instances.periodic)
             slot = int((apart**2).sum(axis=1).argmin())
-            removed = self._note(instances.state[action, slot], action, True).copy()
+            numbers = self._numbers_of(action, slot)
+            instance = instances.state[action, slot], numbers, numbers
+            removed = self._note(instance, action, self.kernel.reach, WENT).copy()
             if instances.terminated[action, slot]:
                 instances.terminated[action, slot] = False
                 self._renew_ends()
@@ -185,14 +223,14 @@ class GridModel(Model):
         self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
-        """The pairs that have had instances since they were fitted."""
-        return np.flatnonzero(self.pairs.n_new)
+        """The pairs many of whose instances are new."""
+        pairs = self.pairs
+        return np.flatnonzero((pairs.n_new * RENEWED_PART >= np.maximum(pairs.length, 1)) & (pairs.known | (self._giver is not None)))
 
     def update_rows(self, pairs: np.ndarray) -> None:
         transferred, done = tuple(self._transferred_to(pairs)), 0
-        part = RENEWED_PART if self._giver is None else RENEWED_PART_WITH_TRANSFER
         while done < len(pairs):
-            done = self._write_rows((pairs, done), transferred, part)
+            done = self._write_rows((pairs, done), transferred)
             if done < len(pairs):
                 self.mdp.make_room()
 

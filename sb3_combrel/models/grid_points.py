@@ -4,9 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled
+from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.constants import MAX_SURPRISE
 from sb3_combrel.common.periodic import difference
+from sb3_combrel.common.regression import PER_BREADTH
 from sb3_combrel.planning.grid import GridArrays
+
+# The kernel's weights over a full list add up to about this part of its length.
+SHARE_OF_LIST = 0.3
 
 
 class PairArrays(NamedTuple):
@@ -14,21 +19,26 @@ class PairArrays(NamedTuple):
 
     reach: np.ndarray  # float64, (n_pairs,): squared distance within which a new instance concerns the pair
     n_new: np.ndarray  # int32, (n_pairs,): instances within that since the pair was last fitted
-    renewed_after: np.ndarray  # int32, (n_pairs,): with so many new ones it is fitted again
-    fitted_at: np.ndarray  # int64, (n_pairs,): transitions there were when it was last fitted; 0: it never was
-    weight: np.ndarray  # float64, (n_pairs,): of its instances then
-    known: np.ndarray  # bool, (n_pairs,): whether that suffices
+    length: np.ndarray  # int32, (n_pairs,): instances that it was fitted to then
+    fitted_at: np.ndarray  # int64, (n_pairs,): transitions there were then; 0: it never was
+    weight: np.ndarray  # float64, (n_pairs,): of the instances, which decides whether the pair is known
+    known: np.ndarray  # bool, (n_pairs,)
+    # How much new instances may have changed of what is predicted, in parts of the mean effect; inf: it is fitted at once.
+    surprise: np.ndarray  # float64, (n_pairs,)
+    fit: np.ndarray  # float64, (n_pairs, d + 1, d + 1): means and slopes of effects and reward; (n_pairs, 0, 0) for a model without
 
     @classmethod
-    def empty(cls, n_pairs: int, reach: float) -> "PairArrays":
-        """Pairs none of which has been fitted."""
+    def empty(cls, n_pairs: int, reach: float, n_numbers: int) -> "PairArrays":
+        """Pairs none of which has been fitted; ``n_numbers``: d + 1, or 0 for a model without fits."""
         return cls(
             reach=np.full(n_pairs, reach),
             n_new=np.zeros(n_pairs, dtype=np.int32),
-            renewed_after=np.ones(n_pairs, dtype=np.int32),
+            length=np.zeros(n_pairs, dtype=np.int32),
             fitted_at=np.zeros(n_pairs, dtype=np.int64),
             weight=np.zeros(n_pairs),
             known=np.zeros(n_pairs, dtype=np.bool_),
+            surprise=np.zeros(n_pairs),
+            fit=np.zeros((n_pairs, n_numbers, n_numbers)),
         )
 
 
@@ -47,16 +57,57 @@ class PointScratch(NamedTuple):
         return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64))
 
 
-@compiled
-def note_instance(state, first_pair, pairs, widest, at_once, grid, scratch):
-    """Count a new instance at ``state`` for the pairs of an action that it concerns; how many are due, in ``scratch.pair``.
+# Why the pairs around a state are looked at: an instance has come, has gone, or an episode has ended there.
+CAME, WENT, ENDED = range(3)
 
+
+@inlined
+def surprise_of(pair, distance, pairs, numbers, state, at, grid, size):
+    """By how much an instance may change what a pair predicts, in parts of the mean size of the action's numbers."""
+    d = len(state)
+    worst = 0.0
+    for v in range(d + 1):
+        predicted = pairs.fit[pair, 0, v]
+        for k in range(d):
+            away = difference(state[k], (at[k] - grid.margin[k]) / grid.cells[k], grid.periodic[k])
+            predicted += pairs.fit[pair, k + 1, v] * away
+        worst = max(worst, abs(numbers[v] - predicted) / size[v])
+    return worst * np.exp(-PER_BREADTH * distance / pairs.reach[pair]) / max(1.0, SHARE_OF_LIST * pairs.length[pair])
+
+
+@inlined
+def look_at(pair, distance, why, pairs, instance, at, grid, rules):
+    """Note at one pair what has happened near it; whether it is to be fitted at once."""
+    state, numbers, size = instance
+    scale, threshold, few = rules
+    if why != ENDED and distance > pairs.reach[pair]:
+        return False
+    if why != CAME:
+        return pairs.known[pair] or why == WENT
+    pairs.n_new[pair] += 1
+    if not pairs.known[pair]:
+        pairs.weight[pair] += np.exp(distance * scale)
+        return pairs.weight[pair] >= threshold * (1.0 - 1e-9) or pairs.n_new[pair] * few > pairs.length[pair]
+    if pairs.fit.shape[1] == 0:
+        return True
+    pairs.surprise[pair] += surprise_of(pair, distance, pairs, numbers, state, at, grid, size)
+    return pairs.surprise[pair] > MAX_SURPRISE or 2 * pairs.n_new[pair] >= pairs.length[pair]
+
+
+@compiled
+def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch):
+    """Note an instance at all pairs of an action that it concerns; how many are to be fitted, in ``scratch.pair``.
+
+    :param instance: (state; effect less the prior's, and reward, shape (d + 1,); what differences of these are measured by)
     :param first_pair: of the action; plain tuples for ``pairs``, ``grid`` and ``scratch``
-    :param widest: the largest reach that a pair may have
-    :param at_once: whether all that it concerns are due, as when an instance is removed
+    :param widest: squared distance beyond which no pair is concerned
+    :param why: CAME, WENT, or ENDED: then the state is where an episode ended
+    :param rules: (-1 / model_breadth ** 2, threshold, how many times the new instances of a pair that is not known must be more
+        than those it has, or 0: it waits until it becomes known)
     """
     pairs, grid, scratch = PairArrays(*pairs), GridArrays(*grid), PointScratch(*scratch)
     first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]
+    state = instance[0]
     d = len(state)
     radius = np.sqrt(widest) * (1 + 1e-12)
     for k in range(d):
@@ -81,11 +132,11 @@ def note_instance(state, first_pair, pairs, widest, at_once, grid, scratch):
             base += at[k] * grid.strides[k]
         if outer <= widest:
             for j in range(first[inner], last[inner]):
-                if outer + scratch.along[inner, j] <= pairs.reach[base + j]:
-                    pairs.n_new[base + j] += 1
-                    if at_once or pairs.n_new[base + j] >= pairs.renewed_after[base + j]:
-                        scratch.pair[due] = base + j
-                        due += 1
+                distance = outer + scratch.along[inner, j]
+                at[inner] = j
+                if distance <= widest and look_at(base + j, distance, why, pairs, instance, at, grid, rules):
+                    scratch.pair[due] = base + j
+                    due += 1
         k = inner - 1
         while k >= 0:
             at[k] += 1

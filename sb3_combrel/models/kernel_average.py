@@ -90,13 +90,13 @@ def entry_distance(near, length, total, kernel):
 def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, near):
     """Write rows of pairs from the instances that the kernel keeps, and from transferred ones; how many are done.
 
-    :param planned: (gamma, threshold, transitions so far, renewed part); plain tuples for the rest
+    :param planned: (gamma, threshold, transitions so far); plain tuples for the rest
     :param which: (pairs, how many of them are done)
     :param transferred: a row for each of them, which counts only while the pair is not known
     """
     instances, pairs, mdp, grid = Instances(*instances), PairArrays(*pairs), MDPArrays(*mdp), GridArrays(*grid)
     transferred, row_scratch, near = TransferredInstances(*transferred), RowScratch(*row_scratch), NearList(*near)
-    gamma, threshold, transitions, renewed_part = planned
+    gamma, threshold, transitions = planned
     which, done = which
     n_points = len(mdp.n_optimistic)
     while done < len(which):
@@ -109,8 +109,7 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         known = weight >= threshold
         pairs.weight[pair], pairs.known[pair] = weight, known
         pairs.reach[pair] = entry_distance(near, length, total, kernel)
-        pairs.n_new[pair], pairs.fitted_at[pair] = 0, transitions
-        pairs.renewed_after[pair] = 1 if known else max(1, length // renewed_part)
+        pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
         joined = not known and transferred.length[done] > 0
         if known or joined:
             coordinates_of(point, grid, row_scratch.at)
@@ -153,8 +152,8 @@ class KernelAverage(GridModel):
         room = self._own_room
         self._near = tuple(NearList(np.zeros(room, dtype=np.int32), np.empty(room), np.empty(self.grid.n_variables)))
 
-    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...], renewed_part: int) -> int:
-        mdp, planned = self.mdp, (self.mdp.gamma, self.exploration_threshold, self.n_added, renewed_part)
+    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
+        mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
         model = self._plain_experience[0], self._plain_pairs, mdp.plain, self.grid.plain, self._weights
         return int(_update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
 

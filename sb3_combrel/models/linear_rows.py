@@ -10,7 +10,7 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances, squared_distance
 from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.ends import Ends, end_at
+from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays
 from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, unit_coordinates_of
@@ -18,7 +18,6 @@ from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, coord
 from sb3_combrel.planning.q_values import Prediction
 
 import os
-GRID = float(os.environ.get("GRID", "1"))
 HOLD = int(os.environ.get("HOLD", "1"))
 # In parts of a cell: an effect of less is none.
 STAYS = 1e-6
@@ -52,14 +51,28 @@ def find_nearest(at, action, n_before, instances, kernel, fit):
 
 
 @inner
-def outcome_of(to, action, length, experience, kernel, fit, end):
-    """Write to ``end`` what arriving at ``to`` means; the squared distance of some arrival."""
+def distances_around(at, action, length, experience, fit):
+    """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
     _, arrivals, ends = experience
     near = np.inf
     if length > 0:
-        near = squared_distance(to, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
-    end_at(to, near, kernel.outcome_breadth, arrivals, ends, end)
-    return near
+        near = np.sqrt(squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True))
+    return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), near
+
+
+@inner
+def outcome_of(to, moved, around, experience, kernel, end):
+    """Write to ``end`` what arriving at ``to`` means; the squared distance of some arrival.
+
+    :param moved: how far it is from the state around which ``around`` are the :func:`distances_around`
+    """
+    _, arrivals, ends = experience
+    of_end, near = around
+    far = (moved + near) ** 2
+    end[0], end[1] = 0.0, 0.0
+    if not far_from_ends(moved, of_end, near, kernel.outcome_breadth):
+        end_at(to, far, kernel.outcome_breadth, arrivals, ends, end)
+    return far
 
 
 @inlined
@@ -105,14 +118,17 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
             fit_around(state, action, length, instances, linear.target, kernel, fit)
         share = share_of_fit(length, claimed[action], fit)
         scratch.away[:] = 0.0
+        moved = 0.0
         for v in range(d):
             effect = predicted[action, v]
             if length > 0:
                 effect += share * number_at(fit, v, scratch.away)
             prediction.effect[action, 0, v] = effect
             scratch.to[v] = state[v] + effect
+            moved += effect * effect
         reward = number_at(fit, d, scratch.away) if length > 0 else predicted[action, d]
-        near = outcome_of(scratch.to, action, length, experience, kernel, fit, scratch.end)
+        around = distances_around(state, action, length, experience, fit)
+        near = outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end = scratch.end[0]
         reward = (1.0 - end) * reward + end * scratch.end[1]
         if claimed[action] and weight < threshold:
@@ -182,10 +198,14 @@ def follow(pair, action, length, known, linear, experience, kernel, fit, grid, a
     away[:] = 0.0
     total, goes_on, discount = 0.0, 1.0, 1.0
     by_prior = linear.claimed[pair] and not known
+    around = distances_around(scratch.at, action, length, experience, fit)
     for n in range(max_steps):
         part = take_step(pair, length, linear, fit, grid, at, has_prior, scratch)
         reward = number_at(fit, d, away) if length > 0 else linear.prior[pair, d]
-        near = outcome_of(scratch.to, action, length, experience, kernel, fit, scratch.end)
+        moved = 0.0
+        for k in range(d):
+            moved += (away[k] + scratch.step[k]) ** 2
+        near = outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end, pays = scratch.end[0], scratch.end[1]
         reward = (1.0 - end) * reward + end * pays
         if by_prior:
@@ -206,22 +226,20 @@ def follow(pair, action, length, known, linear, experience, kernel, fit, grid, a
 
 
 @inlined
-def note_fit(pair, length, weight, threshold, transitions, renewed_part, pairs, kernel, fit):
-    """Note that a pair has been fitted to its instances."""
+def note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit):
+    """Note that a pair is fitted to its instances; whether these suffice."""
     full = length == kernel.n_neighbors
     pairs.reach[pair] = fit.distance[length - 1] if full else kernel.reach
-    pairs.n_new[pair] = 0
-    pairs.renewed_after[pair] = max(1, length // renewed_part)
-    pairs.fitted_at[pair] = transitions
-    pairs.weight[pair] = weight
-    pairs.known[pair] = weight >= GRID * threshold
+    pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
+    pairs.weight[pair], pairs.known[pair], pairs.surprise[pair] = weight, weight >= threshold, 0.0
+    return pairs.known[pair]
 
 
 @compiled
 def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, fit, scratch):
     """Fit pairs anew, and write their rows, with transferred instances for what is not known; how many are done.
 
-    :param planned: (gamma, threshold, whether there is a prior, transitions so far, renewed part); plain tuples for the rest
+    :param planned: (gamma, threshold, whether there is a prior, transitions so far); plain tuples for the rest
     :param which: (pairs, how many of them are done)
     :param transferred: a row for each of them, which counts only while the pair is not known
     """
@@ -230,24 +248,29 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
     linear, pairs, mdp, grid, kernel = LinearArrays(*linear), PairArrays(*pairs), MDPArrays(*mdp), GridArrays(*grid), Kernel(*kernel)
     transferred, row_scratch = TransferredInstances(*transferred), RowScratch(*row_scratch)
     fit, scratch = LocalFit(*fit), LinearScratch(*scratch)
-    gamma, threshold, has_prior, transitions, renewed_part = planned
+    gamma, threshold, has_prior, transitions = planned
     which, done = which
     n_points = len(mdp.n_optimistic)
+    length, action_before = np.int64(0), -1
     while done < len(which):
         pair = which[done]
         point = pair % n_points
         action = pair // n_points
         unit_coordinates_of(point, grid, scratch.at)
         coordinates_of(point, grid, row_scratch.at)
-        length = find_nearest(scratch.at, action, 0, instances, kernel, fit)
+        # What is near the point before is looked at first.
+        length = find_nearest(scratch.at, action, length if action == action_before else 0, instances, kernel, fit)
+        action_before = action
         weight = known_weight(fit, length, kernel)
-        note_fit(pair, length, weight, threshold, transitions, renewed_part, pairs, kernel, fit)
-        known = pairs.known[pair]
+        known = note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit)
         joined = not known and transferred.length[done] > 0
         modelled = known or joined or linear.claimed[pair]
         if modelled:
             if length > 0:
                 fit_around(scratch.at, action, length, instances, linear.target, kernel, fit)
+                for p in range(pairs.fit.shape[1]):
+                    for v in range(pairs.fit.shape[2]):
+                        pairs.fit[pair, p, v] = fit.solution[p, v]
             own = 1.0
             if joined:
                 own = weight / total_weight(weight, transferred, done)
@@ -255,6 +278,9 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
             reward, goes_on, discount = follow(
                 pair, action, length, known, linear, experience, kernel, fit, grid, row_scratch.at, how, scratch
             )
+            if goes_on < 1.0:
+                # Near an end every arrival matters.
+                pairs.surprise[pair] = np.inf
             n_touched = np.int64(0)
             if own * goes_on > 0.0:
                 n_touched = add_successor(own * goes_on, scratch.away, row_scratch, grid, n_touched)

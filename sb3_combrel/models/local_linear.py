@@ -10,7 +10,7 @@ from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.regression import LocalFit
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
-from sb3_combrel.models.grid_model import NO_EFFECT, GridModel
+from sb3_combrel.models.grid_model import GridModel
 from sb3_combrel.models.linear_rows import LinearArrays, LinearScratch, interpolate_prior, predict_own, update_rows
 from sb3_combrel.planning.mdp import FiniteMDP
 
@@ -39,8 +39,10 @@ class LocalLinear(GridModel):
     """
 
     takes_prior = True
+    _fits = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
+        self._n_fitted = mdp.grid.n_variables + 1
         super().__init__(mdp, settings, transfer)
         self._prior = transfer if transfer is not None and transfer.use == "prior" else None
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
@@ -63,13 +65,11 @@ class LocalLinear(GridModel):
     def _set_linear(self, linear: LinearArrays) -> None:
         self.linear, self._plain_linear = linear, tuple(linear)
 
-    def _put(self, transition: tuple[Any, ...], effect: np.ndarray = NO_EFFECT) -> np.ndarray:
-        due = super()._put(transition, effect)
+    def _numbers_of(self, action: int, slot: int) -> np.ndarray:
         if self._prior is not None:
-            action, slot, state = transition[:3]
-            explained = self._prior_effects(state[None], np.array([action]))[0]
+            explained = self._prior_effects(self.instances.state[action, slot][None], np.array([action]))[0]
             self.linear.target[action, slot] = self.instances.effect[action, slot] - explained
-        return due
+        return np.append(self.linear.target[action, slot], self.instances.reward[action, slot])
 
     def _renew_arrivals(self) -> None:
         super()._renew_arrivals()
@@ -120,9 +120,9 @@ class LocalLinear(GridModel):
         self._renew_targets()
         return np.arange(len(self.known))
 
-    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...], renewed_part: int) -> int:
+    def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, has_prior = self.mdp, self._prior is not None
-        planned = mdp.gamma, self.exploration_threshold, has_prior, self.n_added, renewed_part
+        planned = mdp.gamma, self._rules[1], has_prior, self.n_added
         model = self._plain_experience, self._plain_linear, self._plain_pairs, mdp.plain, self.grid.plain, self._plain_kernel
         scratch = mdp.plain_scratch, self._fit, self._scratch
         return int(_update_rows.call(*model, planned, pairs, transferred, *scratch))

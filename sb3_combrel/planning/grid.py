@@ -11,6 +11,10 @@ from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.periodic import flag_array
 
 
+# In parts of a cell.
+ON_LINE = 1e-9
+
+
 class GridArrays(NamedTuple):
     """What compiled code needs to know of a grid.
 
@@ -56,14 +60,15 @@ def corners_of(position, grid, corner_index, corner_weight):
         last = grid.shape[k] - 1
         stride = grid.strides[k]
         if grid.periodic[k]:
-            at = wrapped(position[k], grid.shape[k])
+            at = wrapped(position[k] + ON_LINE, grid.shape[k]) - ON_LINE
         else:
             at = min(max(position[k], 0.0), float(last))
-        low = int(at)
+        # On a grid line but for rounding: half the corners, and half the work of planning.
+        low = int(at + ON_LINE)
         part = at - low
         for c in range(n_corners):
             corner_index[c] += low * stride
-        if part > 0.0:
+        if part > ON_LINE:
             # Beyond the last point there is something between the points of a periodic variable only.
             step = stride if low < last else -last * stride
             for c in range(n_corners):
