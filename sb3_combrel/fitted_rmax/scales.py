@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_combrel.common.constants import SCALE_MARGIN, TOO_WIDE
+from sb3_combrel.common.constants import BEYOND, FAR_BEYOND, TOO_WIDE
 from sb3_combrel.common.scaling import Bounds, StateScaling
 
 # A limit of the order of the largest float stands for "unbounded".
 _LARGEST_BOUND = 1e30
-# In parts of the range: observations beyond the bounds by less change nothing.
-_BEYOND = 0.02
 
 
 class FoundScales:
@@ -21,7 +19,8 @@ class FoundScales:
 
     Those that the user gives stay as they are. Otherwise it begins with the observation space's, where these are finite; a
     variable without bounds, or one that uses less than half of them by the end of an episode, is scaled by the range of its
-    observations, with a margin, and again whenever an observation lies beyond. Periodic variables keep their bounds.
+    observations, and again when one lies beyond: at once if far beyond, otherwise when the episode ends. There is no margin:
+    nobody has been there, and it would draw the agent. Periodic variables keep their bounds.
 
     :param space: observation space
     :param bounds: of the user; None: to be found
@@ -48,14 +47,16 @@ class FoundScales:
         least, most = self.observed
         low, high = self.scaling.low, self.scaling.high
         used, given = most - least, high - low
-        beyond = (least < low - _BEYOND * given) | (most > high + _BEYOND * given)
+        tolerated = (BEYOND if episode_ended else FAR_BEYOND) * given
+        beyond = (least < low - tolerated) | (most > high + tolerated)
         # A variable that never changes has no scale.
         too_wide = (given > TOO_WIDE * used) & (used > 0.0) if episode_ended else np.zeros(len(low), dtype=np.bool_)
         renewed = self._found & (beyond | too_wide)
         if not renewed.any():
             return None
-        margin = np.where(used > 0.0, SCALE_MARGIN * used, SCALE_MARGIN * given)
-        wanted_low, wanted_high = around_zero(least - margin, most + margin)
+        # A single observation has no range.
+        around = np.where(used > 0.0, 0.0, 0.5 * given)
+        wanted_low, wanted_high = around_zero(least - around, most + around)
         low = np.where(renewed, np.maximum(wanted_low, self.low), low)
         high = np.where(renewed, np.minimum(wanted_high, self.high), high)
         self.scaling = StateScaling(low, high)

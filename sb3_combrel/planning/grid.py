@@ -11,6 +11,8 @@ from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.periodic import flag_array
 
 
+# More variables are interpolated between by simplices.
+MAX_MULTILINEAR = 4
 # In parts of a cell.
 ON_LINE = 1e-9
 
@@ -46,37 +48,89 @@ def wrapped(at, n):
     return at if at < n else 0.0
 
 
+def n_corners(n_variables: int) -> int:
+    """Grid points between which is interpolated: those of a cell, or of a simplex of it for more than four variables."""
+    return int(2**n_variables if n_variables <= MAX_MULTILINEAR else n_variables + 1)
+
+
+@inlined
+def cell_of(at, k, grid):
+    """The cell of a grid coordinate along variable ``k``, wrapped or clipped into the grid; and the part of it beyond."""
+    last = grid.shape[k] - 1
+    if grid.periodic[k]:
+        at = wrapped(at + ON_LINE, grid.shape[k]) - ON_LINE
+    else:
+        at = min(max(at, 0.0), float(last))
+    # On a grid line but for rounding: half the corners, and half the work of planning.
+    low = int(at + ON_LINE)
+    part = at - low
+    return low, part if part > ON_LINE else 0.0
+
+
+@inlined
+def step_along(low, k, grid):
+    """What the next grid point along variable ``k`` adds to a point's number."""
+    # Beyond the last point there is something between the points of a periodic variable only.
+    return grid.strides[k] if low < grid.shape[k] - 1 else -(grid.shape[k] - 1) * grid.strides[k]
+
+
 @inlined
 def corners_of(position, grid, corner_index, corner_weight):
-    """Write the grid points around ``position`` and their multilinear weights; how many have a weight above 0.
+    """Write the grid points around ``position`` and their weights; how many have a weight above 0.
+
+    Multilinear weights for up to four variables; for more those of Kuhn's simplices (Munos & Moore 2002), d + 1 instead of 2^d.
 
     :param position: float64, shape (n_variables,): grid coordinates; wrapped or clipped into the grid
     :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape
     """
+    if len(position) > MAX_MULTILINEAR:
+        return simplex_of(position, grid, corner_index, corner_weight)
     corner_index[0] = 0
     corner_weight[0] = 1.0
-    n_corners = 1
+    n = 1
     for k in range(len(position)):
-        last = grid.shape[k] - 1
-        stride = grid.strides[k]
-        if grid.periodic[k]:
-            at = wrapped(position[k] + ON_LINE, grid.shape[k]) - ON_LINE
-        else:
-            at = min(max(position[k], 0.0), float(last))
-        # On a grid line but for rounding: half the corners, and half the work of planning.
-        low = int(at + ON_LINE)
-        part = at - low
-        for c in range(n_corners):
-            corner_index[c] += low * stride
-        if part > ON_LINE:
-            # Beyond the last point there is something between the points of a periodic variable only.
-            step = stride if low < last else -last * stride
-            for c in range(n_corners):
-                corner_index[n_corners + c] = corner_index[c] + step
-                corner_weight[n_corners + c] = corner_weight[c] * part
+        low, part = cell_of(position[k], k, grid)
+        for c in range(n):
+            corner_index[c] += low * grid.strides[k]
+        if part > 0.0:
+            step = step_along(low, k, grid)
+            for c in range(n):
+                corner_index[n + c] = corner_index[c] + step
+                corner_weight[n + c] = corner_weight[c] * part
                 corner_weight[c] *= 1.0 - part
-            n_corners *= 2
-    return n_corners
+            n *= 2
+    return n
+
+
+@inlined
+def simplex_of(position, grid, corner_index, corner_weight):
+    """:func:`corners_of` for many variables: from the lowest corner of the cell on, the longest way first."""
+    d = len(position)
+    # Beyond the d + 1 corners there is room: the parts of a cell, and the steps along it, longest first.
+    parts, steps = d + 1, d + 1
+    base = np.int64(0)
+    for k in range(d):
+        low, part = cell_of(position[k], k, grid)
+        base += low * grid.strides[k]
+        step = step_along(low, k, grid)
+        j = k
+        while j > 0 and corner_weight[parts + j - 1] < part:
+            corner_weight[parts + j] = corner_weight[parts + j - 1]
+            corner_index[steps + j] = corner_index[steps + j - 1]
+            j -= 1
+        corner_weight[parts + j] = part
+        corner_index[steps + j] = step
+    corner_index[0] = base
+    corner_weight[0] = 1.0
+    n = 1
+    for j in range(d):
+        part = corner_weight[parts + j]
+        if part > 0.0:
+            corner_weight[n - 1] -= part
+            corner_index[n] = corner_index[n - 1] + corner_index[steps + j]
+            corner_weight[n] = part
+            n += 1
+    return n
 
 
 @inlined

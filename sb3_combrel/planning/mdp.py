@@ -9,18 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
-from sb3_combrel.planning.grid import StateGrid, corners_of
+from sb3_combrel.planning.grid import StateGrid, corners_of, n_corners
 
 NEVER_LEAVES = 1e-9
 
 
 class MDPArrays(NamedTuple):
-    """The finite MDP for compiled code: rows of fixed width."""
+    """The finite MDP for compiled code: rows of fixed width, those of a grid point beside each other, as sweeps read them."""
 
-    to: np.ndarray  # int32, (n_pairs, width): the *other* grid points that a pair leads to
+    to: np.ndarray  # int32, (n_points, n_actions, width): the *other* grid points that a pair leads to
     weight: np.ndarray  # float64, the same: with which discounted probability (see finish_row)
-    length: np.ndarray  # int32, (n_pairs,): how many they are
-    reward: np.ndarray  # float64, (n_pairs,): reward of the pair until its state is left
+    length: np.ndarray  # int32, (n_points, n_actions): how many they are
+    reward: np.ndarray  # float64, (n_points, n_actions): reward of the pair until its state is left
     modelled: np.ndarray  # bool, (n_pairs,): the pair has a model
     n_optimistic: np.ndarray  # int64, (n_points,): actions of a grid point that have none
 
@@ -51,10 +51,10 @@ class FiniteMDP:
         self.gamma = float(gamma)
         #: The MDP for compiled code; ``plain``: the same as a plain tuple (see ``common.compiled``).
         self.arrays = MDPArrays(
-            to=np.zeros((n_pairs, 2**d), dtype=np.int32),
-            weight=np.zeros((n_pairs, 2**d)),
-            length=np.zeros(n_pairs, dtype=np.int32),
-            reward=np.zeros(n_pairs),
+            to=np.zeros((n_points, n_actions, n_corners(d)), dtype=np.int32),
+            weight=np.zeros((n_points, n_actions, n_corners(d))),
+            length=np.zeros((n_points, n_actions), dtype=np.int32),
+            reward=np.zeros((n_points, n_actions)),
             modelled=np.zeros(n_pairs, dtype=np.bool_),
             n_optimistic=np.full(n_points, n_actions, dtype=np.int64),
         )
@@ -71,8 +71,8 @@ class FiniteMDP:
 
     def make_room(self) -> None:
         """Make rows twice as wide: a mean of many successors needs more room than one successor."""
-        wider = {name: np.hstack([array, np.zeros_like(array)]) for name, array in self.arrays._asdict().items() if array.ndim > 1}
-        self.arrays = self.arrays._replace(**wider)
+        to, weight = (np.concatenate([array, np.zeros_like(array)], axis=2) for array in self.arrays[:2])
+        self.arrays = self.arrays._replace(to=to, weight=weight)
         self.plain = tuple(self.arrays)
 
     def write_rows(
@@ -111,8 +111,7 @@ def add_successor(p, effect, scratch, grid, n_touched):
     """
     for k in range(len(grid.shape)):
         scratch.position[k] = scratch.at[k] + effect[k] * grid.cells[k]
-    n_corners = corners_of(scratch.position, grid, scratch.corner_index, scratch.corner_weight)
-    for c in range(n_corners):
+    for c in range(corners_of(scratch.position, grid, scratch.corner_index, scratch.corner_weight)):
         point = scratch.corner_index[c]
         if scratch.dense[point] == 0.0:
             scratch.touched[n_touched] = point
@@ -137,18 +136,19 @@ def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
     leave = 1.0 - gamma * scratch.dense[point]
     never_leaves = leave < NEVER_LEAVES
     discount = 0.0 if never_leaves else gamma / leave
-    length, width = 0, mdp.to.shape[1]
+    action = pair // len(mdp.n_optimistic)
+    length, width = 0, mdp.to.shape[2]
     room = n_touched <= width
     for t in range(n_touched):
         to = scratch.touched[t]
         if room and to != point and discount > 0.0:
-            mdp.to[pair, length] = to
-            mdp.weight[pair, length] = scratch.dense[to] * discount
+            mdp.to[point, action, length] = to
+            mdp.weight[point, action, length] = scratch.dense[to] * discount
             length += 1
         scratch.dense[to] = 0.0
     if room:
-        mdp.length[pair] = length
-        mdp.reward[pair] = infinite_reward(reward) if never_leaves else reward / leave
+        mdp.length[point, action] = length
+        mdp.reward[point, action] = infinite_reward(reward) if never_leaves else reward / leave
     return room
 
 
@@ -156,11 +156,12 @@ def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
 def set_modelled(mdp, pair, modelled):
     """Note whether a pair has a model; one that has lost it becomes optimistic."""
     if modelled != mdp.modelled[pair]:
+        point, action = pair % len(mdp.n_optimistic), pair // len(mdp.n_optimistic)
         if not modelled:
-            mdp.length[pair] = 0
-            mdp.reward[pair] = 0.0
+            mdp.length[point, action] = 0
+            mdp.reward[point, action] = 0.0
         mdp.modelled[pair] = modelled
-        mdp.n_optimistic[pair % len(mdp.n_optimistic)] += -1 if modelled else 1
+        mdp.n_optimistic[point] += -1 if modelled else 1
 
 
 @compiled

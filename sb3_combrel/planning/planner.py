@@ -23,10 +23,10 @@ def sweep(values, mdp, upper, lowest, downwards):
         best = upper[point]
         if n_optimistic[point] == 0:
             best = lowest
-            for pair in range(point, len(reward), n_points):
-                q = reward[pair]
-                for k in range(length[pair]):
-                    q += weight[pair, k] * values[to[pair, k]]
+            for action in range(reward.shape[1]):
+                q = reward[point, action]
+                for k in range(length[point, action]):
+                    q += weight[point, action, k] * values[to[point, action, k]]
                 best = max(best, q)
             best = min(best, upper[point])
         largest = max(largest, abs(best - values[point]))
@@ -43,11 +43,11 @@ def cautious_sweep(values, mdp, upper, lowest, downwards):
     for step in range(n_points):
         point = n_points - 1 - step if downwards else step
         best = lowest
-        for pair in range(point, len(reward), n_points):
-            if modelled[pair]:
-                q = reward[pair]
-                for k in range(length[pair]):
-                    q += weight[pair, k] * values[to[pair, k]]
+        for action in range(reward.shape[1]):
+            if modelled[action * n_points + point]:
+                q = reward[point, action]
+                for k in range(length[point, action]):
+                    q += weight[point, action, k] * values[to[point, action, k]]
                 best = max(best, q)
         best = min(best, upper[point])
         largest = max(largest, abs(best - values[point]))
