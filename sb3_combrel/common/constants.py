@@ -11,7 +11,7 @@ NARROWEST = 0.02
 # On the slopes of a fit, in weights of instances a breadth away: MountainCar4D, Acrobot.
 RIDGE = 0.001
 # A pair of the grid is fitted anew when new instances may have changed its prediction by this part of the mean effect of its
-# action, and at an episode's end when one in so many instances of its list is new: speed, MountainCar4D.
+# action, when half of its list is new, and at an episode's end when one in so many of it is: speed, MountainCar4D, arm.
 MAX_SURPRISE, RENEWED_PART = 0.1, 8
 # A prior counts as so much weight of instances that agree with it, for effects, and for ends and rewards: transfer.
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1

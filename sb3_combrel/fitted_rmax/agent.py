@@ -253,7 +253,7 @@ class FittedRMaxAgent:
                 self.model.add(state, action, reward, next_state, terminated)
                 if self.transfer is not None:
                     self.transfer.observe(state, action, reward, next_state, terminated)
-            self._outdated.append(self.model.end_episode())
+            self._outdated.append(self.model.outdated())
             self._plan(SWEEPS_AT_EPISODE_END)
 
     def prepare(self) -> None:

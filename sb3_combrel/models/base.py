@@ -112,6 +112,10 @@ class Model(ABC):
         put_instance_at.call(self.instances, (action, slot, state, next_state, reward, terminated))
         return np.arange(action * self.grid.n_points, (action + 1) * self.grid.n_points)
 
+    def outdated(self) -> np.ndarray:
+        """All pairs whose rows are not what the instances say: for new scales."""
+        return np.arange(len(self.known))
+
     def transitions(self) -> list[tuple[np.ndarray, int, float, np.ndarray, bool]]:
         """State, action, reward, next state and terminated of all instances, in the order in which they came."""
         found, d = [], self.grid.n_variables

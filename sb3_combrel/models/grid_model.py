@@ -223,9 +223,13 @@ class GridModel(Model):
         self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
-        """The pairs many of whose instances are new."""
+        """The pairs that have a model and many new instances."""
         pairs = self.pairs
-        return np.flatnonzero((pairs.n_new * RENEWED_PART >= np.maximum(pairs.length, 1)) & (pairs.known | (self._giver is not None)))
+        modelled = pairs.known if self._giver is None else np.ones_like(pairs.known)
+        return np.flatnonzero(modelled & (pairs.n_new > 0) & (pairs.n_new * RENEWED_PART >= pairs.length))
+
+    def outdated(self) -> np.ndarray:
+        return np.flatnonzero(self.pairs.n_new)
 
     def update_rows(self, pairs: np.ndarray) -> None:
         transferred, done = tuple(self._transferred_to(pairs)), 0

@@ -91,7 +91,7 @@ def look_at(pair, distance, why, pairs, instance, at, grid, rules):
     if pairs.fit.shape[1] == 0:
         return True
     pairs.surprise[pair] += surprise_of(pair, distance, pairs, numbers, state, at, grid, size)
-    return pairs.surprise[pair] > MAX_SURPRISE or 2 * pairs.n_new[pair] >= pairs.length[pair]
+    return pairs.surprise[pair] > MAX_SURPRISE or pairs.n_new[pair] * 2 >= pairs.length[pair]
 
 
 @compiled

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.constants import MAX_MODEL_STEPS, PRIOR_OUTCOME_WEIGHT, PRIOR_WEIGHT
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances, squared_distance
@@ -17,8 +17,6 @@ from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, 
 from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
 from sb3_combrel.planning.q_values import Prediction
 
-import os
-HOLD = int(os.environ.get("HOLD", "1"))
 # In parts of a cell: an effect of less is none.
 STAYS = 1e-6
 
@@ -50,7 +48,7 @@ def find_nearest(at, action, n_before, instances, kernel, fit):
     return nearest_instances(instances, action, at, kernel.reach, fit.item, fit.distance, n_before)
 
 
-@inner
+@inlined
 def distances_around(at, action, length, experience, fit):
     """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
     _, arrivals, ends = experience
@@ -60,7 +58,7 @@ def distances_around(at, action, length, experience, fit):
     return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), near
 
 
-@inner
+@inlined
 def outcome_of(to, moved, around, experience, kernel, end):
     """Write to ``end`` what arriving at ``to`` means; the squared distance of some arrival.
 
@@ -160,7 +158,7 @@ def prior_change(linear, pair, k, grid, at, away):
     return change
 
 
-@inner
+@part
 def take_step(pair, length, linear, fit, grid, at, has_prior, scratch):
     """Write the effect of the next step to ``scratch.step``, within the grid; the part of it until the cell is left."""
     share = share_of_fit(length, linear.claimed[pair], fit)
@@ -185,7 +183,7 @@ def take_step(pair, length, linear, fit, grid, at, has_prior, scratch):
     return inside if moved else 0.0
 
 
-@inner
+@part
 def follow(pair, action, length, known, linear, experience, kernel, fit, grid, at, planned, scratch):
     """Follow a pair's model, the action held, until a variable has changed by a cell of the grid, or the episode ends.
 
@@ -200,7 +198,7 @@ def follow(pair, action, length, known, linear, experience, kernel, fit, grid, a
     by_prior = linear.claimed[pair] and not known
     around = distances_around(scratch.at, action, length, experience, fit)
     for n in range(max_steps):
-        part = take_step(pair, length, linear, fit, grid, at, has_prior, scratch)
+        inside = take_step(pair, length, linear, fit, grid, at, has_prior, scratch)
         reward = number_at(fit, d, away) if length > 0 else linear.prior[pair, d]
         moved = 0.0
         for k in range(d):
@@ -212,15 +210,16 @@ def follow(pair, action, length, known, linear, experience, kernel, fit, grid, a
             reward = with_prior(reward, linear.prior[pair, d], near, kernel)
             end = with_prior(end, linear.prior[pair, d + 1], near, kernel)
         # The first step is never cut short, nor one that may end the episode.
-        taken = 1.0 if n == 0 or end > 0.0 or part == 0.0 else part
+        taken = 1.0 if n == 0 or end > 0.0 or inside == 0.0 else inside
         total += discount * goes_on * taken * reward
         goes_on *= 1.0 - end
-        discount *= gamma**taken
+        if gamma < 1.0:
+            discount *= gamma**taken
         left = False
         for k in range(d):
             away[k] += taken * scratch.step[k]
             left = left or abs(away[k]) * grid.cells[k] >= 1.0
-        if part == 0.0 or taken < 1.0 or left or end > 0.5:
+        if inside == 0.0 or taken < 1.0 or left or end > 0.5:
             break
     return total, goes_on, discount
 

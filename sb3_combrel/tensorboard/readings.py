@@ -23,16 +23,12 @@ def spread(n: int, max_count: int = MAX_POINTS) -> np.ndarray:
 def action_values(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
     """Compute Q of every action, the first axis, at grid points of any shape; NaN for an optimistic pair."""
     arrays = agent.mdp.arrays
-    pairs = np.add.outer(np.arange(agent.task.n_actions) * agent.grid.n_points, points)
-    flat = pairs.reshape(-1)
-    length = arrays.rows.length[flat].astype(np.int64)
-    row = np.repeat(np.arange(len(flat)), length)
-    # The entries of all rows one after the other: each row's start, and the place within the row.
-    place = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
-    entry = arrays.rows.start[flat][row] + place
-    following = arrays.rows.weight[entry] * agent.planner.values[arrays.rows.item[entry]]
-    q = arrays.reward[flat] + np.bincount(row, weights=following, minlength=len(flat))
-    return np.where(arrays.modelled[flat], q, np.nan).reshape(pairs.shape)
+    shape, flat = np.shape(points), np.ravel(points)
+    used = np.arange(arrays.to.shape[2]) < arrays.length[flat][:, :, None]
+    following = np.where(used, arrays.weight[flat] * agent.planner.values[arrays.to[flat]], 0.0)
+    modelled = arrays.modelled.reshape(agent.task.n_actions, -1)[:, flat]
+    q = np.where(modelled, (arrays.reward[flat] + following.sum(axis=2)).T, np.nan)
+    return q.reshape(-1, *shape)
 
 
 def bellman_residual(agent: FittedRMaxAgent) -> float:
