@@ -86,7 +86,8 @@ def pairs_of(naive):
 
 def row_of(mdp, point, action=0):
     """{successor: discounted probability} of a pair's row in the finite MDP."""
-    to, probability = mdp.arrays.rows.entries(action * mdp.grid.n_points + point)
+    arrays = mdp.arrays
+    to, probability = (array[point, action, : arrays.length[point, action]] for array in (arrays.to, arrays.weight))
     assert len(set(to.tolist())) == len(to), "a successor has one entry"
     return dict(zip(to.tolist(), probability.tolist(), strict=True))
 

@@ -19,13 +19,11 @@ LINEAR_KERNELS = [
 # As in ``kernel_models.GRIDS``, of a few points.
 SMALL_GRIDS = [((3,), 1), ((2, 2), 0), ((2, 1), 1), ((1, 1, 1), 0), ((3,), 1, (True,)), ((2, 2), 1, (True, False))]
 
-# What a model has of each pair, and of its effects.
-LEARNED = ("sums", "outcome", "reach", "scale", "n_counted", "limit", "total", "known", "claimed", "prior", "effect_range")
+# What a model has of each pair.
+PAIRS = ("reach", "n_new", "length", "fitted_at", "weight", "known", "surprise")
 
 
-def make_linear_model(
-    grid, kernel, *, gamma=1.0, max_instances=None, prior=None, threshold=1.0, n_actions=N_ACTIONS, max_model_steps=1
-):
+def make_linear_model(grid, kernel, *, gamma=1.0, max_instances=None, prior=None, threshold=1.0, n_actions=N_ACTIONS):
     """A model on a finite MDP of its own; ``grid`` as in ``kernel_models.GRIDS``."""
     settings = ModelSettings(
         model_breadth=kernel["breadth"],
@@ -35,22 +33,16 @@ def make_linear_model(
         max_instances=max_instances,
         n_neighbors=kernel["n_neighbors"],
         outcome_breadth=kernel["outcome_breadth"],
-        max_model_steps=max_model_steps,
     )
     return LocalLinear(FiniteMDP(make_grid(grid), n_actions, gamma), settings, prior)
 
 
-def linear_model_and_definition(grid, kernel, *, threshold=1.0, prior=None, max_model_steps=1, **kwargs):
-    model = make_linear_model(grid, kernel, threshold=threshold, prior=prior, max_model_steps=max_model_steps, **kwargs)
-    naive = NaiveLocalLinear(
-        grid,
-        kernel,
-        model.n_actions,
-        threshold=threshold,
-        prior=None if prior is None else prior.as_naive(threshold),
-        max_model_steps=max_model_steps,
+def linear_model_and_definition(grid, kernel, *, prior=None, **kwargs):
+    model = make_linear_model(grid, kernel, prior=prior, **kwargs)
+    arguments = dict(threshold=model.exploration_threshold, max_instances=model.settings.max_instances)
+    return model, NaiveLocalLinear(
+        grid, kernel, model.n_actions, prior=None if prior is None else prior.as_naive(), **arguments
     )
-    return model, naive
 
 
 def learn_linear(model, naive, transitions):
@@ -64,83 +56,74 @@ def finish_episode(model):
     model.update_rows(model.end_episode())
 
 
-def assert_same_sums(model, naive):
-    """The sums of all pairs are those of the instances within the reach of each."""
-    reach, n_counted = (array.reshape(naive.known.shape) for array in (model.fits.reach, model.fits.n_counted))
-    np.testing.assert_allclose(reach, naive.reach, rtol=1e-12)
-    for action, point, pair in pairs_of(naive):
-        sums, outcome = naive.sums(action, point)
-        assert n_counted[action, point] == len(naive.counted(action, point))
-        np.testing.assert_allclose(model.fits.sums[pair], sums, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(model.fits.outcome[pair], outcome, rtol=1e-9, atol=1e-9)
+def assert_same_rows(model, naive):
+    """The row of each pair is that of the definition from the transitions up to which it was fitted.
 
-
-def assert_same_fits(model, naive, gamma=1.0):
-    """All modelled pairs, and none else, have the prediction and the row of the definition.
-
-    :return: how many these are
+    :return: how many have a model
     """
-    n_modelled = 0
     for action, point, pair in pairs_of(naive):
-        modelled = naive.known[action, point] or naive.claimed(action, point)
-        assert model.mdp.arrays.modelled[pair] == modelled
-        if not modelled:
+        now, gamma = int(model.pairs.fitted_at[pair]), model.mdp.gamma
+        known, claimed = model.known[pair], naive.claimed(action, point)
+        assert model.mdp.arrays.modelled[pair] == known or claimed
+        if now > 0:
+            assert known == naive.known(action, point, now)
+        if not known and not claimed:
             assert row_of(model.mdp, point, action) == {}
             continue
-        expected = naive.at_pair(action, point)
-        prediction = [*expected.effect, expected.reward, expected.end]
-        np.testing.assert_allclose(model.fits.row[pair], prediction, rtol=1e-7, atol=1e-8)
-        *row, steps = naive.row(action, point, gamma)
-        reward, successors = without_staying(*row, point, gamma**steps)
+        reward, successors, discount = naive.row(action, point, now, gamma)
+        reward, successors = without_staying(reward, successors, point, discount)
         # A geometric series magnifies rounding.
-        np.testing.assert_allclose(model.mdp.arrays.reward[pair], reward, rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(model.mdp.arrays.reward[point, action], reward, rtol=1e-6, atol=1e-8)
         assert_same_row(row_of(model.mdp, point, action), successors)
-        n_modelled += 1
-    return n_modelled
+    return int(model.mdp.arrays.modelled.sum())
 
 
 def assert_same_prediction(model, naive, state):
     """What is predicted of all actions at a state is that of the definition."""
-    prediction, _ = model.predict_at(state)
+    prediction, given = model.predict_at(state)
+    assert given is None, "instances are asked of no prior"
     for action in range(naive.n_actions):
-        expected, claimed = naive.at_state(state, action), naive.prior_at(state, action)[3]
-        assert abs(prediction.weight[action] - expected.weight) <= 1e-9 * expected.weight
-        assert prediction.modelled[action] == (claimed or expected.weight >= naive.threshold)
-        if not claimed and expected.weight == 0.0:
-            assert prediction.length[action] == 0 and prediction.reward[action] == 0.0
-            continue
-        np.testing.assert_allclose(prediction.reward[action], expected.reward, atol=1e-9)
-        assert prediction.length[action] == (1 if expected.end < 1.0 else 0)
-        if expected.end < 1.0:
+        expected, claimed = naive.at_state(state, action), naive.prior(state, action)[3]
+        np.testing.assert_allclose(prediction.weight[action], expected.weight, rtol=1e-9)
+        assert prediction.modelled[action] == (claimed or expected.weight >= naive.threshold * (1.0 - 1e-12))
+        np.testing.assert_allclose(prediction.reward[action], expected.reward, rtol=1e-9, atol=1e-9)
+        predicts = expected.end < 1.0 and (claimed or expected.weight > 0.0)
+        assert prediction.length[action] == (1 if predicts else 0)
+        if predicts:
             np.testing.assert_allclose(prediction.probability[action, 0], 1.0 - expected.end, atol=1e-9)
-            np.testing.assert_allclose(prediction.effect[action, 0], expected.effect, rtol=1e-7, atol=1e-8)
+            np.testing.assert_allclose(prediction.effect[action, 0], expected.effect, atol=1e-9)
 
 
 def assert_same_to_the_last_bit(one, other):
-    for name in LEARNED:
-        np.testing.assert_array_equal(getattr(one.fits, name), getattr(other.fits, name), err_msg=name)
-    np.testing.assert_array_equal(one.instances.rows(), other.instances.rows())
-    modelled = one.known | one.fits.claimed
-    for name in ("fit", "row", "unexplained"):
-        of_one, of_other = getattr(one.fits, name), getattr(other.fits, name)
-        np.testing.assert_array_equal(of_one[modelled], of_other[modelled], err_msg=name)
-    for name in ("modelled", "reward"):
+    """Rows, pairs and predictions of two models."""
+    for name in PAIRS:
+        np.testing.assert_array_equal(getattr(one.pairs, name), getattr(other.pairs, name), err_msg=name)
+    modelled = one.mdp.arrays.modelled
+    np.testing.assert_array_equal(one.pairs.fit[modelled], other.pairs.fit[modelled], err_msg="fit")
+    for name in ("length", "reward", "modelled", "n_optimistic"):
         np.testing.assert_array_equal(getattr(one.mdp.arrays, name), getattr(other.mdp.arrays, name), err_msg=name)
-    assert all(row_of(one.mdp, pair) == row_of(other.mdp, pair) for pair in range(len(one.known)))
+    used = np.arange(one.mdp.arrays.to.shape[-1]) < one.mdp.arrays.length[..., None]
+    for name in ("to", "weight"):
+        np.testing.assert_array_equal(getattr(one.mdp.arrays, name)[used], getattr(other.mdp.arrays, name)[used], err_msg=name)
+    assert_same_predictions(one, other)
+
+
+def assert_same_predictions(one, other):
     for state in np.random.default_rng(0).random((5, one.grid.n_variables)):
-        for array, same in zip(one.predict_at(state)[0], other.predict_at(state)[0], strict=True):
-            np.testing.assert_array_equal(array, same)
+        (found, _), (expected, _) = one.predict_at(state), other.predict_at(state)
+        for name in ("modelled", "weight", "reward", "length"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+        for action, n in enumerate(found.length.tolist()):
+            np.testing.assert_array_equal(found.probability[action, :n], expected.probability[action, :n])
+            np.testing.assert_array_equal(found.effect[action, :n], expected.effect[action, :n])
 
 
 def assert_restored(model, restored, transitions):
-    """``restored`` has what ``model`` has learned, and learns the same of some more transitions."""
-    finish_episode(model)
-    saved = model.get_state()
-    restored.set_state({name: array.copy() for name, array in saved.items()})
-    assert saved.keys() == restored.get_state().keys()
+    """``restored``, a new model, has what ``model`` has learned, and learns the same of some more transitions."""
+    restored.set_state({name: array.copy() for name, array in model.get_state().items()})
     for name, array in restored.get_state().items():
         assert array.dtype == np.float64
-        np.testing.assert_array_equal(array, saved[name], err_msg=name)
+        np.testing.assert_array_equal(array, model.get_state()[name], err_msg=name)
     assert_same_to_the_last_bit(model, restored)
     for transition in transitions:
         changed, same = model.add(*transition), restored.add(*transition)
@@ -194,7 +177,7 @@ class StubPrior:
     def prior_version(self):
         return self.version
 
-    def as_naive(self, threshold):
+    def as_naive(self):
         """The same as a function for the definition."""
         return lambda state, action: (self.effect(state, action), self.reward, self.end, bool(self.claims(state, action)))
 

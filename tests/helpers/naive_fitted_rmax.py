@@ -71,7 +71,10 @@ class NaiveGrid:
         return np.array([(c - m) / n for c, m, n in zip(self.coordinates[point], self.margin, self.cells, strict=True)])
 
     def corners(self, unit):
-        """{point: weight} of multilinear interpolation; what lies outside the grid is clipped to its edge, or goes around."""
+        """{point: weight} of multilinear interpolation, or for more than four variables of that within a simplex.
+
+        What lies outside the grid is clipped to its edge, or goes around.
+        """
         by_variable = []
         for u, cells, n, margin, wraps in zip(unit, self.cells, self.shape, self.margin, self.periodic, strict=True):
             if wraps:
@@ -83,11 +86,26 @@ class NaiveGrid:
             low = min(math.floor(at), n - 2)
             by_variable.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
         corners = {}
+        if len(by_variable) > 4:
+            return self.simplex(by_variable)
         for corner in itertools.product(*by_variable):
             weight = math.prod(w for _, w in corner)
             if weight > 0.0:
                 corners[self.number[tuple(c for c, _ in corner)]] = weight
         return corners
+
+    def simplex(self, by_variable):
+        """{point: weight} of the simplex of a cell: from its lowest corner on, one variable after the other, the farthest first.
+
+        :param by_variable: ((low, weight), (high, weight)) of each
+        """
+        parts = [high[1] for _, high in by_variable]
+        corner, before, corners = [low[0] for low, _ in by_variable], 1.0, {}
+        for k in sorted(range(len(parts)), key=lambda k: -parts[k]):
+            corners[self.number[tuple(corner)]] = before - parts[k]
+            corner[k], before = by_variable[k][1][0], parts[k]
+        corners[self.number[tuple(corner)]] = before
+        return {point: weight for point, weight in corners.items() if weight > 0.0}
 
     def clipped(self, unit):
         edges = zip(self.margin, self.cells, self.periodic, strict=True)
