@@ -22,15 +22,15 @@ NO_NUMBERS = [True, np.True_, "three", [], 1 + 2j, np.nan, np.inf]
 POSITIVE = ["model_breadth", "outcome_breadth", "min_fraction", "min_weight", "exploration_threshold", "gamma"]
 REFUSED = {
     **{name: [0.0, -0.1, *NO_NUMBERS] for name in (*POSITIVE, "planning_tolerance")},
-    **{name: [-1, 2.5, *NO_NUMBERS] for name in ("n_neighbors", "max_model_steps", "max_backups", "max_instances")},
-    "max_value": [None, *NO_NUMBERS],
+    **{name: [-1, 2.5, *NO_NUMBERS] for name in ("n_neighbors", "max_instances")},
+    "max_value": NO_NUMBERS,
     "degree": [2, -1, 0.5, None, [1], np.array([1]), *NO_NUMBERS],
 }
 OTHERS_REFUSED = [
     *[("min_fraction", 1.1), ("min_fraction", None), ("min_weight", 1.0), ("gamma", 1.5), ("outcome_breadth", None)],
-    *[("n_neighbors", 1), ("max_model_steps", 0), ("max_instances", 0)],
+    *[("n_neighbors", 1), ("max_instances", 0)],
 ]
-TOO_LARGE = [("n_neighbors", 10_001), ("max_model_steps", 10_001), ("max_backups", 2**62), ("max_backups", 10**30)]
+TOO_LARGE = [("n_neighbors", 10_001), ("n_neighbors", 2**62), ("n_neighbors", 10**30)]
 
 
 @pytest.mark.parametrize(("name", "value"), [*((n, v) for n, values in REFUSED.items() for v in values), *OTHERS_REFUSED])
@@ -70,17 +70,15 @@ def test_fitted_rmax_and_its_policy_have_the_defaults_of_the_settings():
 
 
 @pytest.mark.parametrize(
-    ("degree", "n_variables", "breadth", "backups"),
+    ("degree", "n_variables", "breadth"),
     [
-        *[(0, 1, 0.09, 200), (0, 2, 0.09, 100), (0, 3, 0.15, 50), (0, 4, 0.2, 25), (0, 6, 0.2, 6)],
-        *[(1, 1, 0.15, 800), (1, 2, 0.15, 400), (1, 3, 0.25, 200), (1, 4, 0.4, 100), (1, 5, 0.4, 50), (1, 7, 0.5, 12)],
+        *[(0, 1, 0.09), (0, 2, 0.09), (0, 3, 0.15), (0, 4, 0.2), (0, 6, 0.2)],
+        *[(1, 1, 0.15), (1, 2, 0.15), (1, 3, 0.25), (1, 4, 0.4), (1, 5, 0.4), (1, 7, 0.5)],
     ],
 )
-def test_breadth_and_backups_depend_on_degree_and_number_of_variables_unless_given(degree, n_variables, breadth, backups):
-    defaults = FittedRMaxSettings(degree=degree)
-    given = FittedRMaxSettings(degree=degree, model_breadth=0.3, max_backups=0)
-    assert (defaults.model_settings(n_variables).model_breadth, defaults.backups_for(n_variables)) == (breadth, backups)
-    assert (given.model_settings(n_variables).model_breadth, given.backups_for(n_variables)) == (0.3, 0)
+def test_the_breadth_depends_on_degree_and_number_of_variables_unless_given(degree, n_variables, breadth):
+    assert FittedRMaxSettings(degree=degree).model_settings(n_variables).model_breadth == breadth
+    assert FittedRMaxSettings(degree=degree, model_breadth=0.3).model_settings(n_variables).model_breadth == 0.3
 
 
 def test_neighbors_depend_on_the_number_of_variables_and_the_least_weight_on_the_degree_unless_given():
@@ -89,13 +87,6 @@ def test_neighbors_depend_on_the_number_of_variables_and_the_least_weight_on_the
     assert [FittedRMaxSettings(degree=degree).model_settings(2).min_weight for degree in (0, 1)] == [0.01, 0.05]
     given = FittedRMaxSettings(n_neighbors=7, min_weight=0.2).model_settings(3)
     assert (given.n_neighbors, given.min_weight) == (7, 0.2)
-
-
-def test_the_original_looks_one_step_ahead():
-    assert FittedRMaxSettings(degree=0).model_settings(2).max_model_steps == 1
-    assert FittedRMaxSettings(max_model_steps=7).model_settings(4).max_model_steps == 7
-    with pytest.raises(ValueError, match="max_model_steps must be 1 or None with degree=0, the original algorithm, got 3"):
-        FittedRMaxSettings(degree=0, max_model_steps=3)
 
 
 def test_the_arguments_reach_the_model():
@@ -110,7 +101,7 @@ def test_the_arguments_reach_the_model():
 @pytest.mark.parametrize("degree", [0, 1])
 def test_arguments_may_be_numpy_numbers(degree):
     floats = {name: np.float32(0.2) for name in ("model_breadth", "outcome_breadth", "gamma")}
-    counts = {name: np.int64(8) for name in ("max_backups", "max_instances", "n_neighbors")}
+    counts = {name: np.int64(8) for name in ("max_instances", "n_neighbors")}
     FittedRMax(Walk(), seed=0, degree=np.int64(degree), resolution=np.array([3, 4]), **floats, **counts).learn(20)
 
 

@@ -17,16 +17,16 @@ def step(state, action):
     return next_state, -1.0, bool((next_state > 0.9).all())
 
 
-def learn(agent, n_episodes, episode=0, before_each=lambda state: None):
-    """The actions of so many episodes of learning, from number ``episode`` on; ``before_each`` is called with each state."""
+def learn(agent, n_episodes, before_each=lambda state: None):
+    """The actions of so many episodes of learning; ``before_each`` is called with each state."""
     agent.prepare()
     actions = []
-    for number in range(episode, episode + n_episodes):
+    for _ in range(n_episodes):
         state, terminated = START, False
         actions.append([])
         while not terminated and len(actions[-1]) < STEP_LIMIT:
             before_each(state)
-            action = agent.act(state, episode=number)
+            action = agent.act(state)
             next_state, reward, terminated = step(state, action)
             before_each(next_state)
             agent.update(state, action, reward, next_state, terminated)

@@ -23,7 +23,7 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 def test_predict_takes_one_observation_or_a_batch(make, deterministic):
     model = make(DummyVecEnv([Walk] * 3)).learn(60)
     one, state = model.predict(OBSERVATIONS[3], deterministic=deterministic)
-    assert (state is None) == (not deterministic) and np.shape(one) == () and one in (0, 1)
+    assert state is None and np.shape(one) == () and one in (0, 1)
     batch, _ = model.predict(OBSERVATIONS, deterministic=deterministic)
     assert batch.shape == (21,) and set(batch) <= {0, 1}
     actions, _ = model.predict(model.get_env().reset(), deterministic=deterministic)
@@ -44,24 +44,20 @@ def test_deterministic_predictions_do_not_change_and_draw_nothing_whatever_the_m
     assert generator.state == before
 
 
-def ask(model, state):
-    """Ask for everything that may be asked for; the state for the next call."""
+def ask(model):
+    """Ask for everything that may be asked for."""
     model.predict(OBSERVATIONS[::7], deterministic=False)
-    actions, state = model.predict(OBSERVATIONS[::5], state, deterministic=True)
+    actions, _ = model.predict(OBSERVATIONS[::5], deterministic=True)
     assert set(actions.tolist()) <= {0, 1}
     assert np.isfinite(model.agent.q_values(model.policy.to_unit(OBSERVATIONS[4]))).all()
     assert model.agent.statistics().keys() and model.agent.get_state().keys()
-    return state
 
 
 class Asking(BaseCallback):
     """Asks at every step."""
 
-    def _on_training_start(self):
-        self.state = None
-
     def _on_step(self):
-        self.state = ask(self.model, self.state)
+        ask(self.model)
         return True
 
 
@@ -73,10 +69,9 @@ class AskingThread(threading.Thread):
         self.model, self.n_asked, self.error, self.stopped = model, 0, None, threading.Event()
 
     def run(self):
-        state = None
         try:
             while not self.stopped.wait(1e-4):
-                state = ask(self.model, state)
+                ask(self.model)
                 self.n_asked += 1
         except Exception as error:
             self.error = error
@@ -84,7 +79,7 @@ class AskingThread(threading.Thread):
 
 def assert_learned_the_same(one, other):
     assert same_parameters(one, other) and one.agent.rng.bit_generator.state == other.agent.rng.bit_generator.state
-    assert one.agent.n_backups == other.agent.n_backups and one.agent.statistics() == other.agent.statistics()
+    assert one.agent.n_sweeps == other.agent.n_sweeps and one.agent.statistics() == other.agent.statistics()
 
 
 def test_predictions_in_a_callback_or_in_between_do_not_change_what_is_learned(make):
@@ -173,7 +168,7 @@ ARGUMENTS = (*FittedRMaxSettings.names(), "num_timesteps", "seed")
 
 
 def test_save_and_load_keep_everything(make, tmp_path):
-    model = make(max_backups=3).learn(10**6, callback=StopTrainingOnMaxEpisodes(8))
+    model = make(max_value=3.0).learn(10**6, callback=StopTrainingOnMaxEpisodes(8))
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=Walk())
     assert same_parameters(model, loaded) and type(loaded.policy) is FittedRMaxPolicy
@@ -235,10 +230,10 @@ def test_system_info_is_printed(tmp_path, capsys):
 
 def test_arguments_can_be_changed_when_loading(tmp_path):
     small().learn(30).save(tmp_path / "model")
-    loaded = FittedRMax.load(tmp_path / "model", env=Walk(), max_backups=7, verbose=1)
-    assert (loaded.max_backups, loaded.agent.max_backups, loaded.verbose) == (7, 7, 1)
-    with pytest.raises(ValueError, match="max_backups must be"):
-        FittedRMax.load(tmp_path / "model", max_backups=-7)
+    loaded = FittedRMax.load(tmp_path / "model", env=Walk(), max_value=7, verbose=1)
+    assert (loaded.max_value, loaded.agent.planner.bounds[1], loaded.verbose) == (7, 7.0, 1)
+    with pytest.raises(ValueError, match="max_value must be"):
+        FittedRMax.load(tmp_path / "model", max_value=np.nan)
 
 
 def test_a_grid_of_another_size_is_refused_in_a_sentence(tmp_path):
@@ -252,8 +247,8 @@ def test_save_excludes_and_includes_attributes(tmp_path):
     model = small(verbose=1).learn(10)
     model.save(tmp_path / "less", exclude=["verbose"])
     assert "verbose" not in load_from_zip_file(tmp_path / "less")[0] and FittedRMax.load(tmp_path / "less").verbose == 0
-    model.save(tmp_path / "more", include=["_episode_numbers"])
-    assert "_episode_numbers" in load_from_zip_file(tmp_path / "more")[0]
+    model.save(tmp_path / "more", include=["_episode_rewards"])
+    assert "_episode_rewards" in load_from_zip_file(tmp_path / "more")[0]
 
 
 def test_saving_changes_nothing(make, tmp_path):
@@ -276,15 +271,28 @@ def test_random_numbers_go_on_where_they_were_unless_a_seed_is_given(make, tmp_p
     assert generator_state(one) == generator_state(other) == np.random.default_rng(9).bit_generator.state
 
 
+def kept_weight(state, instances, breadth, min_fraction):
+    """Weight of the instances that a kernel average keeps at a state: nearest first, while they add enough."""
+    total = 0.0
+    for weight in sorted(np.exp(-((instances - state) ** 2).sum(axis=1) / breadth**2), reverse=True):
+        if weight < min_fraction * total:
+            break
+        total += weight
+    return total
+
+
 def test_pairs_that_are_known_by_history_alone_are_saved(tmp_path):
     """A nearer instance shortens the list of a kernel average."""
-    model = small(degree=0, min_fraction=0.6, model_breadth=0.5, resolution=1)
-    for state, next_state in [(0.1, 0.2), (0.1, 0.2), (0.45, 0.95)]:
-        model.agent.update(np.array([state, 0.5]), 0, -1.0, np.array([next_state, 0.5]), False)
-    agent_model = model.agent.model
-    assert (agent_model.known & (agent_model.own_weight < 1.0)).any(), "the case that this test is about"
+    model = small(degree=0, min_fraction=0.6, model_breadth=0.5, resolution=1, bounds=(0.0, 1.0))
+    for state in (0.1, 0.1, 0.45):
+        model.agent.update(np.array([state, 0.5]), 0, -1.0, np.array([state + 0.1, 0.5]), False)
+    learned = model.agent.model
+    known = np.flatnonzero(learned.known)
+    points = model.agent.grid.states_of(known)
+    instances = learned.instances.state[0, :3]
+    assert min(kept_weight(point, instances, 0.5, 0.6) for point in points) < 1.0, "the case that this test is about"
     model.save(tmp_path / "model")
-    np.testing.assert_array_equal(FittedRMax.load(tmp_path / "model").agent.model.known, agent_model.known)
+    np.testing.assert_array_equal(FittedRMax.load(tmp_path / "model").agent.model.known, learned.known)
 
 
 def test_a_saved_model_can_be_loaded_for_more_environments(tmp_path):

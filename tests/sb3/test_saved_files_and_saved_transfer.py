@@ -280,7 +280,7 @@ def test_two_halves_make_the_run_that_was_not_interrupted(name, n_episodes, tmp_
 
     Relevance is measured by the transitions of its last renewal, of which there may have been none, not by all so far.
     """
-    given = dict(planning_tolerance=1e-10, max_backups=20_000, model_breadth=0.05, exploration_threshold=2.0)
+    given = dict(planning_tolerance=1e-10, model_breadth=0.05, exploration_threshold=2.0)
     whole = after_episodes(n_episodes + 6, BY_RELEVANCE[name](), Walk(start=-0.5), **given)
     after_episodes(n_episodes, BY_RELEVANCE[name](), Walk(start=-0.5), **given).save(tmp_path / "half")
     halves = FittedRMax.load(tmp_path / "half", env=Walk(start=-0.5))

@@ -1,4 +1,4 @@
-"""Warnings where learning makes no progress: returns above max_value, episodes that cost nothing, returns that are alike."""
+"""Warnings where learning makes no progress: returns above max_value, episodes that cost nothing, returns that are alike; a wall."""
 
 import warnings
 
@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
-import sb3_combrel.fitted_rmax.agent as agent
 from sb3_combrel import FittedRMax
+from sb3_combrel.fitted_rmax.optimism import RewardRange
 from sb3_combrel.fitted_rmax.progress import EQUAL_RETURNS, IDLE_EPISODES, ProgressWatch
 from sb3_combrel.wrappers import AngleObservation
+
+
+def watch_with(max_value, gamma):
+    return ProgressWatch(RewardRange(gamma, max_value), 1e-3)
 
 
 def shown(watch, episodes, explores=True):
@@ -33,7 +37,7 @@ def shown(watch, episodes, explores=True):
     ],
 )
 def test_returns_above_max_value_give_one_warning(max_value, gamma, rewards, terminated, observed):
-    found = shown(ProgressWatch(max_value, gamma, 1e-3), [(rewards, terminated)] * 3, explores=False)
+    found = shown(watch_with(max_value, gamma), [(rewards, terminated)] * 3, explores=False)
     assert len(found) == (0 if observed is None else 1)
     for number, message in found:
         assert number == 1 and f"max_value={max_value:g}" in message and f"a return of {observed} was observed" in message
@@ -41,7 +45,7 @@ def test_returns_above_max_value_give_one_warning(max_value, gamma, rewards, ter
 
 @pytest.mark.parametrize(("max_value", "gamma"), [(0.0, 1.0), (0.0, 0.9), (5.0, 1.0)])
 def test_episodes_that_cost_nothing_give_one_warning(max_value, gamma):
-    watch = ProgressWatch(max_value, gamma, 1e-3)
+    watch = watch_with(max_value, gamma)
     episodes = [([-1.0, 0.0], False), *[([0.0, -1e-9], False)] * 10, ([-1.0], True), *[([0.0], False)] * 10]
     [(number, message)] = shown(watch, episodes, explores=False)
     assert number == 1 + IDLE_EPISODES
@@ -58,12 +62,12 @@ def test_episodes_that_cost_nothing_give_one_warning(max_value, gamma):
     ],
 )
 def test_other_episodes_give_no_warning_of_their_cost(max_value, gamma, episode):
-    assert not shown(ProgressWatch(max_value, gamma, 1e-3), [episode] * 50, explores=False)
+    assert not shown(watch_with(max_value, gamma), [episode] * 50, explores=False)
 
 
 def test_equal_returns_give_one_warning_while_exploration_goes_on():
     alike = ([-1.0, -1.0], False)
-    watch = ProgressWatch(7.0, 0.95, 1e-3)
+    watch = watch_with(7.0, 0.95)
     [(number, message)] = shown(watch, [([-1.0], True), *[alike] * 3, ([-1.0], False), *[alike] * 60])
     assert number == 5 + EQUAL_RETURNS and f"the last {EQUAL_RETURNS} returns are all -2" in message
     assert "max_value=7" in message and "model_breadth" in message
@@ -81,7 +85,7 @@ def test_equal_returns_give_one_warning_while_exploration_goes_on():
     ids=["no exploration", "the goal is reached", "rewards are collected", "different returns", "now and then the goal"],
 )
 def test_other_returns_give_no_warning(episodes, explores):
-    assert not shown(ProgressWatch(100.0, 1.0, 1e-3), episodes, explores)
+    assert not shown(watch_with(100.0, 1.0), episodes, explores)
 
 
 class Corridor(gym.Env):
@@ -106,7 +110,7 @@ class Corridor(gym.Env):
     ("reward", "gamma", "message"),
     [
         (1.0, 1.0, "a return of 20 was observed"),
-        (0.0, 1.0, "max_value=0 with gamma=1"),
+        (0.0, 1.0, "max_value=1 with gamma=1"),
         (-1.0, 0.99, "the last 20 returns are all -20"),
     ],
 )
@@ -130,22 +134,16 @@ def test_normal_tasks_give_no_warning(env_id, wrap, arguments):
         FittedRMax(wrap(gym.make(env_id)), seed=0, **arguments).learn(4000)
 
 
-# Exploration ends: where interpolated values are too high and the agent makes no progress, they are corrected.
+# The agent does not run against a wall for ever.
 STEP_LIMIT = 100
+FEWEST_STEPS = 34
 
 
 class TwoJoints(gym.Env):
-    """Two joints, each action moves one of them a little; a block that they can't enter stands between start and goal.
-
-    The shortest plan around it has 34 steps. With resolution 3 a cell is wider than the kernel's reach at breadth 0.04: grid
-    points inside the block stay optimistic for ever, and the states before it are interpolated as if they led through.
-    """
+    """Two joints, each action moves one of them a little; a block that they can't enter stands between start and goal."""
 
     observation_space = gym.spaces.Box(0.0, 1.0, (2,), dtype=np.float64)
     action_space = gym.spaces.Discrete(4)
-
-    def __init__(self, step=0.05):
-        self.step_length = step
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -154,33 +152,17 @@ class TwoJoints(gym.Env):
 
     def step(self, action):
         to = self.joints.copy()
-        to[action // 2] += self.step_length if action % 2 else -self.step_length
+        to[action // 2] += 0.05 if action % 2 else -0.05
         to = np.clip(to, 0.0, 1.0)
         if not (0.4 < to[0] < 0.6 and to[1] < 0.75):
             self.joints = to
         return self.joints.copy(), -1.0, bool((np.abs(self.joints - 0.9) <= 0.06).all()), False, {}
 
 
-def lengths_of_episodes(seed, n_episodes, degree, step=0.05):
-    env = gym.wrappers.TimeLimit(TwoJoints(step), STEP_LIMIT)
-    with pytest.warns(UserWarning, match="coarse"):
-        model = FittedRMax(env, model_breadth=0.04, resolution=3, min_fraction=0.1, degree=degree, seed=seed)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_way_around_a_block_is_learned(seed):
+    model = FittedRMax(gym.wrappers.TimeLimit(TwoJoints(), STEP_LIMIT), seed=seed)
     monitor = model.get_env().envs[0]
-    model.learn(n_episodes * STEP_LIMIT, callback=StopTrainingOnMaxEpisodes(n_episodes))
-    return np.array(monitor.get_episode_lengths())
-
-
-def test_with_corrections_the_agent_is_not_stuck_where_it_would_be_without(monkeypatch):
-    assert (lengths_of_episodes(0, 80, 0)[-20:] < STEP_LIMIT).all()
-    monkeypatch.setattr(agent, "MAX_VISITS", 10**9)
-    assert (lengths_of_episodes(0, 25, 0)[-15:] == STEP_LIMIT).all()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("degree", [0, 1])
-@pytest.mark.parametrize("step", [0.05, 1 / 24, 0.043])
-def test_with_corrections_the_agent_is_never_stuck_whatever_the_step_length(step, degree):
-    """Also where steps and cells are commensurate, so that states lie on the cells' edges."""
-    for seed in range(3):
-        lengths = lengths_of_episodes(seed, 120, degree, step)
-        assert (lengths[-20:] < STEP_LIMIT).all(), (seed, lengths)
+    model.learn(10**6, callback=StopTrainingOnMaxEpisodes(40))
+    lengths = monitor.get_episode_lengths()
+    assert lengths[0] == STEP_LIMIT and np.median(lengths[-10:]) <= FEWEST_STEPS + 2
