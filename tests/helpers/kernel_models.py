@@ -62,7 +62,9 @@ def model_and_definition(grid, kernel, gamma=1.0, max_instances=None):
 def learn(model, transitions):
     """Add transitions to a model, and update the rows that they change."""
     for transition in transitions:
-        model.update_rows(model.add(*transition))
+        pairs = model.add(*transition)
+        if len(pairs):
+            model.update_rows(pairs)
 
 
 def learn_both(model, naive, transitions):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
-from helpers import kernel_models
+from helpers import kernel_models, linear_models
 from helpers.naive_fitted_rmax import Instance, kept_instances
 from helpers.walk import GOAL, STRIDE, Walk, small, walk_source
 from hypothesis import given, settings
@@ -33,7 +33,11 @@ class NaiveKernelAverage(Model):
             ]
             kept = kept_instances(state, instances, s.model_breadth, s.min_weight, s.min_fraction, periodic)
             total = sum(w for _, w in kept)
-            found.weight[row] = total
+            # Known for ever: by instances that suffice for a list before nearer ones came.
+            everything = kept_instances(state, instances, s.model_breadth, s.min_weight, 0.0, periodic)
+            least = s.min_fraction * s.exploration_threshold / (1.0 + s.min_fraction)
+            was_known = sum(w for _, w in everything if w >= least) >= s.exploration_threshold
+            found.weight[row] = max(total, s.exploration_threshold) if was_known else total
             for k, (number, w) in enumerate(kept):
                 found.reward[row] += w / total * instances[number].reward
                 found.probability[row, k] = 0.0 if instances[number].terminated else w / total
@@ -51,7 +55,7 @@ class SomeInstances:
     What it returns is larger than what was asked for, and full of values that must not be read.
     """
 
-    max_instances = 4
+    use, max_instances = "instances", 4
 
     def __init__(self, points, threshold):
         self.points, self.threshold = points, threshold
@@ -98,15 +102,7 @@ def both(problem):
         model = kernel_models.make_model(grid, kernel, gamma, model_class=model_class)
         if transfers:
             model.transfer = SomeInstances(model.grid.points(), 1.0)
-        transitions = kernel_models.random_transitions(seed, len(grid[0]), n)
-        if model_class is NaiveKernelAverage:
-            for transition in transitions:
-                pairs = model.add(*transition)
-                np.testing.assert_array_equal(pairs, np.arange(model.grid.n_points) + transition[1] * model.grid.n_points)
-                # As update_rows would, at each step.
-                model.known[pairs] |= model.predict(model.grid.points(), np.full(len(pairs), transition[1])).weight >= 1.0
-        else:
-            kernel_models.learn(model, transitions)
+        kernel_models.learn(model, kernel_models.random_transitions(seed, len(grid[0]), n))
         model.update_all_rows()
         made.append(model)
     return made
@@ -130,11 +126,6 @@ def test_rows_and_predictions_by_the_base_class_agree_with_those_of_the_kernel_a
         assert (model.mdp.arrays.modelled & ~model.known).any(), "some pairs are modelled with transferred instances"
     for state in np.random.default_rng(seed).random((4, len(problem[0][0]))):
         (found, given), (expected, expected_given) = naive.predict_at(state), model.predict_at(state)
-        was_known = (found.weight < 1.0) & (expected.weight == 1.0)
-        if was_known.any():
-            # Actions that were known before nearer instances came, which the base class forgets.
-            assert (found.weight[was_known] >= 1.0 / (1.0 + model.settings.min_fraction)).all()
-            continue
         assert (given is None) == (expected_given is None)
         np.testing.assert_array_equal(found.modelled, expected.modelled)
         np.testing.assert_allclose(found.weight, expected.weight, rtol=1e-9)
@@ -142,6 +133,30 @@ def test_rows_and_predictions_by_the_base_class_agree_with_those_of_the_kernel_a
             assert found.reward[action] == pytest.approx(expected.reward[action], abs=1e-9)
             successors = [as_set(prediction, action) for prediction in (found, expected)]
             np.testing.assert_allclose(*successors, rtol=1e-9, atol=1e-12)
+
+
+@slow_and_repeatable
+@given(st.sampled_from(linear_models.SMALL_GRIDS), st.integers(0, 10**6), st.integers(0, 12), st.booleans())
+def test_transferred_instances_join_those_of_a_local_linear_model_as_the_base_class_says(grid, seed, n, gamma_is_one):
+    model, plain = (
+        linear_models.make_linear_model(
+            grid, linear_models.LINEAR_KERNELS[0], gamma=1.0 if gamma_is_one else 0.9, threshold=2.0
+        )
+        for _ in range(2)
+    )
+    for one in (model, plain):
+        one.transfer = SomeInstances(model.grid.points(), 2.0)
+        kernel_models.learn(one, linear_models.small_steps(seed, len(grid[0]), n))
+    model.update_all_rows()
+    unknown = np.flatnonzero(~model.known & (model.own_weight < model.exploration_threshold))
+    Model.update_rows(plain, unknown)
+    np.testing.assert_array_equal(plain.mdp.arrays.modelled[unknown], model.mdp.arrays.modelled[unknown])
+    for pair in unknown.tolist():
+        action, point = divmod(pair, model.grid.n_points)
+        rewards = [one.mdp.arrays.reward[point, action] for one in (model, plain)]
+        np.testing.assert_allclose(*rewards, rtol=1e-9, atol=1e-9)
+        rows = [kernel_models.row_of(one.mdp, point, action) for one in (model, plain)]
+        kernel_models.assert_same_row(*rows)
 
 
 def as_set(prediction, action):

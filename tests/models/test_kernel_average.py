@@ -1,15 +1,13 @@
-"""The kernel average on the grid against its definition: lists of kept instances, what is known, rows."""
+"""The kernel average against its definition: what is known, rows, and instances that are replaced."""
 
 import numpy as np
 import pytest
 from helpers import kernel_models
+from helpers.naive_fitted_rmax import Instance, apart
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.kernel_average import MIN_CHANGE
-
-slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=8)
+slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=12)
 problems = st.tuples(
     st.sampled_from(kernel_models.GRIDS),
     st.sampled_from(kernel_models.KERNELS),
@@ -19,55 +17,66 @@ problems = st.tuples(
 )
 
 
-def assert_same_as_definition(model, naive, gamma, pairs):
-    """Lists, weights and rows of some pairs."""
+def assert_same_rows(model, naive, pairs):
+    """The rows of some pairs, those that are known."""
     for action, point, pair in pairs:
-        expected = naive.list_of(action, point)
-        index, weight = model.arrays.lists.entries(pair)
-        assert list(index) == [number for number, _ in expected]
-        np.testing.assert_allclose(weight, [w for _, w in expected], rtol=1e-9)
-        assert model.own_weight[pair] == pytest.approx(sum(w for _, w in expected), rel=1e-9)
-        if model.known[pair]:
-            reward, successors = kernel_models.without_staying(*naive.row(action, point), point, gamma)
-            assert model.mdp.arrays.reward[pair] == pytest.approx(reward, rel=1e-9, abs=1e-9)
-            kernel_models.assert_same_row(kernel_models.row_of(model.mdp, point, action), successors)
-        else:
+        assert model.mdp.arrays.modelled[pair] == model.known[pair]
+        if not model.known[pair]:
             assert kernel_models.row_of(model.mdp, point, action) == {}
+            continue
+        reward, successors = kernel_models.without_staying(*naive.row(action, point), point, model.mdp.gamma)
+        assert model.mdp.arrays.reward[point, action] == pytest.approx(reward, rel=1e-9, abs=1e-9)
+        kernel_models.assert_same_row(kernel_models.row_of(model.mdp, point, action), successors)
+
+
+def assert_same_as_definition(model, naive, pairs):
+    """What is known, and rows, of some pairs, all of which are up to date."""
+    pairs = list(pairs)
+    for action, point, pair in pairs:
+        assert model.known[pair] == naive.known_at(naive.grid.unit(point), action)
+    assert_same_rows(model, naive, pairs)
 
 
 @slow_and_repeatable
 @given(problems)
-def test_lists_what_is_known_and_rows_are_those_of_the_definition(problem):
+def test_what_is_known_and_rows_are_those_of_the_definition_after_every_transition(problem):
     grid, kernel, seed, n, gamma = problem
     model, naive = kernel_models.model_and_definition(grid, kernel, gamma)
     np.testing.assert_allclose(model.grid.points(), [naive.grid.unit(p) for p in range(naive.n_points)], atol=1e-15)
     for transition in kernel_models.random_transitions(seed, len(grid[0]), n):
         kernel_models.learn_both(model, naive, [transition])
-        np.testing.assert_array_equal(model.known.reshape(kernel_models.N_ACTIONS, -1), naive.known)
-    np.testing.assert_array_equal(model.mdp.arrays.modelled, model.known)
-    np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~naive.known).sum(axis=0))
-    assert_same_as_definition(model, naive, gamma, kernel_models.pairs_of(naive))
+        assert model.known[naive.known.reshape(-1)].all(), "what its list has ever sufficed for, at the latest"
+    np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~model.known.reshape(len(naive.known), -1)).sum(axis=0))
+    assert_same_rows(model, naive, kernel_models.pairs_of(naive))
+    before, known = rows_of(model), model.known.copy()
+    model.update_all_rows()
+    assert_same_as_definition(model, naive, kernel_models.pairs_of(naive))
+    after = rows_of(model)
+    assert all(before[pair] == after[pair] for pair in np.flatnonzero(known)), "rows of other pairs have not changed"
+
+
+def rows_of(model):
+    pairs = [divmod(pair, model.grid.n_points) for pair in range(len(model.known))]
+    return [(model.mdp.arrays.reward[p, a], kernel_models.row_of(model.mdp, p, a)) for a, p in pairs]
 
 
 @slow_and_repeatable
-@given(problems, st.floats(0.05, 0.9))
-def test_a_transition_or_a_lower_threshold_changes_the_rows_of_the_pairs_that_are_returned_and_of_no_others(problem, low):
+@given(problems, st.integers(1, 10))
+def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_everywhere(problem, max_instances):
     grid, kernel, seed, n, gamma = problem
-    model, _ = kernel_models.model_and_definition(grid, kernel, gamma)
-    *before, last = kernel_models.random_transitions(seed, len(grid[0]), n + 1)
-    kernel_models.learn(model, before)
-    changed = model.add(*last)
-    assert len(np.unique(changed)) == len(changed) and (changed // model.grid.n_points == last[1]).all()
-    known, newly_known = model.known.copy(), model.lower_threshold(low)
-    np.testing.assert_array_equal(newly_known, np.flatnonzero(~known & (model.own_weight >= low)))
-    np.testing.assert_array_equal(model.known, known | (model.own_weight >= low))
-    model.update_rows(changed)
-    model.update_rows(newly_known)
-    partial = [(model.mdp.arrays.reward[pair], kernel_models.row_of(model.mdp, pair)) for pair in range(len(model.known))]
+    model, naive = kernel_models.model_and_definition(grid, kernel, gamma, max_instances=max_instances)
+    periodic = naive.grid.periodic
+    for transition in kernel_models.random_transitions(seed, len(grid[0]), 2 * n + max_instances):
+        kernel_models.learn(model, [transition])
+        state, action, reward, next_state, terminated = transition
+        there = naive.instances[action]
+        squared = [sum(d * d for d in apart(state, i.state, periodic)) for i in there]
+        slot = len(there) if len(there) < max_instances else int(np.argmin(squared))
+        there[slot : slot + 1] = [Instance(state, action, reward, next_state, terminated, periodic)]
+    assert model.instances.size.tolist() == [len(some) for some in naive.instances]
+    assert_same_rows(model, naive, kernel_models.pairs_of(naive))
     model.update_all_rows()
-    assert partial == [
-        (model.mdp.arrays.reward[pair], kernel_models.row_of(model.mdp, pair)) for pair in range(len(model.known))
-    ]
+    assert_same_as_definition(model, naive, kernel_models.pairs_of(naive))
 
 
 BREADTH, MIN_FRACTION = 0.2, 0.1
@@ -97,48 +106,15 @@ def test_an_exact_state_is_known_for_ever_once_some_of_its_instances_alone_reach
         assert known_now == (total >= 1.0) or abs(total - 1.0) < 1e-9
 
 
-def test_lists_rows_and_instances_are_complete_after_their_arrays_have_grown():
+def test_rows_and_instances_are_complete_after_their_arrays_have_grown():
     grid, kernel = ((4, 4), 0), dict(breadth=0.4, min_weight=0.01, min_fraction=0.001)
     model, naive = kernel_models.model_and_definition(grid, kernel)
-    lists, rows = len(model.arrays.lists.item), len(model.mdp.arrays.rows.item)
-    capacity, transitions = model.instances.capacity, kernel_models.random_transitions(3, 2, 500)
-    kernel_models.learn(model, transitions)
-    assert len(model.arrays.lists.item) > lists and len(model.mdp.arrays.rows.item) > rows
-    assert model.instances.capacity > capacity
+    width, capacity = model.mdp.arrays.to.shape[-1], model.instances.capacity
+    transitions = kernel_models.random_transitions(3, 2, 500)
+    for transition in transitions:
+        model.add(*transition)
+    model.update_all_rows()
+    assert model.mdp.arrays.to.shape[-1] > width and model.instances.capacity > capacity
     kernel_models.add_instances(naive, transitions)
     chosen = np.random.default_rng(0).choice(len(model.known), 12, replace=False)
-    assert_same_as_definition(model, naive, 1.0, [(*divmod(int(pair), naive.n_points), int(pair)) for pair in chosen])
-
-
-class NoInstances:
-    """A transfer method that transfers nothing."""
-
-    def transferred(self, states, actions, own_weight):
-        return TransferredInstances.empty(*states.shape)
-
-    def transferred_to_sample(self, points, actions, own_weight):
-        return TransferredInstances.empty(len(points), 2)
-
-
-@pytest.mark.parametrize("kernel", kernel_models.KERNELS[:2], ids=str)
-def test_with_transfer_known_pairs_are_updated_at_once_and_others_once_their_weight_has_changed_enough(kernel):
-    grid = ((2, 2), 1)
-    model = kernel_models.make_model(grid, kernel, transfer=NoInstances())
-    naive = kernel_models.model_and_definition(grid, kernel)[1]
-    last, waited = np.zeros(len(model.known)), 0
-    # Without states that repeat: of equal weights the last may enter a list only to be cut again.
-    for transition in {tuple(transition[0]): transition for transition in kernel_models.random_transitions(8, 2, 40)}.values():
-        changed = model.add(*transition)
-        naive.add(*transition)
-        action, newest = transition[1], len(naive.instances[transition[1]]) - 1
-        gained = [newest in [number for number, _ in naive.list_of(action, point)] for point in range(naive.n_points)]
-        pairs = action * naive.n_points + np.flatnonzero(gained)
-        due = model.known[pairs] | (np.abs(model.own_weight[pairs] - last[pairs]) >= MIN_CHANGE)
-        np.testing.assert_array_equal(np.sort(changed), pairs[due])
-        model.update_rows(changed)
-        last[changed] = model.own_weight[changed]
-        np.testing.assert_array_equal(model.outdated(), np.flatnonzero(~model.known & (model.own_weight != last)))
-        waited += len(model.outdated())
-    assert waited > 0 and model.known.any()
-    model.update_rows(model.outdated())
-    assert len(model.outdated()) == 0
+    assert_same_as_definition(model, naive, [(*divmod(int(pair), naive.n_points), int(pair)) for pair in chosen])

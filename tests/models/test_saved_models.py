@@ -7,6 +7,10 @@ from helpers.kernel_models import GRIDS, KERNELS, learn, make_model, random_tran
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.models.kernel_average import KernelAverage
+from sb3_combrel.models.local_linear import LocalLinear
+
 
 @settings(deadline=None, derandomize=True, max_examples=15)
 @given(
@@ -70,12 +74,47 @@ def test_what_is_predicted_of_states_is_the_same_after_instances_were_replaced(s
     np.testing.assert_allclose(model.mdp.arrays.reward, restored.mdp.arrays.reward, rtol=1e-9)
 
 
+def test_an_outcome_whose_instance_has_been_replaced_is_remembered_after_loading():
+    model, restored = (
+        linear_models.make_linear_model(((3,), 0), linear_models.LINEAR_KERNELS[0], threshold=3.0, max_instances=5)
+        for _ in range(2)
+    )
+    learn(model, [(np.array([0.5]), 0, -1.0, np.array([0.6]), True), *linear_models.small_steps(1, 1, 60)])
+    assert not model.instances.terminated[:, :5].any() and model.known.any()
+    restored.set_state(model.get_state())
+    for one in (model, restored):
+        one.update_all_rows()
+    np.testing.assert_array_equal(restored.known, model.known)
+
+
 @pytest.mark.parametrize(("grid", "kernel"), [(grid, KERNELS[i % 4]) for i, grid in enumerate(GRIDS) if i % 3 == 2], ids=str)
 def test_a_restored_kernel_average_is_and_learns_on_as_the_original_to_the_last_bit(grid, kernel):
     model, restored = make_model(grid, kernel, 0.9), make_model(grid, kernel, 0.9)
     transitions = random_transitions(3, len(grid[0]), 130)
     learn(model, transitions[:100])
     linear_models.assert_restored(model, restored, transitions[100:])
+
+
+class NoInstances:
+    """A transfer method that has none."""
+
+    use = "instances"
+
+    def transferred(self, states, actions, own_weight):
+        return TransferredInstances.empty(*states.shape)
+
+    def transferred_to_sample(self, points, actions, own_weight):
+        return TransferredInstances.empty(len(points), 1)
+
+
+@pytest.mark.parametrize("model_class", [KernelAverage, LocalLinear])
+def test_a_model_that_knows_everything_is_restored_with_a_transfer_method_that_is_not_needed_any_more(model_class):
+    grid, kernel = ((2,), 0), dict(breadth=0.5, min_weight=0.01, min_fraction=0.1)
+    model, restored = (make_model(grid, kernel, transfer=NoInstances(), model_class=model_class) for _ in range(2))
+    learn(model, random_transitions(0, 1, 200))
+    assert model.known.all()
+    restored.set_state(model.get_state())
+    linear_models.assert_same_to_the_last_bit(model, restored)
 
 
 def test_transitions_come_back_in_the_order_in_which_they_came():
