@@ -1,0 +1,196 @@
+"""The planner against value iteration on the same finite MDP, staying included."""
+
+import numpy as np
+import pytest
+from helpers.kernel_models import N_ACTIONS, learn, make_model
+from helpers.naive_fitted_rmax import NaiveFittedRMax
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel.planning.planner import Planner
+
+KERNEL = dict(breadth=0.35, min_weight=0.01, min_fraction=0.13)
+MIN_VALUE, MANY = -60.0, 10_000
+
+
+def walk(seed, n, n_variables=2, goal=0.8, noise=False):
+    """Steps about the box; those that end near the upper corner end the episode."""
+    rng = np.random.default_rng(seed)
+    for _ in range(n):
+        state, action = rng.random(n_variables), int(rng.integers(N_ACTIONS))
+        next_state = np.clip(state + rng.normal((0.12 if action else -0.12), 0.05, n_variables), 0.0, 1.0)
+        reward = float(rng.normal()) if noise else -1.0
+        yield state, action, reward, next_state, bool((next_state > goal).all())
+
+
+def planned(grid=((3,), 1), seed=1, n=80, gamma=0.9, max_value=2.0, tolerance=1e-12, noise=True):
+    """A planner of a model that has learned a walk."""
+    model = make_model(grid, KERNEL, gamma)
+    learn(model, walk(seed, n, len(grid[0]), noise=noise))
+    return Planner(model.mdp, max_value=max_value, min_value=MIN_VALUE, tolerance=tolerance)
+
+
+def values_of_rows(planner, upper=np.inf, optimism=True):
+    """Value iteration on the rows of the finite MDP.
+
+    :param upper: bounds of the points' values, besides ``max_value``
+    :param optimism: False: only pairs that have a model count
+    """
+    mdp, (low, high) = planner.mdp, planner.bounds
+    arrays, n = mdp.arrays, mdp.grid.n_points
+    upper = np.minimum(np.broadcast_to(upper, n), high)
+    values = upper.copy() if optimism else np.full(n, low)
+    for _ in range(20_000):
+        backed_up = values.copy()
+        for point in range(n):
+            q = [low]
+            for action in range(mdp.n_actions):
+                if arrays.modelled[action * n + point]:
+                    length = arrays.length[point, action]
+                    to, weight = arrays.to[point, action, :length], arrays.weight[point, action, :length]
+                    q.append(arrays.reward[point, action] + weight @ values[to])
+                elif optimism:
+                    q.append(np.inf)
+            backed_up[point] = min(max(q), upper[point])
+        if np.abs(backed_up - values).max() < 1e-12:
+            return backed_up
+        values = backed_up
+    raise AssertionError("value iteration did not converge")
+
+
+@pytest.mark.parametrize(
+    ("grid", "gamma", "max_value"),
+    [
+        *[(((4,), 0), 0.97, 10.0), (((1, 2, 1), 0), 0.8, 3.0), (((2, 2), 1), 1.0, 0.0)],
+        (((2, 3), 0, (False, True)), 0.9, 5.0),
+    ],
+)
+def test_sweeps_converge_to_the_values_of_exact_value_iteration(grid, gamma, max_value):
+    planner = planned(grid, 1, 80, gamma, max_value, noise=gamma < 1.0)
+    sweeps = planner.sweep(MANY)
+    assert 2 < sweeps < 1000 and planner.sweep(MANY) <= 2
+    naive = NaiveFittedRMax(
+        *grid[:2], N_ACTIONS, KERNEL, gamma=gamma, max_value=max_value, periodic=grid[2] if len(grid) > 2 else None
+    )
+    for transition in walk(1, 80, len(grid[0]), noise=gamma < 1.0):
+        naive.add(*transition)
+    modelled = planner.mdp.arrays.modelled.reshape(naive.known.shape)
+    assert modelled[naive.known].all()
+    naive.known[:] = modelled
+    np.testing.assert_allclose(planner.values, naive.optimal_values(MIN_VALUE), atol=1e-7)
+    np.testing.assert_allclose(planner.values, values_of_rows(planner), atol=1e-7)
+    assert np.unique(np.round(planner.values, 6)).size > 5, "a problem without interest"
+
+
+def test_few_sweeps_leave_work_that_later_ones_finish_and_the_number_is_returned():
+    planner, other = planned(((3, 2), 0), gamma=0.95), planned(((3, 2), 0), gamma=0.95)
+    assert planner.sweep(0) == 0 and (planner.values == 2.0).all()
+    n = planner.sweep(MANY)
+    assert [other.sweep(1) for _ in range(n)] == [1] * n
+    np.testing.assert_array_equal(planner.values, other.values)
+
+
+def test_sweeps_end_when_no_value_changes_by_more_than_the_tolerance():
+    rough, precise = (planned(((3, 2), 0), tolerance=tolerance) for tolerance in (0.1, 1e-12))
+    assert rough.sweep(MANY) < precise.sweep(MANY)
+    # What is left is a tenth, discounted for ever.
+    assert 1e-6 < np.abs(rough.values - precise.values).max() <= 0.1 * 0.9 / (1.0 - 0.9)
+
+
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(
+    st.integers(0, 10**6), st.integers(0, 40), st.lists(st.sampled_from(["lower", "raise", "none"]), min_size=1, max_size=4)
+)
+def test_values_are_bounded_by_what_is_given_and_optimistic_ones_are_that(seed, n, changes):
+    """However bounds come, fall and rise between transitions: exactly, as from the beginning with the last of them."""
+    rng, model = np.random.default_rng(seed), make_model(((3,), 1), KERNEL, 0.9)
+    planner = Planner(model.mdp, max_value=2.0, min_value=MIN_VALUE, tolerance=1e-12)
+    optimistic = model.mdp.arrays.n_optimistic
+    for k, change in enumerate(changes):
+        learn(model, walk(seed + k, n, 1))
+        lowest, highest = {"lower": (-6.0, 0.0), "raise": (-2.0, 3.0), "none": (np.inf, np.inf)}[change]
+        upper = None if change == "none" else rng.uniform(lowest, highest, model.grid.n_points)
+        planner.set_upper(upper)
+        assert (planner.values <= planner.upper).all() and planner.upper.max() <= 2.0
+        assert planner.is_bounded == (upper is not None)
+        np.testing.assert_array_equal(planner.values[optimistic > 0], planner.upper[optimistic > 0])
+        planner.sweep(MANY)
+        expected = values_of_rows(planner, upper=np.inf if upper is None else upper)
+        np.testing.assert_allclose(planner.values, expected, atol=1e-9)
+        np.testing.assert_array_equal(planner.values[optimistic > 0], planner.upper[optimistic > 0])
+
+
+@pytest.mark.parametrize("upper", [np.zeros(3), np.zeros((11, 1)), 0.0, np.full(11, np.nan)])
+def test_bounds_that_are_not_one_number_a_point_are_refused(upper):
+    planner = planned(n=0)
+    assert planner.mdp.grid.n_points == 11
+    with pytest.raises(ValueError, match=r"value_bound\(\) must return None or a finite number for each of the 11 states"):
+        planner.set_upper(upper)
+
+
+@pytest.mark.parametrize("max_value", [-0.5, 5.0])
+def test_another_max_value_changes_what_is_optimistic_at_once_and_the_rest_by_sweeps(max_value):
+    planner = planned(n=9)
+    planner.sweep(MANY)
+    upper = np.where(np.arange(11) == 8, 1.0, np.inf).clip(max=2.0)
+    for bounds in (None, upper):
+        planner.set_upper(bounds)
+        planner.set_max_value(max_value)
+        optimistic = planner.mdp.arrays.n_optimistic > 0
+        assert 0 < optimistic.sum() < 11 and planner.bounds == (MIN_VALUE, max_value)
+        np.testing.assert_array_equal(planner.values[optimistic], planner.upper[optimistic])
+        assert (np.delete(planner.upper, 8) == max_value).all() and planner.upper[8] == (max_value if bounds is None else 1.0)
+        planner.sweep(MANY)
+        np.testing.assert_allclose(planner.values, values_of_rows(planner, planner.upper), atol=1e-9)
+        planner.set_max_value(2.0)
+
+
+@pytest.mark.parametrize(("grid", "n"), [(((4,), 0), 4), (((3, 3), 0), 14), (((3, 3), 0, (False, True)), 14)])
+def test_cautious_values_are_those_of_the_modelled_pairs_alone_and_come_from_below(grid, n):
+    planner = planned(grid, seed=1, n=n)
+    planner.sweep(MANY)
+    before, exact = planner.values.copy(), values_of_rows(planner, optimism=False)
+    lower = np.full(len(before), MIN_VALUE)
+    for max_sweeps in (0, 1, 3, MANY):
+        values = planner.cautious_values(max_sweeps)
+        assert (values >= lower - 1e-12).all() and (values <= exact + 1e-9).all()
+        lower = values
+    np.testing.assert_allclose(lower, exact, atol=1e-9)
+    nothing = ~planner.mdp.arrays.modelled.reshape(N_ACTIONS, -1).any(axis=0)
+    assert nothing.any() and (lower[nothing] == MIN_VALUE).all()
+    assert (lower <= before + 1e-9).all() and (lower < before).any()
+    np.testing.assert_array_equal(planner.values, before)
+
+
+def test_restored_values_are_cut_to_their_bounds_and_converge_to_the_same_as_before():
+    planner = planned(((3, 2), 1), seed=3, n=100, gamma=0.95)
+    planner.sweep(MANY)
+    expected = planner.values.copy()
+    planner.restore(expected)
+    np.testing.assert_array_equal(planner.values, expected)
+    planner.restore(expected + 100.0 * np.random.default_rng(0).normal(size=len(expected)))
+    assert planner.values.max() <= 2.0 and planner.values.min() >= MIN_VALUE
+    planner.sweep(MANY)
+    np.testing.assert_allclose(planner.values, expected, atol=1e-7)
+
+
+def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again():
+    model, lost = make_model(((3,), 0), KERNEL, 0.9, max_instances=2), 0
+    planner = Planner(model.mdp, max_value=2.0, min_value=MIN_VALUE, tolerance=1e-12)
+    for transition in walk(2, 40, 1):
+        known = model.known.copy()
+        learn(model, [transition])
+        lost += int((known & ~model.known).sum())
+        planner.sweep(MANY)
+        np.testing.assert_allclose(planner.values, values_of_rows(planner), atol=1e-8)
+    assert lost > 0
+
+
+@pytest.mark.parametrize(("reward", "expected"), [(-1.0, MIN_VALUE), (1.0, 2.0)])
+def test_values_of_pairs_that_lead_nowhere_are_their_bounds(reward, expected):
+    model = make_model(((2, 2), 0), KERNEL)
+    learn(model, [(state, action, reward, state, False) for state, action, _, _, _ in walk(0, 80)])
+    planner = Planner(model.mdp, max_value=2.0, min_value=MIN_VALUE, tolerance=1e-12)
+    planner.sweep(MANY)
+    modelled = model.mdp.arrays.n_optimistic == 0
+    assert modelled.any() and (planner.values[modelled] == expected).all() and (planner.values[~modelled] == 2.0).all()
