@@ -62,41 +62,29 @@ def test_written_rows_are_those_of_plain_loops(grid, seed, n_successors, gamma):
         found, prediction = row_of(mdp, point, action), expected.get(pair)
         assert mdp.arrays.modelled[pair] == (prediction is not None)
         if prediction is None:
-            assert found == {} and mdp.arrays.reward[pair] == 0.0
+            assert found == {} and mdp.arrays.reward[point, action] == 0.0
             continue
         successors = naive_row(naive, point, prediction[0], prediction[1])
         reward, others = without_staying(prediction[2], successors, point, gamma)
-        assert mdp.arrays.reward[pair] == pytest.approx(reward, rel=1e-9, abs=1e-9)
+        assert mdp.arrays.reward[point, action] == pytest.approx(reward, rel=1e-9, abs=1e-9)
         assert_same_row(found, others)
     modelled = mdp.arrays.modelled.reshape(N_ACTIONS, -1)
     np.testing.assert_array_equal(mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
 
 
-@settings(deadline=None, derandomize=True, max_examples=8)
-@given(st.sampled_from(GRIDS), st.integers(0, 10**6))
-def test_predecessors_include_every_point_that_a_row_leads_from_with_at_least_its_probability(grid, seed):
-    rng = np.random.default_rng(seed)
-    mdp, _ = make_mdp(grid, gamma=0.95)
-    pairs = np.arange(N_ACTIONS * mdp.grid.n_points)
-    for _ in range(3):
-        write(mdp, pairs, *random_predictions(rng, len(pairs), 3, len(grid[0])))
-    for renewed in (False, True):
-        if renewed:
-            mdp.renew_predecessors()
-        noted = [
-            dict(zip(*map(np.ndarray.tolist, mdp.arrays.predecessors.entries(to)), strict=True))
-            for to in range(len(pairs) // 2)
-        ]
-        leading = [{} for _ in noted]
-        for pair in pairs.tolist():
-            action, point = divmod(pair, mdp.grid.n_points)
-            for to, p in row_of(mdp, point, action).items():
-                leading[to][point] = max(p, leading[to].get(point, 0.0))
-        for found, needed in zip(noted, leading, strict=True):
-            assert needed.keys() <= found.keys() and all(found[point] >= p for point, p in needed.items())
-            if renewed:
-                assert needed.keys() == found.keys(), "those that no row needs any more are forgotten"
-                assert all(found[point] < 2 * p * (1 + 1e-12) for point, p in needed.items()), "the next power of two at most"
+def test_rows_become_wider_when_a_mean_has_more_successors_than_there_is_room_for():
+    mdp, naive = make_mdp(((4, 4), 0))
+    rng = np.random.default_rng(0)
+    width = mdp.arrays.to.shape[-1]
+    narrow, wide = random_predictions(rng, 3, 1, 2), random_predictions(rng, 3, 8, 2)
+    write(mdp, [100, 0, 7], *narrow)
+    assert mdp.arrays.to.shape[-1] == width == 4
+    write(mdp, [40, 41, 42], *wide)
+    assert mdp.arrays.to.shape[-1] > width and mdp.plain[0] is mdp.arrays.to
+    for points, (probability, effect, _) in (([100, 0, 7], narrow), ([40, 41, 42], wide)):
+        for row, point in enumerate(points):
+            _, others = without_staying(0.0, naive_row(naive, point, probability[row], effect[row]), point, 1.0)
+            assert_same_row(row_of(mdp, point), others)
 
 
 def test_staying_is_summed_in_closed_form_and_probability_missing_to_one_ends_the_episode():
@@ -104,9 +92,9 @@ def test_staying_is_summed_in_closed_form_and_probability_missing_to_one_ends_th
     write(mdp, [2], [[0.6, 0.3]], [[0.0, 0.25]], [-1.0])
     leave = 1.0 - 0.8 * 0.6
     assert row_of(mdp, 2) == pytest.approx({3: 0.8 * 0.3 / leave})
-    assert mdp.arrays.reward[2] == pytest.approx(-1.0 / leave)
+    assert mdp.arrays.reward[2, 0] == pytest.approx(-1.0 / leave)
     write(mdp, [2], [[0.0, 0.0]], [[0.25, -0.25]], [-3.0])
-    assert row_of(mdp, 2) == {} and mdp.arrays.reward[2] == -3.0
+    assert row_of(mdp, 2) == {} and mdp.arrays.reward[2, 0] == -3.0
     assert mdp.arrays.modelled[2], "a pair that always ends the episode has a model"
 
 
@@ -114,16 +102,19 @@ def test_staying_is_summed_in_closed_form_and_probability_missing_to_one_ends_th
 def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, expected):
     mdp, _ = make_mdp()
     write(mdp, [2], [[0.5, 0.5]], [[0.0, 0.0]], [reward])
-    assert row_of(mdp, 2) == {} and mdp.arrays.reward[2] == expected
+    assert row_of(mdp, 2) == {} and mdp.arrays.reward[2, 0] == expected
     write(mdp, [2], [[0.5, 0.5]], [[0.0, 0.25]], [reward])
     assert row_of(mdp, 2) == pytest.approx({3: 1.0}), "and an ordinary row once it leaves"
-    assert mdp.arrays.reward[2] == pytest.approx(2 * reward)
+    assert mdp.arrays.reward[2, 0] == pytest.approx(2 * reward)
 
 
 # The grid of states against plain loops: its points, interpolation between them, and its size.
+FIVE_VARIABLES = [((1, 1, 1, 1, 1), 0), ((1, 2, 1, 1, 1), 0, (False, True, False, True, False))]
+
+
 @settings(deadline=None, derandomize=True, max_examples=20)
-@given(st.sampled_from(GRIDS), st.integers(0, 10**6))
-def test_interpolation_is_multilinear_between_grid_points_and_constant_beyond_them(grid, seed):
+@given(st.sampled_from([*GRIDS, *FIVE_VARIABLES]), st.integers(0, 10**6))
+def test_interpolation_is_multilinear_or_by_simplices_between_grid_points_and_constant_beyond_them(grid, seed):
     rng = np.random.default_rng(seed)
     own, naive = make_grid(grid), NaiveGrid(*grid)
     values = rng.normal(size=own.n_points)
@@ -132,6 +123,25 @@ def test_interpolation_is_multilinear_between_grid_points_and_constant_beyond_th
     for state in rng.uniform(-0.8, 1.8, (10, own.n_variables)):
         expected = sum(weight * values[point] for point, weight in naive.corners(state).items())
         assert own.interpolate(values, state) == pytest.approx(expected, abs=1e-12)
+
+
+def test_interpolation_by_simplices_is_exact_for_linear_functions():
+    grid, rng = make_grid(FIVE_VARIABLES[0]), np.random.default_rng(0)
+    slopes = rng.normal(size=5)
+    for state in rng.random((20, 5)):
+        assert grid.interpolate(grid.points() @ slopes, state) == pytest.approx(state @ slopes, abs=1e-12)
+
+
+@pytest.mark.parametrize("grid", [((2,), 0), ((2,), 1), ((2,), 0, (True,))])
+@pytest.mark.parametrize("error", [-5e-10, -1e-16, 0.0, 1e-16, 5e-10])
+def test_what_lies_on_a_grid_line_but_for_rounding_has_one_successor(grid, error):
+    mdp, naive = make_mdp(grid)
+    for point in range(mdp.grid.n_points):
+        for moved in (-0.25, 0.25, 0.5, 1.0):
+            write(mdp, [point], [[1.0]], [[moved + error / 4.0]], [-1.0])
+            [(to, p)] = row_of(mdp, point).items() or [(point, 1.0)]
+            [expected] = [to for to, p in naive.corners(naive.unit(point) + moved).items() if p > 1e-6]
+            assert to == expected and p == 1.0
 
 
 @pytest.mark.parametrize(("n_variables", "breadth"), [(1, 0.09), (2, 0.09), (2, 0.02), (3, 0.15), (4, 0.2)])
