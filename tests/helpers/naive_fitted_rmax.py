@@ -95,7 +95,7 @@ class NaiveGrid:
         return corners
 
     def simplex(self, by_variable):
-        """{point: weight} of the simplex of a cell: from its lowest corner on, one variable after the other, the farthest first.
+        """{point: weight} of the simplex of a cell: from its lowest corner on, the variable that is farthest on first.
 
         :param by_variable: ((low, weight), (high, weight)) of each
         """
