@@ -52,18 +52,14 @@ class EpisodeRecorder(BaseCallback):
         return self.n_episodes is None or len(self._rows) < self.n_episodes
 
 
-def play(model: Any, env: gym.Env, n_episodes: int, seed: int, keeps_state: bool) -> Episodes:
-    """Play episodes without exploration; with ``keeps_state``, ``predict`` gets the state that it returned before."""
-    rows, state = [], None
+def play(model: Any, env: gym.Env, n_episodes: int, seed: int) -> Episodes:
+    """Play episodes without exploration."""
+    rows = []
     for episode in range(n_episodes):
         observation, _ = env.reset(seed=seed if episode == 0 else None)
         steps, total, terminated, truncated = 0, 0.0, False, False
         while not (terminated or truncated):
-            if keeps_state:
-                starts = np.array([steps == 0])
-                action, state = model.predict(observation, state=state, episode_start=starts, deterministic=True)
-            else:
-                action, _ = model.predict(observation, deterministic=True)
+            action, _ = model.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, _ = env.step(int(action))
             steps, total = steps + 1, total + float(reward)
         rows.append((steps, total, bool(terminated)))

@@ -41,7 +41,7 @@ LAYOUT: dict[str, dict[str, list[object]]] = {
     },
     "Planner": {
         "Bellman residual": _chart("planner/residual"),
-        "backups": _chart("planner/backups"),
+        "sweeps": _chart("planner/sweeps"),
         "share of the time": _chart("planner/time_share"),
     },
 }

@@ -201,7 +201,7 @@ class GreedyEvaluator(BaseCallback):
     def _on_step(self) -> bool:
         n_steps = self.n_before + self.num_timesteps
         if n_steps in self.at:
-            played = play(self.model, self.env, EVALUATION_EPISODES, self.seed, keeps_state=False)
+            played = play(self.model, self.env, EVALUATION_EPISODES, self.seed)
             self.evaluations.append([n_steps, float(played.returns.mean()), float(played.terminated.mean())])
         return True
 

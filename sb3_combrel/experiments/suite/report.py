@@ -10,17 +10,14 @@ import pandas as pd
 
 from sb3_combrel.comparison.statistics import ALPHA, holm, p_value_of_difference
 from sb3_combrel.comparison.tables import Table
-from sb3_combrel.experiments.suite.runs import WITH_STATE, WITHOUT_STATE
 from sb3_combrel.experiments.suite.tasks import Task
 
-#: Prefixes of the columns of evaluation, see :mod:`~sb3_combrel.experiments.suite.runs`.
-POLICIES = (WITH_STATE, WITHOUT_STATE)
 #: Not tested: it depends on the machine.
 UNTESTED = "ms_per_step"
-_OF_EVALUATION = {"mean": True, "worst": True, "failures": False, "as_good": True}
 #: Columns of every task besides its own measures, with whether more is better.
-COMMON = {UNTESTED: False, "last10_return": True, "last10_failed": False} | {
-    f"{policy}_{column}": better for policy in POLICIES for column, better in _OF_EVALUATION.items()
+COMMON = {
+    **{UNTESTED: False, "last10_return": True, "last10_failed": False},
+    **{"greedy_mean": True, "greedy_worst": True, "greedy_failures": False, "greedy_as_good": True},
 }
 
 
@@ -90,14 +87,10 @@ def frozen_table(cells: Cells, tasks: Sequence[Task], variants: Sequence[str]) -
             if (task.name, UNTESTED, variant) not in cells:
                 continue
             own = {column: cells[task.name, column, variant] for column in COMMON}
-            row = [task.name, variant, own["last10_return"].mean()]
-            for policy in POLICIES:
-                good = own[f"{policy}_as_good"].values
-                as_good = f"{np.nansum(good):.0f} of {len(good)}"
-                row += [own[f"{policy}_mean"].mean(), own[f"{policy}_worst"].worst(), as_good]
-            stuck = np.sum(own["last10_failed"].values == 1.0)
-            rows.append((*row, f"{stuck:.0f}", own[UNTESTED].mean()))
-    header = ("task", "variant", "last 10 of learning", "greedy", "worst", "as good", "without state", "worst", "as good")
+            good, stuck = own["greedy_as_good"].values, np.sum(own["last10_failed"].values == 1.0)
+            greedy = own["greedy_mean"].mean(), own["greedy_worst"].worst(), f"{np.nansum(good):.0f} of {len(good)}"
+            rows.append((task.name, variant, own["last10_return"].mean(), *greedy, f"{stuck:.0f}", own[UNTESTED].mean()))
+    header = ("task", "variant", "last 10 of learning", "greedy", "worst", "as good")
     as_good = "as good: no failure and at most 5% below the last 10 episodes of learning"
     title = f"Returns of the frozen policy; {as_good}; stuck: runs whose last 10 episodes of learning all failed"
     return Table(title, (*header, "stuck", "ms a step"), rows)

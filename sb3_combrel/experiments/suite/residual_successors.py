@@ -110,7 +110,7 @@ class ModelRun(Job):
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
         """Play the task without exploration."""
         with closing(self.make_env()) as env:
-            played = play(model, env, EVALUATION_EPISODES, EVALUATION_SEED + self.seed, keeps_state=True)
+            played = play(model, env, EVALUATION_EPISODES, EVALUATION_SEED + self.seed)
         return {"learning": float(np.mean(result.returns[-LAST:])), "greedy": float(played.returns.mean())}
 
 

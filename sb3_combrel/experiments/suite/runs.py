@@ -24,8 +24,6 @@ from sb3_combrel.runs.runner import read_results
 from sb3_combrel.sources.source_instances import SourceInstances
 
 RUNS_FILE, EPISODES_FILE = "runs.csv", "episodes.csv"
-#: With the state that ``predict`` returns handed on to the next call, and by callers that drop it.
-WITH_STATE, WITHOUT_STATE = "greedy", "stateless"
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class Variant:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteRun(Job):
-    """A task learnt with one variant and one seed, then evaluated with the state of ``predict`` and as often without."""
+    """A task learnt with one variant and one seed, then evaluated without exploration."""
 
     compiled_steps: ClassVar[int] = 60
 
@@ -65,12 +63,10 @@ class SuiteRun(Job):
         row |= {"episodes": len(rows), "steps": result.n_steps, "ms_per_step": 1000.0 * result.seconds / result.n_steps}
         row |= {measure.name: measure.of(learnt) for measure in self.task.measures}
         row |= summary_of_learning(learnt, self.task.failure_return)
-        for policy, keeps_state in ((WITH_STATE, True), (WITHOUT_STATE, False)):
-            with closing(self.make_env()) as env:
-                played = play(model, env, self.evaluation_episodes, EVALUATION_SEED + self.seed, keeps_state)
-            summary = summary_of_evaluation(played, self.task.failure_return, row["last10_return"])
-            row |= {f"{policy}_{key}": value for key, value in summary.items()}
-        return {"row": row}
+        with closing(self.make_env()) as env:
+            played = play(model, env, self.evaluation_episodes, EVALUATION_SEED + self.seed)
+        summary = summary_of_evaluation(played, self.task.failure_return, row["last10_return"])
+        return {"row": row | {f"greedy_{key}": value for key, value in summary.items()}}
 
 
 def suite_runs(
