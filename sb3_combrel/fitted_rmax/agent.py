@@ -234,19 +234,16 @@ class FittedRMaxAgent:
             self._outdated.append(self.model.end_episode())
             self._plan(SWEEPS_AT_EPISODE_END)
 
-    def rescale(self, scaling: StateScaling, keeps: bool = True) -> None:
+    def rescale(self, scaling: StateScaling) -> None:
         """Compute all anew in other unit coordinates.
 
         :param scaling: raw <-> unit coordinates from now on
-        :param keeps: whether to keep what has been learned
         """
         with self._lock:
             before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
             self.task = replace(self.task, scaling=scaling)
             self._bind()
             self._build()
-            if not keeps:
-                return
             self._widen(min(0.0, lowest) / LONGEST_PLAN)
             for state, action, reward, next_state, terminated in transitions:
                 state, next_state = (scaling.to_unit(before.to_raw(each)) for each in (state, next_state))
@@ -314,13 +311,14 @@ class FittedRMaxAgent:
                 "rewards": self.rewards.get_state(),
             }
 
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        """Take over what :meth:`get_state` returned; what has been learned since is forgotten."""
+    def set_state(self, state: dict[str, np.ndarray], scaling: StateScaling | None = None) -> None:
+        """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``; what has been learned is forgotten."""
         with self._lock:
+            self.task = self.task if scaling is None else replace(self.task, scaling=scaling)
             self.rewards.set_state(state["rewards"])
+            self._bind()
             self._build()
             if self.transfer is not None:
-                self._bind()
                 prefix = "transfer_"
                 self.transfer.set_state({name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)})
             self.model.set_state(state)

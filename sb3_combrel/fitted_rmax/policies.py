@@ -152,8 +152,7 @@ class FittedRMaxPolicy(BasePolicy):
         if not problems:
             arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
             self.scales.set_state(arrays.pop("scales"))
-            self.agent.rescale(self.scales.scaling, keeps=False)
-            self.agent.set_state(arrays)
+            self.agent.set_state(arrays, self.scales.scaling)
             self._renew_to_unit()
 
 

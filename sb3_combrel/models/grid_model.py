@@ -110,6 +110,7 @@ class GridModel(Model):
         self._make_prediction(self._own_room)
         # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
         self.n_added = 0
+        self._replays = False
         self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         self._renew_arrivals()
 
@@ -240,7 +241,7 @@ class GridModel(Model):
 
     def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
         """Transferred instances for pairs; known ones need none."""
-        if self._giver is None:
+        if self._giver is None or self._replays:
             if len(self._nothing.length) < len(pairs):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
@@ -284,6 +285,7 @@ class GridModel(Model):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
+        self._replays = True
         self.renew_prior()
         rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
         actions, numbers = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64), rows[:, -1].astype(np.int64)
@@ -300,7 +302,10 @@ class GridModel(Model):
             if until > done:
                 self.update_rows(np.sort(by_time[done:until]))
                 done = until
-        self.n_added = int(state["n_added"][0])
+        self.n_added, self._replays = int(state["n_added"][0]), False
         if self._giver is not None:
-            # What would be transferred now may be something else than when they were fitted.
+            # What is transferred now may be something else than when they were fitted, which stays as it was.
+            before = [array.copy() for array in self.pairs]
             self.update_rows(np.flatnonzero(~self.known))
+            for array, copied in zip(self.pairs, before, strict=True):
+                array[:] = copied

@@ -95,7 +95,7 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     ridge, root = RIDGE / scale, np.sqrt(weights)[:, None]
     design = np.vstack([root * (x - mean_x), np.sqrt(ridge) * np.eye(len(at))])
     slopes = np.linalg.lstsq(design, np.vstack([root * (e - mean_e), np.zeros((len(at), e.shape[1]))]), rcond=None)[0]
-    effect = np.clip(mean_e + (at - mean_x) @ slopes, effects.min(axis=0), effects.max(axis=0))
+    effect = np.clip(mean_e + (at - mean_x) @ slopes, e.min(axis=0), e.max(axis=0))
     outcome = np.exp(-(squared - squared[0]) / min(breadth, outcome_breadth) ** 2)
     spread = np.linalg.solve(design.T @ design / weights.sum(), at - mean_x)
     weight = np.exp(-squared / breadth**2).sum() / (1.0 + (at - mean_x) @ spread)

@@ -86,7 +86,7 @@ def test_a_model_with_a_prior_is_saved_and_learns_on(method, tmp_path):
     states, actions = np.random.default_rng(0).random((300, 2)), np.zeros(300, dtype=np.int64)
     for one, other in zip(ours.prior(states, actions), theirs.prior(states, actions), strict=True):
         np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(model.agent.model.fits.prior, loaded.agent.model.fits.prior)
+    np.testing.assert_array_equal(model.agent.model.linear.prior, loaded.agent.model.linear.prior)
     assert ours.value_bound() is not None
     np.testing.assert_array_equal(loaded.agent.planner.upper, model.agent.planner.upper)
     assert loaded.learn(60, reset_num_timesteps=False).agent.model.n_instances > model.agent.model.n_instances - 1

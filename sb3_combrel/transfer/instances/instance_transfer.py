@@ -162,7 +162,7 @@ class InstanceTransfer:
         compared = int(self.errors.of_actions[action, 0])
         words, share = "many mappings at once" if compared else "nothing was transferred", np.nan
         if of_action:
-            best = max(of_action, key=lambda each: of_action[each])
+            best = max(of_action, key=lambda each: (of_action[each], -each))
             words = f"{parts_of[best].source_action} with {parts_of[best].state_mapping}"
             share = of_action[best] / sum(of_action.values())
         sure = self.selector.confidence(action) or Confidence(np.nan, np.nan, np.nan)

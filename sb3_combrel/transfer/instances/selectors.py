@@ -127,6 +127,12 @@ class RandomSelector(Selector):
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         return self._drawn[actions], self._drawn[actions] + 1
 
+    def get_state(self) -> dict[str, np.ndarray]:
+        return {"drawn": self._drawn.astype(np.float64)}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        self._drawn = np.clip(state["drawn"].astype(np.int64), self.first[:-1], self.first[1:] - 1)
+
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
         chosen = self._draw(actions)
         return chosen, chosen + 1
