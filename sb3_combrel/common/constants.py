@@ -27,5 +27,4 @@ FAR_BEYOND, BEYOND, TOO_WIDE = 0.1, 0.02, 2.0
 # Grid points are known with this fraction of the weight that exact states need, once an episode has ended or rewards have
 # differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how states
 # change is not to know what is there: dm_control's pendulum, point robot.
-import os
-ON_GRID = float(os.environ.get("GRID", "0.5"))
+ON_GRID = 0.5

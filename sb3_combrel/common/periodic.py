@@ -19,13 +19,6 @@ def difference(a, b, periodic):
     return apart
 
 
-@inlined
-def bring_near(state, at, periodic, near):
-    """Write a state to ``near``, its periodic variables by as many periods away as bring them nearest to the state ``at``."""
-    for k in range(len(state)):
-        near[k] = at[k] + difference(state[k], at[k], True) if periodic[k] else state[k]
-
-
 def differences(a: NDArray[np.float64], b: NDArray[np.float64], periodic: NDArray[np.bool_] | None) -> NDArray[np.float64]:
     """:func:`difference` of arrays of states, shape (..., n_variables); ``periodic`` None: no variable is."""
     apart: NDArray[np.float64] = np.asarray(a - b)

@@ -7,6 +7,7 @@ depends on the transitions alone: so a model is saved as its transitions and one
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.regression import Kernel
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
 from sb3_combrel.models.ends import Ends, put_arrivals, put_transition
 from sb3_combrel.models.grid_points import CAME, ENDED, WENT, PairArrays, PointScratch, note_instance
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
@@ -99,7 +100,7 @@ class GridModel(Model):
         few = 0 if self._giver is None else 1
         self._rules = self.kernel.scale, self.exploration_threshold, few
         # Whether an outcome has told states apart.
-        self._informed, self._first_reward = not self._fits, np.nan
+        self._informed, self._first_reward, self._informed_at = not self._fits, np.nan, 0
         # Sums of the sizes of effects and rewards, by action.
         self._sizes = np.zeros((self.n_actions, self.grid.n_variables + 1))
         self._cell = float((self.grid.arrays.cells**-2.0).sum()) ** 0.5
@@ -176,11 +177,14 @@ class GridModel(Model):
     def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
         """Note an outcome; with the first that differs grid points need less weight: the pairs that are due."""
         self._first_reward = reward if np.isnan(self._first_reward) else self._first_reward
-        self._informed = terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)
-        if not self._informed:
+        if not (terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)):
             return due
-        self._rules = self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2]
+        self._informed_at = self.n_added
+        self._set_informed()
         return np.union1d(due, np.flatnonzero(~self.known & (self.own_weight >= self._rules[1])))
+
+    def _set_informed(self) -> None:
+        self._informed, self._rules = True, (self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2])
 
     def _numbers_of(self, action: int, slot: int) -> np.ndarray:
         """Effect and reward of an instance."""
@@ -241,7 +245,7 @@ class GridModel(Model):
 
     def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
         """Transferred instances for pairs; known ones need none."""
-        if self._giver is None or self._replays:
+        if self._giver is None or self._replays or len(pairs) == 0:
             if len(self._nothing.length) < len(pairs):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
@@ -280,32 +284,58 @@ class GridModel(Model):
         return {
             "instances": np.column_stack([self.instances.rows(), self._numbers()]),
             "fitted_at": self.pairs.fitted_at.astype(np.float64),
-            "n_added": np.array([float(self.n_added)]),
+            "n_added": np.array([float(self.n_added), float(self._informed_at)]),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
         self._replays = True
-        self.renew_prior()
+        self._update_all(self.renew_prior())
         rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
-        actions, numbers = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64), rows[:, -1].astype(np.int64)
+        actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
         self._make_room(int(np.bincount(actions, minlength=self.n_actions).max()))
+        n_added, self._informed_at = (int(number) for number in state["n_added"])
         fitted_at = state["fitted_at"].astype(np.int64)
-        by_time = np.argsort(fitted_at, kind="stable")
-        done = int(np.searchsorted(fitted_at[by_time], 1))
-        for action, number, row in zip(actions.tolist(), numbers.tolist(), rows, strict=True):
-            slot = int(self.instances.size[action])
-            self.n_added = number - 1
+        for_fitting = _Due(fitted_at)
+        for action, row in zip(actions.tolist(), rows, strict=True):
+            self._fit_until(for_fitting, int(row[-1]))
+            self.n_added = int(row[-1]) - 1
             at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
-            self._put((action, slot, at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
-            until = int(np.searchsorted(fitted_at[by_time], number, side="right"))
-            if until > done:
-                self.update_rows(np.sort(by_time[done:until]))
-                done = until
-        self.n_added, self._replays = int(state["n_added"][0]), False
+            self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
+        self._fit_until(for_fitting, n_added + 1)
+        self.n_added, self._replays = n_added, False
         if self._giver is not None:
             # What is transferred now may be something else than when they were fitted, which stays as it was.
             before = [array.copy() for array in self.pairs]
-            self.update_rows(np.flatnonzero(~self.known))
+            self._update_all(np.flatnonzero(~self.known))
             for array, copied in zip(self.pairs, before, strict=True):
                 array[:] = copied
+
+    def _fit_until(self, due: _Due, number: int) -> None:
+        """Fit the pairs that were last fitted before transition ``number`` came."""
+        for fitted_at, pairs in due.before(number):
+            self.n_added = fitted_at
+            if 0 < self._informed_at <= fitted_at:
+                self._set_informed()
+            self._update_all(pairs)
+
+    def _update_all(self, pairs: np.ndarray) -> None:
+        for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
+            self.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
+
+
+class _Due:
+    """Pairs in the order in which they were last fitted; those that never were are left out."""
+
+    def __init__(self, fitted_at: np.ndarray):
+        self._pairs = np.argsort(fitted_at, kind="stable")
+        self._times = fitted_at[self._pairs]
+        self._done = int(np.searchsorted(self._times, 1))
+
+    def before(self, number: int) -> Iterator[tuple[int, np.ndarray]]:
+        """Each time before ``number`` that has not been asked for, and its pairs, ascending."""
+        end = int(np.searchsorted(self._times, number))
+        while self._done < end:
+            first, time = self._done, int(self._times[self._done])
+            self._done = int(np.searchsorted(self._times, time, side="right"))
+            yield time, np.sort(self._pairs[first : self._done])

@@ -209,7 +209,7 @@ def coarsest_in_reach(n_variables: int, reach: float) -> int:
     return max(1, int(np.ceil(np.log2(np.sqrt(n_variables) / reach))))
 
 
-# Arrays of a pair and of a point when all pairs have a model, from the sizes of KernelLists, MDPArrays and SweepQueue.
+# What the arrays of a pair and of a point may take, from the sizes of PairArrays, LinearArrays and MDPArrays.
 BYTES_PER_PAIR = 1000
 BYTES_PER_POINT = 200
 MAX_PAIRS_BY_DEFAULT = 1_000_000

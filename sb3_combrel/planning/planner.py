@@ -98,9 +98,8 @@ class Planner:
     def set_max_value(self, max_value: float) -> None:
         """Change the value of what is optimistic; the others follow by sweeps."""
         before, self.bounds = self.bounds[1], (self.bounds[0], float(max_value))
-        self.upper[self.upper == before] = max_value
-        optimistic = self.mdp.arrays.n_optimistic > 0
-        self.values[optimistic] = self.upper[optimistic]
+        self.upper[:] = np.where(self.upper == before, max_value, np.minimum(self.upper, max_value))
+        self.restore(np.where(self.mdp.arrays.n_optimistic > 0, self.upper, self.values))
 
     def set_upper(self, upper: np.ndarray | None) -> None:
         """Bound the values of grid points, and so what is optimistic, by less than ``max_value``.

@@ -67,8 +67,9 @@ class Witness(BaseCallback):
 
 def slow_q(agent, point, action):
     """Q of a pair of the grid, entry by entry; None if it is optimistic."""
-    pair = action * agent.grid.n_points + point
-    if not agent.mdp.arrays.modelled[pair]:
+    mdp = agent.mdp.arrays
+    if not mdp.modelled[action * agent.grid.n_points + point]:
         return None
-    index, weight = agent.mdp.arrays.rows.entries(pair)
-    return agent.mdp.arrays.reward[pair] + sum(w * agent.planner.values[i] for i, w in zip(index, weight, strict=True))
+    entries = range(mdp.length[point, action])
+    following = (mdp.weight[point, action, k] * agent.planner.values[mdp.to[point, action, k]] for k in entries)
+    return mdp.reward[point, action] + sum(following)
