@@ -21,10 +21,10 @@ MAX_MODEL_STEPS = 50
 SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END = 2, 300
 # Lowest return that a state is given, in steps of the worst reward seen, far below every sensible plan: all rows.
 LONGEST_PLAN = 10_000
-# Scales that are found, in parts of the range: what an observation may lie beyond by until the episode ends, and after; a range
-# that is more times as wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum and cart-pole.
+# Scales that are found, in parts of the range: what an observation may lie beyond by until the episode ends, and after; a
+# range that is more times as wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
 FAR_BEYOND, BEYOND, TOO_WIDE = 0.1, 0.02, 2.0
 # Grid points are known with this fraction of the weight that exact states need, once an episode has ended or rewards have
-# differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how states
-# change is not to know what is there: dm_control's pendulum, point robot.
+# differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how
+# states change is not to know what is there: dm_control's pendulum, point robot.
 ON_GRID = 0.5

@@ -312,7 +312,7 @@ class FittedRMaxAgent:
             }
 
     def set_state(self, state: dict[str, np.ndarray], scaling: StateScaling | None = None) -> None:
-        """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``; what has been learned is forgotten."""
+        """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``, in place of what was learned."""
         with self._lock:
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling)
             self.rewards.set_state(state["rewards"])

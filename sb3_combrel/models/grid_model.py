@@ -24,7 +24,11 @@ from sb3_combrel.models.grid_points import CAME, ENDED, WENT, PairArrays, PointS
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
 from sb3_combrel.planning.q_values import Prediction
 
-_note_instance, _put_transition, _put_arrivals = EntryPoint(note_instance), EntryPoint(put_transition), EntryPoint(put_arrivals)
+_note_instance, _put_transition, _put_arrivals = (
+    EntryPoint(note_instance),
+    EntryPoint(put_transition),
+    EntryPoint(put_arrivals),
+)
 NO_EFFECT = np.empty(0)
 LEAST_SIZE = 0.01
 
@@ -127,7 +131,7 @@ class GridModel(Model):
 
     @abstractmethod
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        """Fit, and write the rows of, (pairs, how many of them are done); how many are done then, fewer if there is no room."""
+        """Fit, and write the rows of, (pairs, how many are done); how many are done then, fewer if there is no room."""
 
     def _make_prediction(self, room: int) -> None:
         self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
@@ -169,10 +173,10 @@ class GridModel(Model):
             return due
         self._renew_ends()
         # What is known of ends concerns all actions that may lead there.
-        due, arrived = [due.copy()], self.arrivals.state[action, slot]
+        arrived, noted = self.arrivals.state[action, slot], [due.copy()]
         widest = (self._cell + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
-        due += [self._note((arrived, numbers, size), other, widest, ENDED).copy() for other in range(self.n_actions)]
-        return np.unique(np.concatenate(due))
+        noted += [self._note((arrived, numbers, size), other, widest, ENDED).copy() for other in range(self.n_actions)]
+        return np.unique(np.concatenate(noted))
 
     def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
         """Note an outcome; with the first that differs grid points need less weight: the pairs that are due."""

@@ -25,7 +25,9 @@ class PairArrays(NamedTuple):
     known: np.ndarray  # bool, (n_pairs,)
     # How much new instances may have changed of what is predicted, in parts of the mean effect; inf: it is fitted at once.
     surprise: np.ndarray  # float64, (n_pairs,)
-    fit: np.ndarray  # float64, (n_pairs, d + 1, d + 1): means and slopes of effects and reward; (n_pairs, 0, 0) for a model without
+    fit: (
+        np.ndarray
+    )  # float64, (n_pairs, d + 1, d + 1): means and slopes of effects and reward; (n_pairs, 0, 0) for a model without
 
     @classmethod
     def empty(cls, n_pairs: int, reach: float, n_numbers: int) -> "PairArrays":
@@ -102,8 +104,8 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
     :param first_pair: of the action; plain tuples for ``pairs``, ``grid`` and ``scratch``
     :param widest: squared distance beyond which no pair is concerned
     :param why: CAME, WENT, or ENDED: then the state is where an episode ended
-    :param rules: (-1 / model_breadth ** 2, threshold, how many times the new instances of a pair that is not known must be more
-        than those it has, or 0: it waits until it becomes known)
+    :param rules: (-1 / model_breadth ** 2, threshold, 1 if a pair that is not known is fitted when its instances are twice as
+        many, or 0: it waits until it becomes known)
     """
     pairs, grid, scratch = PairArrays(*pairs), GridArrays(*grid), PointScratch(*scratch)
     first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]

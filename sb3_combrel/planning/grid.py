@@ -10,7 +10,6 @@ import numpy as np
 from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.periodic import flag_array
 
-
 # More variables are interpolated between by simplices.
 MAX_MULTILINEAR = 4
 # In parts of a cell.
@@ -78,7 +77,7 @@ def step_along(low, k, grid):
 def corners_of(position, grid, corner_index, corner_weight):
     """Write the grid points around ``position`` and their weights; how many have a weight above 0.
 
-    Multilinear weights for up to four variables; for more those of Kuhn's simplices (Munos & Moore 2002), d + 1 instead of 2^d.
+    Multilinear weights for up to four variables; for more those of Kuhn's simplices (Munos & Moore 2002), d + 1 corners.
 
     :param position: float64, shape (n_variables,): grid coordinates; wrapped or clipped into the grid
     :param corner_index: int64, shape (2 ** n_variables,); ``corner_weight``: float64, same shape

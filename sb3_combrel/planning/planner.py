@@ -6,8 +6,6 @@ from sb3_combrel.common.compiled import EntryPoint, compiled
 from sb3_combrel.planning.mdp import FiniteMDP
 
 
-
-
 @compiled
 def sweep(values, mdp, upper, lowest, downwards):
     """V(point) = max over a of Q(point, a), Fitted R-Max's backup, at all grid points; the largest change.

@@ -6,8 +6,8 @@ import numpy as np
 
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
-from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
 from sb3_combrel.planning.planner import Planner
+from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel

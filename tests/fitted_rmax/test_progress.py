@@ -1,4 +1,4 @@
-"""Warnings where learning makes no progress: returns above max_value, episodes that cost nothing, returns that are alike; a wall."""
+"""Warnings where learning makes no progress: returns above max_value, idle episodes, returns that are alike; a wall."""
 
 import warnings
 

@@ -103,7 +103,13 @@ def test_a_variable_that_never_changes_keeps_its_bounds_or_gets_some_around_it()
 
 @pytest.mark.parametrize(
     ("low", "high", "wanted"),
-    [(-1.0, 1.6, (-1.6, 1.6)), (-5.0, 3.0, (-5.0, 5.0)), (-1.0, 9.0, (-1.0, 9.0)), (2.0, 3.0, (2.0, 3.0)), (-3.0, -2.0, (-3.0, -2.0))],
+    [
+        (-1.0, 1.6, (-1.6, 1.6)),
+        (-5.0, 3.0, (-5.0, 5.0)),
+        (-1.0, 9.0, (-1.0, 9.0)),
+        (2.0, 3.0, (2.0, 3.0)),
+        (-3.0, -2.0, (-3.0, -2.0)),
+    ],
 )
 def test_zero_is_in_the_middle_of_bounds_that_reach_about_as_far_on_either_side(low, high, wanted):
     assert tuple(float(each[0]) for each in around_zero(np.array([low]), np.array([high]))) == wanted

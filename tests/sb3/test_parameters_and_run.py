@@ -50,7 +50,12 @@ def test_parameters_of_another_kind_are_refused_by_the_name_of_the_argument(lear
         *[("instances", lambda t: t[:, :-1]), ("instances", lambda t: t[0]), ("instances", lambda t: t * th.nan)],
         *[("values", lambda t: t[:-1]), ("values", lambda t: t.to(th.int64)), ("values", lambda t: t / 0.0)],
         *[("fitted_at", lambda t: t[1:]), ("lowest_value", lambda t: t[:0]), ("rewards", lambda t: th.zeros(4))],
-        *[("scales", lambda t: t[1:]), ("n_added", lambda t: t[:0]), ("transfer_instances_used", lambda t: None), ("stranger", lambda t: th.zeros(3))],
+        *[
+            ("scales", lambda t: t[1:]),
+            ("n_added", lambda t: t[:0]),
+            ("transfer_instances_used", lambda t: None),
+            ("stranger", lambda t: th.zeros(3)),
+        ],
     ],
 )
 def test_parameters_that_do_not_fit_are_refused_by_name_and_change_nothing(learned, name, spoil):

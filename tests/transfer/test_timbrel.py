@@ -132,8 +132,8 @@ def row_of(model, pair):
     if not arrays.modelled[pair]:
         return None
     used = slice(arrays.length[point, action])
-    return float(arrays.reward[point, action]), arrays.to[point, action, used].tolist(), arrays.weight[point, action, used].tolist()
-
+    row = (array[point, action, used].tolist() for array in (arrays.to, arrays.weight))
+    return float(arrays.reward[point, action]), *row
 
 
 @pytest.mark.parametrize("method", [TIMBREL, COMBREL])

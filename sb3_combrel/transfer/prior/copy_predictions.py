@@ -72,9 +72,7 @@ def predict_pairs(source, table, uses, pairs, predicted, found):
                 copy = uses.copy[use]
                 see_state(table, copy, states[i], at)
                 effect, outcome = found.effect[use], found.outcome[use]
-                outcome[0], outcome[1], outcome[2] = predict_source(
-                    instances, kernel, fit, away, uses.action[use], at, effect
-                )
+                outcome[0], outcome[1], outcome[2] = predict_source(instances, kernel, fit, away, uses.action[use], at, effect)
                 found.done[use] = True
         join_copies(table, uses, actions[i], i, found.effect, found.outcome, predicted)
 
