@@ -13,30 +13,36 @@ from sb3_combrel.common.scaling import StateScaling
 
 # Excess over the bounds, in unit coordinates, that rounding can explain.
 ROUNDING = 1e-6
+# Share of observations outside the bounds that is worth a warning.
+MANY_OUTSIDE = 0.01
 
 
 @compiled
-def scale_into_box(states, low, ranges, periodic, fixed, observed, units):
+def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, units):
     """``StateScaling.to_unit``; what is outside fixed bounds is moved to the boundary, and periodic variables are wrapped.
 
     :param states: float64, raw units, shape (n, n_variables); ``units`` receives the unit coordinates
     :param observed: float64, shape (2, n_variables) or (0, n_variables): receives the least and the largest observations
+    :param n_outside: float64, shape (n_variables + 1,): counts these by variable where they are outside; and all, at the end
     :return: whether anything is outside, or is no number
     """
     outside = False
+    noted = len(observed) > 0
     for i in range(len(states)):
+        n_outside[len(low)] += noted
         for k in range(len(low)):
             unit = (states[i, k] - low[k]) / ranges[k]
             if periodic[k]:
                 # Not a number if the observation is infinite.
                 unit -= np.floor(unit)
-            if len(observed) > 0:
+            if noted:
                 observed[0, k] = min(observed[0, k], states[i, k])
                 observed[1, k] = max(observed[1, k], states[i, k])
             inside = min(max(unit, 0.0), 1.0)
             units[i, k] = inside if fixed or periodic[k] else unit
             if inside != unit:
                 outside = True
+                n_outside[k] += noted
     return outside
 
 
@@ -62,7 +68,8 @@ class ObservationScaler:
         self._warned = False
         #: Whether anything was outside the bounds.
         self.went_beyond = False
-
+        #: How many of the noted observations were outside, by variable; and, at the end, how many were noted.
+        self.n_outside = np.zeros(scaling.n_variables + 1)
         self._unnoted = np.empty((0, scaling.n_variables))
 
     def __call__(self, observations: np.ndarray, observed: np.ndarray | None = None) -> np.ndarray:
@@ -75,7 +82,7 @@ class ObservationScaler:
         inside = np.empty_like(raw)
         flat = (-1, self.scaling.n_variables)
         scales, noted = (self._low, self._range, self._periodic, self._fixed), self._unnoted if observed is None else observed
-        if _scale_into_box.call(raw.reshape(flat), *scales, noted, inside.reshape(flat)):
+        if _scale_into_box.call(raw.reshape(flat), *scales, noted, self.n_outside, inside.reshape(flat)):
             excess = self.scaling.to_unit(raw) - np.clip(inside, 0.0, 1.0)
             with np.errstate(invalid="ignore"):
                 # Whole periods are no excess; what is not finite stays so.
@@ -95,3 +102,21 @@ class ObservationScaler:
                 "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)",
                 stacklevel=3,
             )
+
+    def warn_of_share(self, observed: np.ndarray, names: Sequence[str]) -> None:
+        """Warn of fixed bounds outside which more than a hundredth of the noted observations were, and propose others.
+
+        :param observed: least and largest of them, raw units, shape (2, n_variables)
+        """
+        share = self.n_outside[:-1] / max(1.0, self.n_outside[-1])
+        many = np.flatnonzero(share > MANY_OUTSIDE)
+        if not self._fixed or len(many) == 0:
+            return
+        low, high = np.minimum(self.scaling.low, observed[0]), np.maximum(self.scaling.high, observed[1])
+        shares = ", ".join(f"{names[k]} in {100 * share[k]:.0f} %" for k in many)
+        warnings.warn(
+            f"observations were outside the bounds and counted as the nearest state inside: {shares} of {self.n_outside[-1]:.0f} "
+            f"observations; all are inside bounds=({np.round(low, 3).tolist()}, {np.round(high, 3).tolist()}), or leave "
+            "bounds out, and they are found",
+            stacklevel=3,
+        )

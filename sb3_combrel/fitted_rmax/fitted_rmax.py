@@ -280,6 +280,7 @@ class FittedRMax(SavedAlgorithm):
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
         finally:
             callback.on_training_end()
+        self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
         return self
 
     def _run_name(self) -> str:

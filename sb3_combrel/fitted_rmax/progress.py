@@ -13,11 +13,12 @@ EQUAL_RETURNS = 20
 
 
 class ProgressWatch:
-    """Looks at the episodes of learning, and warns once of each of three things.
+    """Looks at the episodes of learning, and warns once of each of four things.
 
     - A return above ``max_value``: then that is no upper bound, and exploration ends too soon.
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
       ``max_value`` of what is unknown, and nothing draws the agent to the unknown.
+    - Episodes that all end by their time limit, with gamma 1.
     - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time: nothing that
       exploration reaches makes a difference.
     """
@@ -48,6 +49,7 @@ class ProgressWatch:
         if terminated or min(rewards) >= 0.0:
             self._note_best_return(rewards)
         self._note_cost(rewards, terminated)
+        self._note_endless()
         explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
         self._note_return(rewards, terminated, explored)
 
@@ -74,6 +76,15 @@ class ProgressWatch:
                 "0, and steps that cost nothing keep the value of what is known at max_value, so that nothing draws the agent "
                 "to what is unknown. Pass the largest return that the task can give as max_value, such as the reward of its "
                 "goal, above 0, and a gamma below 1, such as gamma=0.99",
+            )
+
+    def _note_endless(self) -> None:
+        seen = self.rewards
+        if self.gamma == 1.0 and seen.n_ended == 0 and seen.n_truncated >= EQUAL_RETURNS:
+            self._warn(
+                "endless",
+                f"gamma=1, and all {seen.n_truncated} episodes have ended by their time limit: if the task has no end, returns "
+                "grow without limit, and plans never settle; leave gamma out, or pass gamma=0.99",
             )
 
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:

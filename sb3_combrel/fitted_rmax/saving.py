@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_combrel.common.checks import check_boolean
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.serialisation import damage_text, to_plain
+from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.transfer.by_name import describe_transfer
@@ -41,6 +43,8 @@ class SavedAlgorithm(BaseAlgorithm):
     transfer: Any
     _rng: np.random.Generator
     _generator_state: dict[str, Any] | None
+    #: Version of this package that has saved the model.
+    package_version: str
 
     def save(
         self, path: str | Path | io.BufferedIOBase, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
@@ -63,6 +67,7 @@ class SavedAlgorithm(BaseAlgorithm):
         for name in (*FittedRMaxSettings.names(), "seed"):
             setattr(written, name, to_plain(getattr(self, name)))
         written.transfer = describe_transfer(self.policy.transfer)
+        written.package_version = __version__
         written._generator_state = dict(self._rng.bit_generator.state)
         super(SavedAlgorithm, written).save(archive, exclude, include)
         content = _zipped_anew(archive, zipfile.ZIP_DEFLATED).getvalue()
@@ -172,8 +177,20 @@ def _naming(path: object) -> Iterator[None]:
         raise
     except Exception as error:
         raise ValueError(
-            f"{path} is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)})"
+            f"{path} is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)}){_other_version(path)}"
         ) from error
+
+
+def _other_version(path: object) -> str:
+    """Say that the file of a model was saved by another version of this package, if so."""
+    try:
+        with zipfile.ZipFile(path) as archive:  # type: ignore[call-overload]
+            version = json.loads(archive.read("data")).get("package_version", "before 0.2")
+    except Exception:
+        # Damaged content makes libraries raise anything; then nothing is known.
+        return ""
+    same = version == __version__
+    return "" if same else f"; it was saved by sb3_combrel {version}, which can load it, and this is {__version__}"
 
 
 def _is_tensors(parameters: Any) -> bool:

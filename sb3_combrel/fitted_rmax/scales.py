@@ -73,7 +73,9 @@ class FoundScales:
         low, high, *observed = state.reshape(4, -1)
         limit = np.finfo(np.float64).max
         self.observed = np.where(np.abs(observed) == limit, np.copysign(np.inf, observed), observed)
-        self.scaling = StateScaling(low, high)
+        # Whatever a file says.
+        least, most = np.minimum(low, high), np.maximum(low, high)
+        self.scaling = StateScaling(least, np.where(most > least, most, least + 1.0))
 
 
 def around_zero(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ SETUP_OF_PAIR = (1e-6, 1e-5)
 STEP_OF_POINT = (7e-7, 4e-6)
 
 LONG_SETUP_SECONDS = 5.0
+MAX_VARIABLES = 6
 LONG_STEP_SECONDS = 0.05
 
 
@@ -44,7 +45,14 @@ def workload(grid: StateGrid, n_actions: int, settings: ModelSettings, transfers
 
 
 def warn_if_long(work: Workload, grid: StateGrid) -> None:
-    """Warn of a grid that takes long, before it does."""
+    """Warn of a grid that takes long, before it does, and of more state variables than a grid is good for."""
+    if grid.n_variables > MAX_VARIABLES:
+        warnings.warn(
+            f"{grid.n_variables} state variables are many for a grid, which has {grid.arrays.shape.min()} points along some of "
+            f"them: {work}. Fewer variables, chosen with gymnasium.wrappers.FilterObservation or a wrapper of your own, are "
+            "learned in fewer steps; for more there are DQN and PPO of Stable-Baselines3",
+            stacklevel=6,
+        )
     if work.setup_seconds > LONG_SETUP_SECONDS or work.step_seconds > LONG_STEP_SECONDS:
         warnings.warn(
             f"resolution={list(grid.resolution)} means {work}; a lower resolution takes less time, each number less by one "
