@@ -115,8 +115,8 @@ class ObservationScaler:
         low, high = np.minimum(self.scaling.low, observed[0]), np.maximum(self.scaling.high, observed[1])
         shares = ", ".join(f"{names[k]} in {100 * share[k]:.0f} %" for k in many)
         warnings.warn(
-            f"observations were outside the bounds and counted as the nearest state inside: {shares} of {self.n_outside[-1]:.0f} "
-            f"observations; all are inside bounds=({np.round(low, 3).tolist()}, {np.round(high, 3).tolist()}), or leave "
+            f"observations were outside the bounds and counted as the nearest state inside: {shares} of "
+            f"{self.n_outside[-1]:.0f} observations; all are inside bounds=({np.round(low, 3).tolist()}, {np.round(high, 3).tolist()}), or leave "
             "bounds out, and they are found",
             stacklevel=3,
         )

@@ -83,8 +83,8 @@ class ProgressWatch:
         if self.gamma == 1.0 and seen.n_ended == 0 and seen.n_truncated >= EQUAL_RETURNS:
             self._warn(
                 "endless",
-                f"gamma=1, and all {seen.n_truncated} episodes have ended by their time limit: if the task has no end, returns "
-                "grow without limit, and plans never settle; leave gamma out, or pass gamma=0.99",
+                f"gamma=1, and all {seen.n_truncated} episodes have ended by their time limit: if the task has no end, "
+                "returns grow without limit, and plans never settle; leave gamma out, or pass gamma=0.99",
             )
 
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:

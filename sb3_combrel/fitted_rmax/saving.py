@@ -176,9 +176,8 @@ def _naming(path: object) -> Iterator[None]:
     except (FileNotFoundError, PermissionError):
         raise
     except Exception as error:
-        raise ValueError(
-            f"{path} is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)}){_other_version(path)}"
-        ) from error
+        wrong = f"is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)})"
+        raise ValueError(f"{path} {wrong}{_other_version(path)}") from error
 
 
 def _other_version(path: object) -> str:
