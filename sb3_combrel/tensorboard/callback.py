@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_combrel.common.checks import check_count, check_positive
+from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.tensorboard import readings
@@ -93,10 +94,10 @@ class DashboardCallback(BaseCallback):
             return
         if self.picture_freq is not None:
             check_matplotlib("pass picture_freq=None")
-        self._planes = planes_of(self.agent, self.variables, self.at)
         transfer = self.agent.transfer
         self._transfer = transfer if isinstance(transfer, MappingTransfer) else None
-        self._history = ChoiceHistory() if self._transfer is not None and self._transfer.makes_choices else None
+        self._scaling: StateScaling | None = None
+        self._follow_scales()
         self._shown_at = self._drawn_at = self._scalars_at = self.model.num_timesteps
         self._next_pictures = self._following_pictures()
         n_steps = self.model._total_timesteps - self.model.num_timesteps
@@ -154,6 +155,14 @@ class DashboardCallback(BaseCallback):
         self._writer.flush()
         self._writer = None
 
+    def _follow_scales(self) -> None:
+        """Begin anew with planes and history if the agent has other scales: candidates are then numbered anew."""
+        if self.agent.task.scaling is self._scaling:
+            return
+        self._scaling = self.agent.task.scaling
+        self._planes = planes_of(self.agent, self.variables, self.at)
+        self._history = ChoiceHistory() if self._transfer is not None and self._transfer.makes_choices else None
+
     def _write_scalars(self, writer: SummaryWriter) -> None:
         """Write what a log would have, between logs, in one piece: single scalars would take several times as long."""
         from sb3_combrel.tensorboard.summaries import scalars_summary
@@ -165,6 +174,7 @@ class DashboardCallback(BaseCallback):
         self._between_logs.spend_since(began)
 
     def _readings(self) -> dict[str, float]:
+        self._follow_scales()
         found = {
             "planner/residual": readings.bellman_residual(self.agent),
             "planner/time_share": self._planning_share(),
@@ -208,6 +218,7 @@ class DashboardCallback(BaseCallback):
     def _draw(self, step: int) -> dict[str, np.ndarray]:
         from sb3_combrel.tensorboard import pictures
 
+        self._follow_scales()
         drawn = pictures.over_planes(self.agent, self._planes)
         if self._history is not None and self._transfer is not None:
             self._history.note(step, self._transfer.choices())

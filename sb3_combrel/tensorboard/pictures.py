@@ -95,8 +95,9 @@ def source_actions(agent: FittedRMaxAgent, transfer: MappingTransfer, plane: Pla
 
 def chosen_source_actions(transfer: MappingTransfer, points: np.ndarray, n_actions: int) -> tuple[list[str], np.ndarray]:
     """Find names of all source actions, and numbers of those chosen, by target action and point; -1 for none."""
-    names = transfer.source_action_names()
     chosen = transfer.choices().reshape(n_actions, -1)[:, points]
+    # Only now: candidates are listed when they are first chosen.
+    names = transfer.source_action_names()
     found = np.full(chosen.shape, -1, dtype=np.int64)
     for candidate in np.unique(chosen[chosen >= 0]):
         found[chosen == candidate] = names.index(transfer.candidate(int(candidate)).source_action)

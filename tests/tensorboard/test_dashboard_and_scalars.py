@@ -4,6 +4,7 @@ import functools
 import subprocess
 import sys
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
@@ -14,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_combrel import COMBREL, SourceInstances
 from sb3_combrel.callbacks import DashboardCallback
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
 from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
@@ -42,6 +44,27 @@ def test_every_method_has_its_scalars_and_pictures_which_change_nothing_of_what_
     of_choice = ["source_action/place_height", "state_mappings/chosen"] if method in ("TIMBREL", "COMBREL") else []
     assert sorted(found.Tags()["images"]) == sorted([PICTURE, *of_choice])
     assert ("transfer/most_chosen_mappings/text_summary" in found.Tags()["tensors"]) == (method != "none")
+
+
+class WideWalk(NamedWalk):
+    """The walk in a space of which it uses a twentieth."""
+
+    def __init__(self):
+        super().__init__(limit=10)
+        self.observation_space = gym.spaces.Box(np.float32([-20.0, 0.0]), np.float32([20.0, 2.0]))
+
+
+@pytest.mark.parametrize("use", ["instances", "prior"])
+def test_pictures_and_choices_follow_the_scales_of_the_agent(use, tmp_path):
+    dashboard = DashboardCallback(picture_freq=7, picture_share=1.0, scalar_share=1.0)
+    transfer = COMBREL(SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0), use=use)
+    model = walker(tmp_path, transfer, WideWalk()).learn(150, dashboard, log_interval=1)
+    scaling = model.policy.scaling
+    assert scaling.high[0] < 2.0
+    left, right, *_ = dashboard._planes[0].extent
+    assert scaling.low[0] - 0.2 < left < scaling.low[0] and scaling.high[0] < right < scaling.high[0] + 0.2
+    assert max(dashboard._history.table().sum(axis=0)) > 0
+    assert image_steps(tmp_path)[-1] == 150
 
 
 def test_without_a_log_nothing_is_computed_for_one(transfers, monkeypatch):

@@ -159,7 +159,7 @@ def test_every_task_can_be_learnt_and_has_its_headline(name):
         wrapper = wrapper.env
     with chosen_on_purpose():
         model = FittedRMax(env, **task.learner)
-    assert model.gamma == task.learner.get("gamma", 1.0)
+    assert model.gamma == task.learner.get("gamma")
     env.close()
 
 
