@@ -171,8 +171,8 @@ def translate(transfer: Transfer, visited: Transitions) -> Transitions:
         outcome = given.reward[rows, best], scaling.to_raw(ends), given.terminated[rows, best]
         found.append((visited.states[rows], actions[rows], *outcome))
     states, actions, rewards, next_states, terminated = map(np.concatenate, zip(*found, strict=True))
-    outcomes = {"rewards": rewards, "next_states": next_states, "terminated": terminated}
-    return visited._replace(states=states, actions=actions, low=scaling.low, high=scaling.high, **outcomes)
+    scaled = visited._replace(low=scaling.low, high=scaling.high)
+    return scaled._replace(states=states, actions=actions, rewards=rewards, next_states=next_states, terminated=terminated)
 
 
 def fill(buffer: ReplayBuffer, transitions: Transitions, env: RescaleObservation) -> None:
