@@ -12,7 +12,7 @@ NARROWEST = 0.02
 RIDGE = 0.001
 # A pair of the grid is fitted anew when new instances may have changed its prediction by this part of the mean effect of its
 # action, when half of its list is new, and at an episode's end when one in so many of it is: speed, MountainCar4D, arm.
-MAX_SURPRISE, RENEWED_PART = 0.1, 8
+MAX_SURPRISE, RENEWED_PART = 0.4, 4
 # A prior counts as so much weight of instances that agree with it, for effects, and for ends and rewards: transfer.
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 # An action is held until its cell of the grid is left, but no more steps than this: Acrobot, CartPole.
