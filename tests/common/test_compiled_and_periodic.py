@@ -29,7 +29,7 @@ MESSAGE = "sb3_combrel: compiling"
 
 def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
     states = np.array([[0.5, 3.0], [-2.0, 1.0]])
-    scales = np.array([0.0, 1.0]), np.array([2.0, 4.0]), np.array([False, True]), True, np.empty((0, 2))
+    scales = np.array([0.0, 1.0]), np.array([2.0, 4.0]), np.array([False, True]), True, np.empty((0, 2)), np.zeros(3)
     scale = EntryPoint(scale_into_box)
     for again in (scale, scale, copy.deepcopy(scale), pickle.loads(pickle.dumps(scale))):
         for call in (again, again.call):
@@ -41,17 +41,19 @@ def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
 def test_scale_into_box_is_to_unit_moved_into_the_box_if_that_is_fixed_and_notes_what_is_observed():
     scaling = StateScaling(np.array([-1.0, 0.0, 10.0]), np.array([1.0, 5.0, 11.0]))
     states = np.random.default_rng(0).uniform([-2.0, -1.0, 9.5], [2.0, 6.0, 11.5], (100, 3))
-    units, nothing = np.empty_like(states), np.empty((0, 3))
+    units, nothing, n_outside = np.empty_like(states), np.empty((0, 3)), np.zeros(4)
     scales = scaling.low.copy(), scaling.high - scaling.low, np.zeros(3, dtype=bool)
-    assert scale_into_box(states, *scales, True, nothing, units)
+    assert scale_into_box(states, *scales, True, nothing, n_outside, units)
     np.testing.assert_array_equal(units, np.clip(scaling.to_unit(states), 0.0, 1.0))
     observed = np.array([[0.0, np.inf, 9.0], [0.0, -np.inf, 9.0]])
-    assert scale_into_box(states, *scales, False, observed, units)
+    assert scale_into_box(states, *scales, False, observed, n_outside, units)
     np.testing.assert_array_equal(units, scaling.to_unit(states))
     least, most = np.minimum(states.min(axis=0), [0.0, np.inf, 9.0]), np.maximum(states.max(axis=0), [0.0, -np.inf, 9.0])
     np.testing.assert_array_equal(observed, [least, most])
-    assert not scale_into_box(scaling.to_raw(np.full((1, 3), 0.5)), *scales, True, nothing, units[:1])
-    assert scale_into_box(np.full((1, 3), np.nan), *scales, True, nothing, units[:1])
+    outside = (scaling.to_unit(states) != np.clip(scaling.to_unit(states), 0.0, 1.0)).sum(axis=0)
+    np.testing.assert_array_equal(n_outside, [*outside, 100])
+    assert not scale_into_box(scaling.to_raw(np.full((1, 3), 0.5)), *scales, True, nothing, n_outside, units[:1])
+    assert scale_into_box(np.full((1, 3), np.nan), *scales, True, nothing, n_outside, units[:1])
 
 
 @pytest.fixture(params=[True, False])
