@@ -115,7 +115,6 @@ class GridModel(Model):
         self._make_prediction(self._own_room)
         # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
         self.n_added = 0
-        self._replays = False
         self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         self._renew_arrivals()
 
@@ -232,10 +231,10 @@ class GridModel(Model):
         self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
-        """The pairs that have a model and many new instances."""
+        """The pairs that have a model and many new instances; those with transferred instances that have any."""
         pairs = self.pairs
-        modelled = pairs.known if self._giver is None else np.ones_like(pairs.known)
-        return np.flatnonzero(modelled & (pairs.n_new > 0) & (pairs.n_new * RENEWED_PART >= pairs.length))
+        many = pairs.known & (pairs.n_new * RENEWED_PART >= pairs.length)
+        return np.flatnonzero((pairs.n_new > 0) & (many if self._giver is None else many | ~pairs.known))
 
     def outdated(self) -> np.ndarray:
         return np.flatnonzero(self.pairs.n_new)
@@ -249,12 +248,15 @@ class GridModel(Model):
 
     def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
         """Transferred instances for pairs; known ones need none."""
-        if self._giver is None or self._replays or len(pairs) == 0:
+        if self._giver is None or len(pairs) == 0:
             if len(self._nothing.length) < len(pairs):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
         actions, points = np.divmod(pairs, self.grid.n_points)
         own_weight = self.predict(self.grid.states_of(points), actions).weight
+        # Of what is known the full threshold, so that no method has work with it: grid points may be known with less.
+        full = self.settings.exploration_threshold
+        own_weight = np.where(own_weight >= self._rules[1], np.maximum(full, own_weight), own_weight)
         given = self._giver.transferred_to_sample(points, actions, own_weight)
         self._check(given, own_weight)
         return given
@@ -293,7 +295,6 @@ class GridModel(Model):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
-        self._replays = True
         self._update_all(self.renew_prior())
         rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
@@ -307,13 +308,7 @@ class GridModel(Model):
             at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
         self._fit_until(for_fitting, n_added + 1)
-        self.n_added, self._replays = n_added, False
-        if self._giver is not None:
-            # What is transferred now may be something else than when they were fitted, which stays as it was.
-            before = [array.copy() for array in self.pairs]
-            self._update_all(np.flatnonzero(~self.known))
-            for array, copied in zip(self.pairs, before, strict=True):
-                array[:] = copied
+        self.n_added = n_added
 
     def _fit_until(self, due: _Due, number: int) -> None:
         """Fit the pairs that were last fitted before transition ``number`` came."""

@@ -74,14 +74,11 @@ class Planner:
         #: Whether the values of some grid points are bounded by less than ``max_value``.
         self.is_bounded = False
         self.values = self.upper.copy()
-        self._downwards = False
 
     def sweep(self, max_sweeps: int) -> int:
         """Back up all points, up and down the grid in turn, until little changes; the sweeps that this took."""
         for n in range(max_sweeps):
-            change = _sweep.call(self.values, self.mdp.plain, self.upper, self.bounds[0], self._downwards)
-            self._downwards = not self._downwards
-            if change <= self.tolerance:
+            if _sweep.call(self.values, self.mdp.plain, self.upper, self.bounds[0], n % 2 == 1) <= self.tolerance:
                 return n + 1
         return max_sweeps
 

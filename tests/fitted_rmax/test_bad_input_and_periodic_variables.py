@@ -82,7 +82,7 @@ def test_observations_outside_given_bounds_count_as_the_boundary_with_one_warnin
     model = FittedRMax(Scripted(spoil=lambda obs, reward: (obs + 5.0, reward)), bounds=(-1.0, 1.0), seed=0)
     with pytest.warns(UserWarning, match="outside the bounds") as caught:
         model.learn(40)
-    assert sum("outside the bounds" in str(w.message) for w in caught) == 1
+    assert sum("counts as the nearest state inside" in str(w.message) for w in caught) == 1
     states, effects = states_and_effects(model)
     assert len(states) == 40 and ((states >= 0.0) & (states <= 1.0)).all()
     assert (np.abs(states + effects - 0.5) <= 0.5 + 1e-12).all()
