@@ -112,11 +112,12 @@ class ObservationScaler:
         many = np.flatnonzero(share > MANY_OUTSIDE)
         if not self._fixed or len(many) == 0:
             return
-        low, high = np.minimum(self.scaling.low, observed[0]), np.maximum(self.scaling.high, observed[1])
-        shares = ", ".join(f"{names[k]} in {100 * share[k]:.0f} %" for k in many)
+        low = np.round(np.minimum(self.scaling.low, observed[0]), 3).tolist()
+        high = np.round(np.maximum(self.scaling.high, observed[1]), 3).tolist()
+        shares = ", ".join(f"{names[k]} in {100 * share[k]:.0f} %" for k in many.tolist())
         warnings.warn(
             f"observations were outside the bounds and counted as the nearest state inside: {shares} of "
-            f"{self.n_outside[-1]:.0f} observations; all are inside bounds=({np.round(low, 3).tolist()}, {np.round(high, 3).tolist()}), or leave "
-            "bounds out, and they are found",
+            f"{self.n_outside[-1]:.0f} observations; all are inside bounds=({low}, {high}), or leave bounds out, and they are "
+            "found",
             stacklevel=3,
         )

@@ -56,9 +56,8 @@ class FittedRMaxPolicy(BasePolicy):
             raise ValueError(f"model_class must be a subclass of Model or None, got {model_class!r}")
         given = FittedRMaxSettings(**settings)
         n_variables = len(StateScaling.limits_of(observation_space, given.bounds)[0])
-        self.scales = FoundScales(
-            observation_space, given.bounds, flag_array(periodic_flags(given.periodic, n_variables), n_variables)
-        )
+        periodic = flag_array(periodic_flags(given.periodic, n_variables), n_variables)
+        self.scales = FoundScales(observation_space, given.bounds, periodic, finer=transfer is None)
         names = (() if given_names is None else given_names for given_names in (state_names, action_names))
         task = Task(self.scales.scaling, int(action_space.n), *names)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)

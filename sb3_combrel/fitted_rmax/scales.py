@@ -25,18 +25,22 @@ class FoundScales:
     :param space: observation space
     :param bounds: of the user; None: to be found
     :param periodic: one bool for each state variable
+    :param finer: False: a variable that has bounds keeps them, as what a transfer method has found is about those
     :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, or the bounds do not fit it
     """
 
-    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray):
+    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray, finer: bool = True):
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
         self._found = ~periodic & (bounds is None)
         unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < _LARGEST_BOUND)
         #: What the space allows, raw units.
-        self.low, self.high = np.where(unbounded, -np.inf, low), np.where(unbounded, np.inf, high)
+        self.low = np.where(low > -_LARGEST_BOUND, low, -np.inf)
+        self.high = np.where(high < _LARGEST_BOUND, high, np.inf)
         #: The least and the largest observation of each variable, raw units, shape (2, n_variables).
         self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
+        if not finer:
+            self._found &= unbounded
         self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
 
     def renewed(self, episode_ended: bool) -> StateScaling | None:

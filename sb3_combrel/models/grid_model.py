@@ -115,6 +115,7 @@ class GridModel(Model):
         self._make_prediction(self._own_room)
         # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
         self.n_added = 0
+        self._replays = False
         self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         self._renew_arrivals()
 
@@ -248,7 +249,7 @@ class GridModel(Model):
 
     def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
         """Transferred instances for pairs; known ones need none."""
-        if self._giver is None or len(pairs) == 0:
+        if self._giver is None or self._replays or len(pairs) == 0:
             if len(self._nothing.length) < len(pairs):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
@@ -295,6 +296,7 @@ class GridModel(Model):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
+        self._replays = True
         self._update_all(self.renew_prior())
         rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
@@ -308,7 +310,13 @@ class GridModel(Model):
             at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
         self._fit_until(for_fitting, n_added + 1)
-        self.n_added = n_added
+        self.n_added, self._replays = n_added, False
+        if self._giver is not None:
+            # What is transferred now may be something else than when they were fitted, which stays as it was.
+            before = [array.copy() for array in self.pairs]
+            self._update_all(np.flatnonzero(~self.known))
+            for array, copied in zip(self.pairs, before, strict=True):
+                array[:] = copied
 
     def _fit_until(self, due: _Due, number: int) -> None:
         """Fit the pairs that were last fitted before transition ``number`` came."""

@@ -86,8 +86,9 @@ def test_few_sweeps_leave_work_that_later_ones_finish_and_the_number_is_returned
     planner, other = planned(((3, 2), 0), gamma=0.95), planned(((3, 2), 0), gamma=0.95)
     assert planner.sweep(0) == 0 and (planner.values == 2.0).all()
     n = planner.sweep(MANY)
-    assert [other.sweep(1) for _ in range(n)] == [1] * n
-    np.testing.assert_array_equal(planner.values, other.values)
+    assert n > 4 and other.sweep(2) == 2
+    other.sweep(MANY)
+    np.testing.assert_allclose(planner.values, other.values, atol=1e-9)
 
 
 def test_sweeps_end_when_no_value_changes_by_more_than_the_tolerance():
