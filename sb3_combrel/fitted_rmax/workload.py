@@ -48,8 +48,8 @@ def warn_if_long(work: Workload, grid: StateGrid) -> None:
     """Warn of a grid that takes long, before it does, and of more state variables than a grid is good for."""
     if grid.n_variables > MAX_VARIABLES:
         warnings.warn(
-            f"{grid.n_variables} state variables are many for a grid, which has {grid.arrays.shape.min()} points along some "
-            f"of them: {work}. Fewer variables, chosen with gymnasium.wrappers.FilterObservation or a wrapper of your own, are "
+            f"{grid.n_variables} state variables are many for a grid, with {grid.arrays.shape.min()} points along some of "
+            f"them: {work}. Fewer variables, chosen with gymnasium.wrappers.FilterObservation or a wrapper of your own, are "
             "learned in fewer steps; for more there are DQN and PPO of Stable-Baselines3",
             stacklevel=6,
         )

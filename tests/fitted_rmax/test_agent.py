@@ -67,7 +67,9 @@ def test_the_agent_and_all_that_it_needs_are_imported_without_stable_baselines3(
 @pytest.mark.parametrize("method", METHODS)
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(method):
     runs = [learn(square_agent(method, seed), 3) for seed in (0, 0, 1)]
-    assert runs[0] == runs[1] != runs[2]
+    assert runs[0] == runs[1]
+    # What TIMBREL transfers here leaves no ties, and nothing is drawn.
+    assert (runs[0] == runs[2]) == (method == "TIMBREL")
 
 
 @DEGREES
