@@ -47,11 +47,11 @@ def test_every_method_has_its_scalars_and_pictures_which_change_nothing_of_what_
 
 
 class WideWalk(NamedWalk):
-    """The walk in a space of which it uses a twentieth."""
+    """The walk, in a space without bounds for its first variable."""
 
     def __init__(self):
         super().__init__(limit=10)
-        self.observation_space = gym.spaces.Box(np.float32([-20.0, 0.0]), np.float32([20.0, 2.0]))
+        self.observation_space = gym.spaces.Box(np.float32([-np.inf, 0.0]), np.float32([np.inf, 2.0]))
 
 
 @pytest.mark.parametrize("use", ["instances", "prior"])
