@@ -13,6 +13,9 @@ RIDGE = 0.001
 # A pair of the grid is fitted anew when new instances may have changed its prediction by this part of the mean effect of its
 # action, when half of its list is new, and at an episode's end when one in so many of it is: speed, MountainCar4D, arm.
 MAX_SURPRISE, RENEWED_PART = 0.4, 4
+# A difference is measured by the mean effect of the action, but by no less than this part of a cell; and an instance changes a
+# fit by its weight over this part of a full list, which is what the kernel's weights over one add up to: the same.
+LEAST_SIZE, SHARE_OF_LIST = 0.01, 0.3
 # A prior counts as so much weight of instances that agree with it, for effects, and for ends and rewards: transfer.
 PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 # An action is held until its cell of the grid is left, but no more steps than this: Acrobot, CartPole.
@@ -21,6 +24,9 @@ MAX_MODEL_STEPS = 50
 SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END = 2, 300
 # Lowest return that a state is given, in steps of the worst reward seen, far below every sensible plan: all rows.
 LONGEST_PLAN = 10_000
+# The discount where one is needed and none is given, as in Stable-Baselines3; and what is unknown is worth as long as all
+# rewards were 0, any value above that: CartPole, MountainCarContinuous, dm_control's pendulum.
+DISCOUNT, WORTH_TRYING = 0.99, 1.0
 # Scales that are found, in parts of the range: what an observation may lie beyond by until the episode ends, and after; a
 # range that is more times as wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
 FAR_BEYOND, BEYOND, TOO_WIDE = 0.1, 0.02, 2.0

@@ -107,10 +107,14 @@ class Instances(NamedTuple):
 
     def with_room(self, action: int) -> "Instances":
         """Itself, or the same with twice the room if one more instance of ``action`` would not fit."""
-        n_actions, capacity, n_variables = self.state.shape
-        if self.size[action] < capacity:
-            return self
-        larger = Instances.empty(n_actions, n_variables, 2 * capacity)
+        return self if self.size[action] < self.capacity else self.enlarged(2 * self.capacity)
+
+    def enlarged(self, capacity: int) -> "Instances":
+        """The same with room for at least so many instances of each action."""
+        n_actions, room, n_variables = self.state.shape
+        while room < capacity:
+            room *= 2
+        larger = Instances.empty(n_actions, n_variables, room)
         for old, new in zip(self, larger, strict=True):
             new[tuple(slice(n) for n in old.shape)] = old
         return larger

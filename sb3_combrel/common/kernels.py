@@ -107,15 +107,11 @@ def measure_blocks(instances, action, at):
 
 
 @part
-def near_instances(instances, action, state, kernel, indices, weights, n_before):
+def near_instances(instances, action, state, kernel, indices, weights):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
-
-    What was near at the last query is looked at first: most others are then too far away to enter. The result does not
-    depend on it.
 
     :param kernel: (breadth, min_weight, min_fraction)
     :param indices: int32, receives them, at least ``list_room(min_fraction)`` long; ``weights``: exp(-d^2 / breadth^2)
-    :param n_before: how many instances of the last query are in ``indices``
     """
     breadth, min_weight, min_fraction = kernel
     scale = -1.0 / (breadth * breadth)
@@ -125,23 +121,12 @@ def near_instances(instances, action, state, kernel, indices, weights, n_before)
     total = 0.0
     count = instances.size[action]
     wraps = any_periodic(instances.periodic)
-    instances.searches[0] += 1
-    search = instances.searches[0]
-    for b in range(n_before):
-        before = np.int64(indices[b])
-        if before < count:
-            instances.seen[action, before] = search
-            w = np.exp(squared_distance(state, instances.state[action, before], instances.periodic, wraps) * scale)
-            if w >= min_weight:
-                length, total = insert_by_weight(indices, weights, start, length, total, before, w, min_fraction)
-    if length > 0:
-        farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
     for block in range(measure_blocks(instances, action, state)):
         if instances.gap[block] > farthest:
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
             distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
-            if distance > farthest or instances.seen[action, i] == search:
+            if distance > farthest:
                 continue
             w = np.exp(distance * scale)
             if w < min_weight:

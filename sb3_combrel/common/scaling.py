@@ -15,7 +15,7 @@ Bounds = tuple[ArrayLike, ArrayLike]
 
 # A limit of the order of the largest float stands for "unbounded" (3.4e38 in older Gymnasium spaces): a range that
 # dwarfs every state would put all states at one unit coordinate.
-_LARGEST_BOUND = 1e30
+LARGEST_BOUND = 1e30
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class StateScaling:
         :raises ValueError: if the space is not such a box or is unbounded and ``bounds`` not given, or if these do not fit it
         """
         low, high = cls.limits_of(space, bounds)
-        unbounded = np.flatnonzero(~(np.maximum(np.abs(low), np.abs(high)) < _LARGEST_BOUND))
+        unbounded = np.flatnonzero(~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND))
         if unbounded.size:
             raise ValueError(
                 f"the observation space {space} has no finite bounds for the state variable(s) {unbounded.tolist()}; "

@@ -66,10 +66,10 @@ class FittedRMax(SavedAlgorithm):
 
         model = FittedRMax("MountainCar-v0", seed=0).learn(total_timesteps=5_000)
         model.save("car")
-        action, state = model.predict(np.array([-0.5, 0.0]), deterministic=True)
+        action, _ = model.predict(np.array([-0.5, 0.0]), deterministic=True)
 
-    A step's time is about linear in the number of instances near the state. Memory, about 400 bytes for an instance and 800
-    for a known state-action pair of the grid, is bounded by ``max_instances`` and by the grid.
+    A step's time is mostly that of two sweeps over the grid and of fitting pairs anew. Memory, with four state variables about
+    160 bytes for an instance and 500 for a state-action pair of the grid, is bounded by ``max_instances`` and by the grid.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", which means the same); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)
@@ -90,8 +90,9 @@ class FittedRMax(SavedAlgorithm):
     :param gamma: discount factor, in (0, 1]. None: found as well: 0.99, or 1 where every step costs and episodes end
     :param planning_tolerance: sweeps end when no value changes by more
     :param max_instances: of one action; beyond, the nearest instance is replaced. None: no limit.
-    :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable; needed
-        where those are infinite
+    :param bounds: ``(low, high)`` in place of the observation space's bounds, each one number or one a variable.
+        None: found from the observations where those are infinite or far too wide, see
+        :class:`~sb3_combrel.fitted_rmax.scales.FoundScales`
     :param degree: of the local model: 1, effects are fitted as linear functions of the state to the instances near it
         (:class:`~sb3_combrel.models.local_linear.LocalLinear`); or 0, their kernel average, Jong & Stone's, which needs more
         instances (:class:`~sb3_combrel.models.kernel_average.KernelAverage`)

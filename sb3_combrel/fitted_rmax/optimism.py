@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# As in Stable-Baselines3.
-DISCOUNT = 0.99
-# What is unknown is worth as long as all rewards were 0: any value above that draws the agent to what it has not tried.
-WORTH_TRYING = 1.0
+from sb3_combrel.common.constants import DISCOUNT, WORTH_TRYING
 
 
 class RewardRange:

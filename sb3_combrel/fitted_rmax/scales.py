@@ -8,10 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel.common.constants import BEYOND, FAR_BEYOND, TOO_WIDE
-from sb3_combrel.common.scaling import Bounds, StateScaling
-
-# A limit of the order of the largest float stands for "unbounded".
-_LARGEST_BOUND = 1e30
+from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling
 
 
 class FoundScales:
@@ -33,10 +30,10 @@ class FoundScales:
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
         self._found = ~periodic & (bounds is None)
-        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < _LARGEST_BOUND)
+        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
         #: What the space allows, raw units.
-        self.low = np.where(low > -_LARGEST_BOUND, low, -np.inf)
-        self.high = np.where(high < _LARGEST_BOUND, high, np.inf)
+        self.low = np.where(low > -LARGEST_BOUND, low, -np.inf)
+        self.high = np.where(high < LARGEST_BOUND, high, np.inf)
         #: The least and the largest observation of each variable, raw units, shape (2, n_variables).
         self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
         if not finer:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
-from sb3_combrel.common.constants import ON_GRID, RENEWED_PART
+from sb3_combrel.common.constants import LEAST_SIZE, ON_GRID, RENEWED_PART
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.regression import Kernel
@@ -30,7 +30,6 @@ _note_instance, _put_transition, _put_arrivals = (
     EntryPoint(put_arrivals),
 )
 NO_EFFECT = np.empty(0)
-LEAST_SIZE = 0.01
 
 
 @inlined
@@ -86,7 +85,7 @@ class GridModel(Model):
     #: Numbers that are fitted at each pair.
     _n_fitted = 0
     #: Whether grid points need less weight than exact states.
-    _fits = False
+    _known_by_less = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
@@ -104,7 +103,7 @@ class GridModel(Model):
         few = 0 if self._giver is None else 1
         self._rules = self.kernel.scale, self.exploration_threshold, few
         # Whether an outcome has told states apart.
-        self._informed, self._first_reward, self._informed_at = not self._fits, np.nan, 0
+        self._informed, self._first_reward, self._informed_at = not self._known_by_less, np.nan, 0
         # Sums of the sizes of effects and rewards, by action.
         self._sizes = np.zeros((self.n_actions, self.grid.n_variables + 1))
         self._cell = float((self.grid.arrays.cells**-2.0).sum()) ** 0.5
@@ -132,6 +131,10 @@ class GridModel(Model):
     @abstractmethod
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         """Fit, and write the rows of, (pairs, how many are done); how many are done then, fewer if there is no room."""
+
+    @abstractmethod
+    def _weigh(self, pairs: np.ndarray) -> np.ndarray:
+        """The weight of the own instances of pairs, which decides whether they are known."""
 
     def _make_prediction(self, room: int) -> None:
         self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
@@ -220,12 +223,7 @@ class GridModel(Model):
 
     def _make_room(self, capacity: int) -> None:
         """Make room for so many instances of each action."""
-        while self.instances.capacity < capacity:
-            full = int(self.instances.size.argmax())
-            size = int(self.instances.size[full])
-            self.instances.size[full] = self.instances.capacity
-            self.instances = self.instances.with_room(full)
-            self.instances.size[full] = size
+        self.instances = self.instances.enlarged(capacity)
         number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         number[:, : self._number.shape[1]] = self._number
         self._number = number
@@ -254,7 +252,7 @@ class GridModel(Model):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
         actions, points = np.divmod(pairs, self.grid.n_points)
-        own_weight = self.predict(self.grid.states_of(points), actions).weight
+        own_weight = self._weigh(pairs)
         # Of what is known the full threshold, so that no method has work with it: grid points may be known with less.
         full = self.settings.exploration_threshold
         own_weight = np.where(own_weight >= self._rules[1], np.maximum(full, own_weight), own_weight)

@@ -5,13 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined
-from sb3_combrel.common.constants import MAX_SURPRISE
+from sb3_combrel.common.constants import MAX_SURPRISE, SHARE_OF_LIST
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.regression import PER_BREADTH
 from sb3_combrel.planning.grid import GridArrays
-
-# The kernel's weights over a full list add up to about this part of its length.
-SHARE_OF_LIST = 0.3
 
 
 class PairArrays(NamedTuple):

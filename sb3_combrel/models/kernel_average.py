@@ -58,7 +58,7 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
     instances, near, prediction = Instances(*instances), NearList(*near), Prediction(*prediction)
     least = np.inf
     for action in range(len(instances.size)):
-        length, total = near_instances(instances, action, state, kernel, near.item, near.weight, 0)
+        length, total = near_instances(instances, action, state, kernel, near.item, near.weight)
         reward = 0.0
         n = 0
         for k in range(length):
@@ -74,6 +74,18 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
         prediction.weight[action], prediction.modelled[action] = weight, weight >= threshold
         least = min(least, weight)
     return least
+
+
+@compiled
+def weigh(instances, grid, kernel, threshold, pairs, near, found):
+    """Write the weight of the instances of pairs to ``found``; plain tuples."""
+    instances, grid, near = Instances(*instances), GridArrays(*grid), NearList(*near)
+    n_points = grid.shape[0] * grid.strides[0]
+    for k in range(len(pairs)):
+        action = pairs[k] // n_points
+        unit_coordinates_of(pairs[k] % n_points, grid, near.at)
+        _, total = near_instances(instances, action, near.at, kernel, near.item, near.weight)
+        found[k] = weight_ever(instances, action, near.at, kernel, threshold, total)
 
 
 @inlined
@@ -104,7 +116,7 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         point = pair % n_points
         action = pair // n_points
         unit_coordinates_of(point, grid, near.at)
-        length, total = near_instances(instances, action, near.at, kernel, near.item, near.weight, 0)
+        length, total = near_instances(instances, action, near.at, kernel, near.item, near.weight)
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
         known = weight >= threshold
         pairs.weight[pair], pairs.known[pair] = weight, known
@@ -131,7 +143,7 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
     return done
 
 
-_predict_own, _update_rows = EntryPoint(predict_own), EntryPoint(update_rows)
+_predict_own, _update_rows, _weigh = EntryPoint(predict_own), EntryPoint(update_rows), EntryPoint(weigh)
 
 
 class KernelAverage(GridModel):
@@ -156,6 +168,11 @@ class KernelAverage(GridModel):
         mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
         model = self._plain_experience[0], self._plain_pairs, mdp.plain, self.grid.plain, self._weights
         return int(_update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
+
+    def _weigh(self, pairs: np.ndarray) -> np.ndarray:
+        found, threshold = np.empty(len(pairs)), self.exploration_threshold
+        _weigh.call(self._plain_experience[0], self.grid.plain, self._weights, threshold, pairs, self._near, found)
+        return found
 
     def _predict_own(self, state: np.ndarray) -> float:
         given = state, self._weights, self.exploration_threshold, self._near, self._plain_prediction

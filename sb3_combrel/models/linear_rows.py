@@ -141,6 +141,17 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
     return least
 
 
+@compiled
+def weigh(instances, grid, kernel, pairs, fit, at, found):
+    """Write the weight of the instances of pairs to ``found``; ``at``: work space; plain tuples."""
+    instances, grid, kernel, fit = Instances(*instances), GridArrays(*grid), Kernel(*kernel), LocalFit(*fit)
+    n_points = grid.shape[0] * grid.strides[0]
+    for k in range(len(pairs)):
+        unit_coordinates_of(pairs[k] % n_points, grid, at)
+        length = find_nearest(at, pairs[k] // n_points, 0, instances, kernel, fit)
+        found[k] = known_weight(fit, length, kernel)
+
+
 @inlined
 def prior_change(linear, pair, k, grid, at, away):
     """By how much the prior's effect ``k`` changes from a pair's point to ``away`` from there, linear between grid points."""

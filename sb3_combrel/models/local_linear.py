@@ -11,11 +11,11 @@ from sb3_combrel.common.regression import LocalFit
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel
-from sb3_combrel.models.linear_rows import LinearArrays, LinearScratch, interpolate_prior, predict_own, update_rows
+from sb3_combrel.models.linear_rows import LinearArrays, LinearScratch, interpolate_prior, predict_own, update_rows, weigh
 from sb3_combrel.planning.mdp import FiniteMDP
 
 _update_rows, _predict_own = EntryPoint(update_rows), EntryPoint(predict_own)
-_interpolate_prior = EntryPoint(interpolate_prior)
+_interpolate_prior, _weigh = EntryPoint(interpolate_prior), EntryPoint(weigh)
 
 
 class LocalLinear(GridModel):
@@ -39,7 +39,7 @@ class LocalLinear(GridModel):
     """
 
     takes_prior = True
-    _fits = True
+    _known_by_less = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._n_fitted = mdp.grid.n_variables + 1
@@ -126,6 +126,11 @@ class LocalLinear(GridModel):
         model = self._plain_experience, self._plain_linear, self._plain_pairs, mdp.plain, self.grid.plain, self._plain_kernel
         scratch = mdp.plain_scratch, self._fit, self._scratch
         return int(_update_rows.call(*model, planned, pairs, transferred, *scratch))
+
+    def _weigh(self, pairs: np.ndarray) -> np.ndarray:
+        found, at = np.empty(len(pairs)), np.empty(self.grid.n_variables)
+        _weigh.call(self._plain_experience[0], self.grid.plain, self._plain_kernel, pairs, self._fit, at, found)
+        return found
 
     def _predict_own(self, state: np.ndarray) -> float:
         model, prior = (self._plain_experience, self._plain_linear), self._prior_at(state)

@@ -2,8 +2,17 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
 from sb3_combrel.planning.mdp import FiniteMDP
+
+
+@inlined
+def value_of_row(values, to, weight, length, reward, point, action):
+    """Reward of a pair that has a model, and the values of its successors."""
+    q = reward[point, action]
+    for k in range(length[point, action]):
+        q += weight[point, action, k] * values[to[point, action, k]]
+    return q
 
 
 @compiled
@@ -22,10 +31,7 @@ def sweep(values, mdp, upper, lowest, downwards):
         if n_optimistic[point] == 0:
             best = lowest
             for action in range(reward.shape[1]):
-                q = reward[point, action]
-                for k in range(length[point, action]):
-                    q += weight[point, action, k] * values[to[point, action, k]]
-                best = max(best, q)
+                best = max(best, value_of_row(values, to, weight, length, reward, point, action))
             best = min(best, upper[point])
         largest = max(largest, abs(best - values[point]))
         values[point] = best
@@ -43,10 +49,7 @@ def cautious_sweep(values, mdp, upper, lowest, downwards):
         best = lowest
         for action in range(reward.shape[1]):
             if modelled[action * n_points + point]:
-                q = reward[point, action]
-                for k in range(length[point, action]):
-                    q += weight[point, action, k] * values[to[point, action, k]]
-                best = max(best, q)
+                best = max(best, value_of_row(values, to, weight, length, reward, point, action))
         best = min(best, upper[point])
         largest = max(largest, abs(best - values[point]))
         values[point] = best
