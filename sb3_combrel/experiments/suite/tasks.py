@@ -1,4 +1,4 @@
-"""The tasks of the suite: environment, budget, measures, and what the learner is told of each."""
+"""The tasks of the suite: environment, budget, measures. The learner is told nothing of them, but for a target of transfer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import DiscretizeAction
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.experiments.suite.measures import (
@@ -22,6 +21,7 @@ from sb3_combrel.experiments.suite.measures import (
 )
 from sb3_combrel.experiments.tasks import cart_pole, icub_arm, mountain_car
 from sb3_combrel.experiments.tasks.point_robot import make_point_robot
+from sb3_combrel.experiments.tasks.swing_ups import make_car, make_dm_cart_pole, make_dm_pendulum, make_pendulum
 from sb3_combrel.runs.job import make_env
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.wrappers import AngleObservation
@@ -81,11 +81,6 @@ def check_budget(name: str, n_steps: int | None, n_episodes: int | None) -> None
     check_count("n_episodes", n_episodes, none_allowed=True)
 
 
-def make_pendulum() -> gym.Env:
-    """Make the pendulum with five torques: Gymnasium's ``DiscretizeAction`` takes the centres of five intervals."""
-    return AngleObservation(DiscretizeAction(make_env("Pendulum-v1", disable_env_checker=True), bins=5))
-
-
 def make_acrobot() -> gym.Env:
     """Make the acrobot with its two angles in place of their cosines and sines."""
     return AngleObservation(make_env("Acrobot-v1", disable_env_checker=True))
@@ -127,8 +122,8 @@ _TORSO_SETTLED = steps_until_always(27)
 _NEAR_50 = steps_until_median(50)
 # 475 is Gymnasium's own threshold.
 _FALLEN = 474.0
-# A pendulum that never swings up has about -1000 or less.
-_NOT_UP = -800.0
+# A pendulum that never swings up has about -1000 or less; no return of dm_control's tasks is a failure of its own.
+_NOT_UP, _NEVER = -800.0, -1.0
 
 _ALL = (
     Task("MountainCar4D", _car_4d, n_episodes=12, measures=(_TWELVE,), headline=_TWELVE.name, source=CAR_2D),
@@ -139,9 +134,9 @@ _ALL = (
     Task("MountainCar2D-noisy", _noisy_car_2d, n_episodes=50, measures=(_LAST_OF_50,), headline=_LAST_OF_50.name),
     Task("MountainCar-v0", _gym_car, n_steps=1500),
     Task("MountainCar-v0-noisy", _noisy_gym_car, n_steps=3000),
-    Task("Acrobot-v1", make_acrobot, ACROBOT, n_steps=6000),
-    Task("Acrobot-v1-15000", make_acrobot, ACROBOT, n_steps=15_000),
-    Task("CartPole-v1", _cart_pole, cart_pole.LEARNER, n_steps=3000, failure_return=_FALLEN),
+    Task("Acrobot-v1", make_acrobot, n_steps=6000),
+    Task("Acrobot-v1-15000", make_acrobot, n_steps=15_000),
+    Task("CartPole-v1", _cart_pole, n_steps=3000, failure_return=_FALLEN),
     Task(
         "CartPole-long",
         _long_cart_pole,
@@ -152,12 +147,14 @@ _ALL = (
         failure_return=_FALLEN,
         source=CART_POLE,
     ),
-    Task("Pendulum-v1", make_pendulum, {"gamma": 0.97}, n_steps=1000, failure_return=_NOT_UP),
+    Task("Pendulum-v1", make_pendulum, n_steps=1000, failure_return=_NOT_UP),
+    Task("MountainCarContinuous-v0", make_car, n_steps=3000),
+    Task("dm_control-pendulum", make_dm_pendulum, n_steps=3000, failure_return=_NEVER),
+    Task("dm_control-cart-pole", make_dm_cart_pole, n_steps=5000, failure_return=_NEVER),
     *(
         Task(
             f"ICubTorso{suffix}",
             partial(make_env, f"combrel/ICubTorsoStrike{noisy}-v0"),
-            icub_arm.LEARNER,
             n_steps=4000,
             measures=(_TORSO_SETTLED, _NEAR_50),
             headline=headline,
@@ -169,7 +166,6 @@ _ALL = (
         Task(
             f"ICubArm{suffix}",
             partial(make_env, f"combrel/ICubArmStrike{noisy}-v0"),
-            icub_arm.LEARNER,
             n_steps=10_000,
             measures=(_NEAR_50,),
             headline=_NEAR_50.name,
