@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,9 +12,6 @@ from gymnasium.wrappers import TimeLimit, TransformAction
 
 from sb3_combrel.runs.job import make_env
 from sb3_combrel.wrappers import AngleObservation
-
-if TYPE_CHECKING:
-    from dm_control.rl import control
 
 #: dm_control's episodes: so many decisions, each of so many of its control steps.
 N_DECISIONS, STEPS_A_DECISION = 500, 2
@@ -39,28 +36,29 @@ def make_car() -> gym.Env:
 
 
 class _DmControl(gym.Env):
-    """A task of dm_control's suite with a Box action of one number, seen by its positions, angle and speeds."""
+    """A task of dm_control's suite with a Box action of one number, seen by its positions, angle and speeds.
 
-    def __init__(self, domain: str, task: str, low: Sequence[float], high: Sequence[float]):
-        self._name = domain, task
-        self._made: control.Environment | None = None
+    :param high: upper bounds of these; the lower ones are as far
+    """
+
+    def __init__(self, domain: str, task: str, high: Sequence[float]):
+        # Only who makes one needs MuJoCo.
+        from dm_control import suite
+
+        self._environment = suite.load(domain, task, task_kwargs={"time_limit": np.inf})
         #: The angle is, between the positions and as many speeds.
-        self.periodic = [k == len(low) // 2 - 1 for k in range(len(low))]
-        self.observation_space = Box(np.array(low), np.array(high), dtype=np.float64)
+        self.periodic = [k == len(high) // 2 - 1 for k in range(len(high))]
+        self.observation_space = Box(-np.array(high), np.array(high), dtype=np.float64)
         self.action_space = Box(-1.0, 1.0, (1,))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        if self._made is None or seed is not None:
-            from dm_control import suite
-
-            drawn = int(self.np_random.integers(2**31))
-            self._made = suite.load(*self._name, task_kwargs={"random": drawn, "time_limit": np.inf})
-        return self._state(self._made.reset().observation), {}
+        if seed is not None:
+            self._environment.task.random.seed(int(self.np_random.integers(2**32)))
+        return self._state(self._environment.reset().observation), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        assert self._made is not None
-        steps = [self._made.step(action) for _ in range(STEPS_A_DECISION)]
+        steps = [self._environment.step(action) for _ in range(STEPS_A_DECISION)]
         reward = float(np.mean([step.reward for step in steps]))
         return self._state(steps[-1].observation), reward, False, False, {}
 
@@ -71,17 +69,13 @@ class _DmControl(gym.Env):
         return np.array([*positions, np.arctan2(sine, cosine), *observation["velocity"]])
 
 
-def _dm_control(name: tuple[str, str], high: Sequence[float], forces: Sequence[float]) -> gym.Env:
-    """Make a task of dm_control's suite with some forces; ``high``: upper bounds of its state, the lower ones are as far."""
-    env = _DmControl(*name, [-most for most in high], high)
-    return with_forces(TimeLimit(env, N_DECISIONS), forces)
-
-
 def make_dm_pendulum() -> gym.Env:
     """Make dm_control's pendulum, to be swung up, with five torques; its angle is 0 when it stands."""
-    return _dm_control(("pendulum", "swingup"), (np.pi, FAST), np.linspace(-1.0, 1.0, 5).tolist())
+    env = _DmControl("pendulum", "swingup", (np.pi, FAST))
+    return with_forces(TimeLimit(env, N_DECISIONS), np.linspace(-1.0, 1.0, 5).tolist())
 
 
 def make_dm_cart_pole() -> gym.Env:
     """Make dm_control's cart with a pole, to be balanced, with three forces."""
-    return _dm_control(("cartpole", "balance"), (FAR, np.pi, FAST, FAST), (-1.0, 0.0, 1.0))
+    env = _DmControl("cartpole", "balance", (FAR, np.pi, FAST, FAST))
+    return with_forces(TimeLimit(env, N_DECISIONS), (-1.0, 0.0, 1.0))
