@@ -204,9 +204,8 @@ def test_selections_are_those_of_the_transfer_method(run):
     uses, selections = result.more["uses"], result.more["selections"]
     counts = np.bincount([int(row[0]) for row in selections], minlength=len(uses))
     assert counts.tolist() == [use[-1] for use in uses] == sorted(counts, reverse=True)
-    assert sum(counts) == sum(transfer.uses().values())
     # The random source of the mountain car reaches little beyond what the target knows by then.
-    assert sum(counts) > 0 or job.group == "mountain_car"
+    assert sum(counts) == sum(transfer.uses().values()) > (0 if job.group == "mountain_car" else 5)
     numbers = list(uses_of(transfer))
     assert [numbers[int(row[0])] for row in selections] == [number for number, _ in rows]
     np.testing.assert_allclose([row[1:] for row in selections], [state for _, state in rows], atol=1e-5)
