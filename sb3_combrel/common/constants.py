@@ -6,18 +6,14 @@ Tolerances of arithmetic stand where they are used.
 
 # The kernel of a fit is so broad that the farthest of its instances weighs this: MountainCar-v0, all local linear rows.
 LAST_WEIGHT = 0.05
-# It is no narrower than this fraction of ``model_breadth``, where many instances lie at the very same state: torso.
-NARROWEST = 0.02
 # On the slopes of a fit, in weights of instances a breadth away: MountainCar4D, Acrobot.
 RIDGE = 0.001
 # A pair of the grid is fitted anew when new instances may have changed its prediction by this part of the mean effect of its
-# action, when half of its list is new, and at an episode's end when one in so many of it is: speed, MountainCar4D, arm.
-MAX_SURPRISE, RENEWED_PART = 0.4, 4
+# action, or when half of its list is new: speed, MountainCar4D, arm.
+MAX_SURPRISE = 0.4
 # A difference is measured by the mean effect of the action, but by no less than this part of a cell; and an instance changes a
 # fit by its weight over this part of a full list, which is what the kernel's weights over one add up to: the same.
 LEAST_SIZE, SHARE_OF_LIST = 0.01, 0.3
-# A prior counts as so much weight of instances that agree with it, for effects, and for ends and rewards: transfer.
-PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
 # An action is held until its cell of the grid is left, but no more steps than this: Acrobot, CartPole.
 MAX_MODEL_STEPS = 50
 # Full sweeps over the grid after each step, and at an episode's end: MountainCar4D, speed.
@@ -27,9 +23,9 @@ LONGEST_PLAN = 10_000
 # The discount where one is needed and none is given, as in Stable-Baselines3; and what is unknown is worth as long as all
 # rewards were 0, any value above that: CartPole, MountainCarContinuous, dm_control's pendulum.
 DISCOUNT, WORTH_TRYING = 0.99, 1.0
-# Scales that are found, in parts of the range: what an observation may lie beyond by until the episode ends, and after; a
-# range that is more times as wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
-FAR_BEYOND, BEYOND, TOO_WIDE = 0.1, 0.02, 2.0
+# Scales that are found: what an observation may lie beyond them by, in parts of the range; and a range that is more times as
+# wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
+BEYOND, TOO_WIDE = 0.05, 2.0
 # Grid points are known with this fraction of the weight that exact states need, once an episode has ended or rewards have
 # differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how
 # states change is not to know what is there: dm_control's pendulum, point robot.

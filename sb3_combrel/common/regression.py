@@ -11,10 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import inlined, inner
-from sb3_combrel.common.constants import LAST_WEIGHT, NARROWEST, RIDGE
+from sb3_combrel.common.constants import LAST_WEIGHT, RIDGE
 from sb3_combrel.common.periodic import difference
 
 PER_BREADTH = -np.log(LAST_WEIGHT)
+# A kernel is no narrower than this part of the breadth, for the arithmetic, where all instances lie at the very same state.
+NARROWEST = 1e-6
 
 
 class Kernel(NamedTuple):
@@ -32,7 +34,8 @@ class LocalFit(NamedTuple):
     item: np.ndarray  # int32, (n_neighbors,): instances, nearest first
     distance: np.ndarray  # float64, the same: squared distances
     factor: np.ndarray  # float64, (d + 1, d + 1): Cholesky's factor of the regression's matrix
-    # The mean of each number in row 0, its slopes per unit below; in the last column the leverage in row 0.
+    # The mean of each number in row 0, its slopes per unit below; in the last column the leverage in row 0, and by how much an
+    # instance at the state itself that is larger by 1 moves the slopes.
     solution: np.ndarray  # float64, (d + 1, d + 2)
     low: np.ndarray  # float64, (d + 1,): the least of each number among the instances
     high: np.ndarray  # float64, the same: the largest
@@ -115,8 +118,30 @@ def fit_around(at, action, length, instances, target, kernel, fit):
     solution[0, d + 1] = 1.0
     solve(factor, solution)
     for p in range(1, d + 1):
-        for v in range(d + 1):
+        for v in range(d + 2):
             solution[p, v] *= per_unit
+
+
+@inlined
+def join_prior(weights, kernel, length, fit):
+    """Let a fit to residuals know that a prior says of each effect that they are 0, as so many instances at its very state.
+
+    A further instance of weight p at the state itself, whose number is 0: by the Sherman-Morrison formula all coefficients
+    lose p y / (1 + p h) times what such an instance would move them by, where y is the mean so far and h its leverage.
+
+    :param weights: float64, shape (n_variables,)
+    """
+    d = len(weights)
+    # A fit's weights are seen from its nearest instance.
+    nearest = np.exp(fit.distance[0] * kernel_scale(fit, length, kernel))
+    for v in range(d):
+        p = weights[v] / nearest
+        if p > 0.0:
+            moved = p * fit.solution[0, v] / (1.0 + p * fit.solution[0, d + 1])
+            for j in range(d + 1):
+                fit.solution[j, v] -= moved * fit.solution[j, d + 1]
+            fit.low[v] = min(fit.low[v], 0.0)
+            fit.high[v] = max(fit.high[v], 0.0)
 
 
 @inlined

@@ -214,11 +214,18 @@ class FittedRMaxAgent:
         with self._lock:
             self.rewards.note(reward, terminated)
             self._widen(reward)
-            self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
             if self.transfer is not None:
                 self.transfer.environment = environment
-                self.transfer.observe(state, action, reward, next_state, terminated)
+            self._take_in(state, action, reward, next_state, terminated)
             self._plan(SWEEPS_A_STEP)
+
+    def _take_in(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        """Give a transition to the model and to the transfer method."""
+        if self.transfer is not None and self.transfer.use == "prior":
+            self.transfer.note_prediction(self.model.predict_alone(state, action))
+        self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
+        if self.transfer is not None:
+            self.transfer.observe(state, action, reward, next_state, terminated)
 
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """Plan on while no action is due.
@@ -247,10 +254,8 @@ class FittedRMaxAgent:
             self._widen(min(0.0, lowest) / LONGEST_PLAN)
             for state, action, reward, next_state, terminated in transitions:
                 state, next_state = (scaling.to_unit(before.to_raw(each)) for each in (state, next_state))
-                self.model.add(state, action, reward, next_state, terminated)
-                if self.transfer is not None:
-                    self.transfer.observe(state, action, reward, next_state, terminated)
-            self._outdated.append(self.model.outdated())
+                self._take_in(state, action, reward, next_state, terminated)
+            self._outdated = [self.model.outdated()]
             self._plan(SWEEPS_AT_EPISODE_END)
 
     def prepare(self) -> None:

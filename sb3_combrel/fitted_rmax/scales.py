@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_combrel.common.constants import BEYOND, FAR_BEYOND, TOO_WIDE
+from sb3_combrel.common.constants import BEYOND, TOO_WIDE
 from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling
 
 
@@ -16,8 +16,8 @@ class FoundScales:
 
     Those that the user gives stay as they are. Otherwise it begins with the observation space's, where these are finite; a
     variable without bounds, or one that uses less than half of them by the end of an episode, is scaled by the range of its
-    observations, and again when one lies beyond: at once if far beyond, otherwise when the episode ends. There is no margin:
-    nobody has been there, and it would draw the agent. Periodic variables keep their bounds.
+    observations, and again when one lies beyond. There is no margin: nobody has been there, and it would draw the agent.
+    Periodic variables keep their bounds.
 
     :param space: observation space
     :param bounds: of the user; None: to be found
@@ -48,7 +48,7 @@ class FoundScales:
         least, most = self.observed
         low, high = self.scaling.low, self.scaling.high
         used, given = most - least, high - low
-        tolerated = (BEYOND if episode_ended else FAR_BEYOND) * given
+        tolerated = BEYOND * given
         beyond = (least < low - tolerated) | (most > high + tolerated)
         # A variable that never changes has no scale.
         too_wide = (given > TOO_WIDE * used) & (used > 0.0) if episode_ended else np.zeros(len(low), dtype=np.bool_)

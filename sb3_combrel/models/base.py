@@ -161,6 +161,10 @@ class Model(ABC):
         arrays = map(np.ascontiguousarray, (predictions.probability, predictions.effect))
         return Prediction(modelled, weight, predictions.reward, length, *arrays), given
 
+    def predict_alone(self, state: np.ndarray, action: int) -> np.ndarray:
+        """Predict the effect of an action without a prior, shape (n_variables,); NaN where nothing is predicted."""
+        return np.full(self.grid.n_variables, np.nan)
+
     def renew_prior(self) -> np.ndarray:
         """Ask the transfer method for its prior again if that may have changed; the pairs whose rows are to be updated."""
         return NO_PAIRS

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
-from sb3_combrel.common.constants import LEAST_SIZE, ON_GRID, RENEWED_PART
+from sb3_combrel.common.constants import LEAST_SIZE, ON_GRID
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.regression import Kernel
@@ -230,10 +230,8 @@ class GridModel(Model):
         self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
-        """The pairs that have a model and many new instances; those with transferred instances that have any."""
-        pairs = self.pairs
-        many = pairs.known & (pairs.n_new * RENEWED_PART >= pairs.length)
-        return np.flatnonzero((pairs.n_new > 0) & (many if self._giver is None else many | ~pairs.known))
+        """The pairs with transferred instances that have new ones of their own."""
+        return NO_PAIRS if self._giver is None else np.flatnonzero((self.pairs.n_new > 0) & ~self.known)
 
     def outdated(self) -> np.ndarray:
         return np.flatnonzero(self.pairs.n_new)

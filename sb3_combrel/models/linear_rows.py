@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, part
-from sb3_combrel.common.constants import MAX_MODEL_STEPS, PRIOR_OUTCOME_WEIGHT, PRIOR_WEIGHT
+from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances, squared_distance
-from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
+from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, join_prior, known_weight, number_at
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
@@ -25,9 +25,7 @@ class LinearArrays(NamedTuple):
     """What the local linear model has besides instances and pairs."""
 
     target: np.ndarray  # float64, (n_actions, capacity, n_variables): effect of each instance less the prior's
-    # Effect, reward and probability of termination that the prior predicts of each pair; 0 without one.
-    prior: np.ndarray  # float64, (n_pairs, n_variables + 2)
-    claimed: np.ndarray  # bool, (n_pairs,): the prior suffices for a model
+    prior: np.ndarray  # float64, (n_pairs, 2 * n_variables): effects that a prior predicts, and their weights; 0 without one
     near: np.ndarray  # int32, (n_actions, n_neighbors): instances near the last exact state
     n_near: np.ndarray  # int64, (n_actions,): how many these are
 
@@ -60,33 +58,15 @@ def distances_around(at, action, length, experience, fit):
 
 @inlined
 def outcome_of(to, moved, around, experience, kernel, end):
-    """Write to ``end`` what arriving at ``to`` means; the squared distance of some arrival.
+    """Write to ``end`` what arriving at ``to`` means.
 
     :param moved: how far it is from the state around which ``around`` are the :func:`distances_around`
     """
     _, arrivals, ends = experience
     of_end, near = around
-    far = (moved + near) ** 2
     end[0], end[1] = 0.0, 0.0
     if not far_from_ends(moved, of_end, near, kernel.outcome_breadth):
-        end_at(to, far, kernel.outcome_breadth, arrivals, ends, end)
-    return far
-
-
-@inlined
-def with_prior(own, prior, near, kernel):
-    """A number of an outcome from own arrivals, the nearest known being so far away, and from a prior that is claimed."""
-    weight = np.exp(-near / kernel.outcome_breadth)
-    return (weight * own + PRIOR_OUTCOME_WEIGHT * prior) / (weight + PRIOR_OUTCOME_WEIGHT)
-
-
-@inlined
-def share_of_fit(length, claimed, fit):
-    """The part that a fit has in what is predicted, besides a prior that claims to know."""
-    if length == 0:
-        return 0.0
-    total = fit.factor[0, 0] * fit.factor[0, 0]
-    return total / (total + PRIOR_WEIGHT) if claimed else 1.0
+        end_at(to, (moved + near) ** 2, kernel.outcome_breadth, arrivals, ends, end)
 
 
 @compiled
@@ -94,14 +74,12 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
     """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
 
     :param experience: (instances, arrivals, ends); plain tuples all of them
-    :param prior: what it predicts at ``state``, float64, shape (n_actions, n_variables + 2); and whether that suffices for a
-        model, bool, shape (n_actions,)
+    :param prior: what it predicts at ``state``, float64, shape (n_actions, 2 * n_variables), see ``LinearArrays``
     """
     instances = Instances(*experience[0])
     experience = instances, Instances(*experience[1]), Ends(*experience[2])
     linear, kernel, fit = LinearArrays(*linear), Kernel(*kernel), LocalFit(*fit)
     scratch, prediction = LinearScratch(*scratch), Prediction(*prediction)
-    predicted, claimed = prior
     d = len(state)
     least = np.inf
     for action in range(len(linear.n_near)):
@@ -114,31 +92,40 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
         weight = known_weight(fit, length, kernel)
         if length > 0:
             fit_around(state, action, length, instances, linear.target, kernel, fit)
-        share = share_of_fit(length, claimed[action], fit)
+            join_prior(prior[action, d:], kernel, length, fit)
         scratch.away[:] = 0.0
         moved = 0.0
         for v in range(d):
-            effect = predicted[action, v]
+            effect = prior[action, v]
             if length > 0:
-                effect += share * number_at(fit, v, scratch.away)
+                effect += number_at(fit, v, scratch.away)
             prediction.effect[action, 0, v] = effect
             scratch.to[v] = state[v] + effect
             moved += effect * effect
-        reward = number_at(fit, d, scratch.away) if length > 0 else predicted[action, d]
+        reward = number_at(fit, d, scratch.away) if length > 0 else 0.0
         around = distances_around(state, action, length, experience, fit)
-        near = outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
+        outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end = scratch.end[0]
-        reward = (1.0 - end) * reward + end * scratch.end[1]
-        if claimed[action] and weight < threshold:
-            reward = with_prior(reward, predicted[action, d], near, kernel)
-            end = with_prior(end, predicted[action, d + 1], near, kernel)
-        prediction.reward[action] = reward
-        prediction.length[action] = 1 if end < 1.0 and (length > 0 or claimed[action]) else 0
+        prediction.reward[action] = (1.0 - end) * reward + end * scratch.end[1]
+        prediction.length[action] = 1 if end < 1.0 and length > 0 else 0
         prediction.probability[action, 0] = 1.0 - end
         prediction.weight[action] = weight
-        prediction.modelled[action] = weight >= threshold or claimed[action]
+        prediction.modelled[action] = weight >= threshold
         least = min(least, weight)
     return least
+
+
+@compiled
+def predict_alone(instances, kernel, state, action, fit, scratch, effect):
+    """Write to ``effect`` what the instances alone predict of an action, NaN without any near the state; plain tuples."""
+    instances, kernel, fit, scratch = Instances(*instances), Kernel(*kernel), LocalFit(*fit), LinearScratch(*scratch)
+    length = find_nearest(state, action, 0, instances, kernel, fit)
+    effect[:] = np.nan
+    scratch.away[:] = 0.0
+    if length > 0:
+        fit_around(state, action, length, instances, instances.effect, kernel, fit)
+        for v in range(len(state)):
+            effect[v] = number_at(fit, v, scratch.away)
 
 
 @compiled
@@ -164,24 +151,20 @@ def prior_change(linear, pair, k, grid, at, away):
             side = -side
         steps = ((at[j] + side) % grid.shape[j]) - at[j]
         beside = pair + steps * grid.strides[j]
-        if linear.claimed[beside] == linear.claimed[pair]:
-            change += (linear.prior[beside, k] - linear.prior[pair, k]) * side * grid.cells[j] * away[j]
+        change += (linear.prior[beside, k] - linear.prior[pair, k]) * side * grid.cells[j] * away[j]
     return change
 
 
 @part
-def take_step(pair, length, linear, fit, grid, at, has_prior, scratch):
+def take_step(pair, linear, fit, grid, at, has_prior, scratch):
     """Write the effect of the next step to ``scratch.step``, within the grid; the part of it until the cell is left."""
-    share = share_of_fit(length, linear.claimed[pair], fit)
     away, step = scratch.away, scratch.step
     inside = 1.0
     moved = False
     for k in range(len(at)):
-        effect = linear.prior[pair, k]
-        if length > 0:
-            effect += share * number_at(fit, k, away)
+        effect = number_at(fit, k, away)
         if has_prior:
-            effect += prior_change(linear, pair, k, grid, at, away)
+            effect += linear.prior[pair, k] + prior_change(linear, pair, k, grid, at, away)
         cells = away[k] * grid.cells[k]
         after = cells + effect * grid.cells[k]
         if not grid.periodic[k]:
@@ -195,7 +178,7 @@ def take_step(pair, length, linear, fit, grid, at, has_prior, scratch):
 
 
 @part
-def follow(pair, action, length, known, linear, experience, kernel, fit, grid, at, planned, scratch):
+def follow(pair, action, length, linear, experience, kernel, fit, grid, at, planned, scratch):
     """Follow a pair's model, the action held, until a variable has changed by a cell of the grid, or the episode ends.
 
     :param at: grid coordinates of the point; ``planned``: (gamma, whether there is a prior, most steps)
@@ -206,20 +189,16 @@ def follow(pair, action, length, known, linear, experience, kernel, fit, grid, a
     away = scratch.away
     away[:] = 0.0
     total, goes_on, discount = 0.0, 1.0, 1.0
-    by_prior = linear.claimed[pair] and not known
     around = distances_around(scratch.at, action, length, experience, fit)
     for n in range(max_steps):
-        inside = take_step(pair, length, linear, fit, grid, at, has_prior, scratch)
-        reward = number_at(fit, d, away) if length > 0 else linear.prior[pair, d]
+        inside = take_step(pair, linear, fit, grid, at, has_prior, scratch)
+        reward = number_at(fit, d, away)
         moved = 0.0
         for k in range(d):
             moved += (away[k] + scratch.step[k]) ** 2
-        near = outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
+        outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end, pays = scratch.end[0], scratch.end[1]
         reward = (1.0 - end) * reward + end * pays
-        if by_prior:
-            reward = with_prior(reward, linear.prior[pair, d], near, kernel)
-            end = with_prior(end, linear.prior[pair, d + 1], near, kernel)
         # The first step is never cut short, nor one that may end the episode.
         taken = 1.0 if n == 0 or end > 0.0 or inside == 0.0 else inside
         total += discount * goes_on * taken * reward
@@ -280,50 +259,48 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         weight = known_weight(fit, length, kernel)
         known = note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit)
         joined = not known and transferred.length[done] > 0
-        modelled = known or joined or linear.claimed[pair]
-        if modelled:
+        if known or joined:
+            total = total_weight(weight, transferred, done) if joined else weight
+            reward, discount, n_touched = 0.0, gamma, np.int64(0)
             if length > 0:
                 fit_around(scratch.at, action, length, instances, linear.target, kernel, fit)
+                if has_prior:
+                    join_prior(linear.prior[pair, len(scratch.at) :], kernel, length, fit)
                 for p in range(pairs.fit.shape[1]):
                     for v in range(pairs.fit.shape[2]):
                         pairs.fit[pair, p, v] = fit.solution[p, v]
-            own = 1.0
+                how = gamma, has_prior, 1 if joined else MAX_MODEL_STEPS
+                reward, goes_on, discount = follow(
+                    pair, action, length, linear, experience, kernel, fit, grid, row_scratch.at, how, scratch
+                )
+                if goes_on < 1.0:
+                    # Near an end every arrival matters.
+                    pairs.surprise[pair] = np.inf
+                reward *= weight / total
+                if goes_on > 0.0:
+                    n_touched = add_successor(goes_on * (weight / total), scratch.away, row_scratch, grid, n_touched)
             if joined:
-                own = weight / total_weight(weight, transferred, done)
-            how = gamma, has_prior, 1 if joined else MAX_MODEL_STEPS
-            reward, goes_on, discount = follow(
-                pair, action, length, known, linear, experience, kernel, fit, grid, row_scratch.at, how, scratch
-            )
-            if goes_on < 1.0:
-                # Near an end every arrival matters.
-                pairs.surprise[pair] = np.inf
-            n_touched = np.int64(0)
-            if own * goes_on > 0.0:
-                n_touched = add_successor(own * goes_on, scratch.away, row_scratch, grid, n_touched)
-            if joined:
-                total = total_weight(weight, transferred, done)
-                reward, n_touched = add_to_row(own * reward, n_touched, transferred, done, total, row_scratch, grid)
+                reward, n_touched = add_to_row(reward, n_touched, transferred, done, total, row_scratch, grid)
             if not finish_row(mdp, discount, pair, point, reward, n_touched, row_scratch):
                 return done
-        set_modelled(mdp, pair, modelled)
+        set_modelled(mdp, pair, known or joined)
         done += 1
     return done
 
 
 @compiled
 def interpolate_prior(prior, grid, states, actions, corners, found):
-    """Write the effects that a prior predicts of states and actions, multilinear between the grid points, to ``found``.
+    """Write what a prior says of states and actions, multilinear between the grid points, to ``found``.
 
     :param prior: as in ``LinearArrays``; ``corners``: work space: position, corner_index, corner_weight (see ``corners_of``)
     """
     grid = GridArrays(*grid)
     position, corner, weight = corners
-    d = len(position)
     n_points = grid.shape[0] * grid.strides[0]
     for i in range(len(actions)):
         grid_coordinates(states[i], grid, position)
         found[i, :] = 0.0
         first_pair = actions[i] * n_points
         for c in range(corners_of(position, grid, corner, weight)):
-            for k in range(d):
+            for k in range(found.shape[1]):
                 found[i, k] += weight[c] * prior[first_pair + corner[c], k]

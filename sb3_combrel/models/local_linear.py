@@ -8,14 +8,21 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.regression import LocalFit
-from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel
-from sb3_combrel.models.linear_rows import LinearArrays, LinearScratch, interpolate_prior, predict_own, update_rows, weigh
+from sb3_combrel.models.linear_rows import (
+    LinearArrays,
+    LinearScratch,
+    interpolate_prior,
+    predict_alone,
+    predict_own,
+    update_rows,
+    weigh,
+)
 from sb3_combrel.planning.mdp import FiniteMDP
 
 _update_rows, _predict_own = EntryPoint(update_rows), EntryPoint(predict_own)
-_interpolate_prior, _weigh = EntryPoint(interpolate_prior), EntryPoint(weigh)
+_interpolate_prior, _weigh, _predict_alone = EntryPoint(interpolate_prior), EntryPoint(weigh), EntryPoint(predict_alone)
 
 
 class LocalLinear(GridModel):
@@ -31,9 +38,9 @@ class LocalLinear(GridModel):
     A row of the finite MDP leads from a grid point to where its action, held until the cell is left, leads by the pair's
     fit: values interpolated once a cell are nearer to the truth than those interpolated once a step (Munos & Moore 2002).
 
-    With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and pairs
-    that it claims to know are modelled before their own instances suffice. The prior's effects are those at the grid points,
-    interpolated between them; its rewards and ends count until the own instances suffice.
+    With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and the prior
+    counts as an instance at the very state that agrees with it, of the weight that it has there. Its effects and weights are
+    those at the grid points, interpolated between them. What is known, rewards and ends are by the own instances alone.
 
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
@@ -49,8 +56,7 @@ class LocalLinear(GridModel):
         self._set_linear(
             LinearArrays(
                 target=self.instances.effect,
-                prior=np.zeros((n_pairs, d + 2)),
-                claimed=np.zeros(n_pairs, dtype=np.bool_),
+                prior=np.zeros((n_pairs, 2 * d)),
                 near=np.zeros((self.n_actions, n_near), dtype=np.int32),
                 n_near=np.zeros(self.n_actions, dtype=np.int64),
             )
@@ -59,7 +65,7 @@ class LocalLinear(GridModel):
         self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2))))
         self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
         self._prior_version = -1
-        self._no_prior = np.zeros((self.n_actions, d + 2)), np.zeros(self.n_actions, dtype=np.bool_)
+        self._no_prior = np.zeros((self.n_actions, 2 * d))
         self._all_actions = np.arange(self.n_actions)
 
     def _set_linear(self, linear: LinearArrays) -> None:
@@ -67,8 +73,8 @@ class LocalLinear(GridModel):
 
     def _numbers_of(self, action: int, slot: int) -> np.ndarray:
         if self._prior is not None:
-            explained = self._prior_effects(self.instances.state[action, slot][None], np.array([action]))[0]
-            self.linear.target[action, slot] = self.instances.effect[action, slot] - explained
+            found = self._interpolated_prior(self.instances.state[action, slot][None], np.array([action]))[0]
+            self.linear.target[action, slot] = self.instances.effect[action, slot] - found[: self.grid.n_variables]
         return np.append(self.linear.target[action, slot], self.instances.reward[action, slot])
 
     def _renew_arrivals(self) -> None:
@@ -83,27 +89,21 @@ class LocalLinear(GridModel):
         if self._prior is not None:
             for action, size in enumerate(self.instances.size.tolist()):
                 states = self.instances.state[action, :size]
-                target[action, :size] -= self._prior_effects(states, np.full(size, action))
+                target[action, :size] -= self._interpolated_prior(states, np.full(size, action))[:, : self.grid.n_variables]
         self._set_linear(self.linear._replace(target=target))
 
-    def _prior_at(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the prior predicts of all actions at a state, as in ``LinearArrays``, and whether it claims to know."""
+    def _prior_at(self, state: np.ndarray) -> np.ndarray:
+        """What the prior says of all actions at a state, as in ``LinearArrays``."""
         if self._prior is None:
             return self._no_prior
-        states = np.repeat(state[None], self.n_actions, axis=0)
-        given = self._prior.prior(states, self._all_actions)
-        effects = self._prior_effects(states, self._all_actions)
-        return np.column_stack([effects, given.reward, given.end]), self._claims(given)
+        return self._interpolated_prior(np.repeat(state[None], self.n_actions, axis=0), self._all_actions)
 
-    def _claims(self, given: PriorPredictions) -> np.ndarray:
-        return given.weight >= self.settings.exploration_threshold
+    def _interpolated_prior(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """The prior's effects and weights, multilinear between the grid points: shape (n, 2 * n_variables).
 
-    def _prior_effects(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """The prior's effects, multilinear between the grid points: shape (n, n_variables).
-
-        Finer ones would be confirmed by instances at a wall, but not at the grid points beside, which lead through the wall.
+        Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through it.
         """
-        found = np.empty((len(actions), self.grid.n_variables))
+        found = np.empty((len(actions), 2 * self.grid.n_variables))
         _interpolate_prior.call(self.linear.prior, self.grid.plain, states, actions, self._corners, found)
         return found
 
@@ -115,10 +115,9 @@ class LocalLinear(GridModel):
         for action in range(self.n_actions):
             pairs = slice(action * n_points, (action + 1) * n_points)
             given = self._prior.prior(points, np.full(n_points, action))
-            self.linear.prior[pairs] = np.column_stack([given.effect, given.reward, given.end])
-            self.linear.claimed[pairs] = self._claims(given)
+            self.linear.prior[pairs] = np.column_stack(given)
         self._renew_targets()
-        return np.arange(len(self.known))
+        return np.flatnonzero(self.known)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, has_prior = self.mdp, self._prior is not None
@@ -130,6 +129,12 @@ class LocalLinear(GridModel):
     def _weigh(self, pairs: np.ndarray) -> np.ndarray:
         found, at = np.empty(len(pairs)), np.empty(self.grid.n_variables)
         _weigh.call(self._plain_experience[0], self.grid.plain, self._plain_kernel, pairs, self._fit, at, found)
+        return found
+
+    def predict_alone(self, state: np.ndarray, action: int) -> np.ndarray:
+        """Predict the effect of an action without a prior, shape (n_variables,); NaN without any instance near the state."""
+        found = np.empty(self.grid.n_variables)
+        _predict_alone.call(self._plain_experience[0], self._plain_kernel, state, action, self._fit, self._scratch, found)
         return found
 
     def _predict_own(self, state: np.ndarray) -> float:

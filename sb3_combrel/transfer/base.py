@@ -23,7 +23,7 @@ FOR_THE_ALGORITHM = frozenset(
     (
         *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
         *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "makes_choices"),
-        *("informs_model", "value_bound"),
+        *("informs_model", "value_bound", "note_prediction"),
     )
 )
 
@@ -127,6 +127,14 @@ class Transfer(ABC):
 
         :param state: unit coordinates, shape (n_variables,), as ``next_state``; ``action``: from 0 on; ``reward``: raw
         :param terminated: the episode ended in a terminal state; a time limit is none
+        """
+
+    def note_prediction(self, effect: np.ndarray) -> None:  # noqa: B027 - a method may well ignore it
+        """Take in what the target's own instances alone predict of the transition that :meth:`observe` takes in next.
+
+        Called only if :attr:`use` is "prior": whether a source helps to predict is measured by it.
+
+        :param effect: next state minus state, unit coordinates, shape (n_variables,); NaN where nothing is predicted
         """
 
     def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it

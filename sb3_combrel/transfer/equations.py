@@ -325,17 +325,6 @@ def transferred_instances(
     return numbers, weights[numbers]
 
 
-def running_scales(effects: Floats) -> Floats:
-    """Compute what squared errors are compared with when the source's own model is judged (``use="prior"``; no equation).
-
-    Of each variable the square of the mean size of its effects so far. A mean of squares would be that of a few large ones.
-
-    :param effects: of the target's transitions, in the order in which they came, shape (t, d); so is what is returned
-    """
-    so_far = np.cumsum(np.abs(effects), axis=0) / np.arange(1, len(effects) + 1)[:, None]
-    return so_far**2
-
-
 def prediction_compliances(effects: Floats, predicted: Floats, scales: Floats) -> Floats:
     """Compute the compliance of target transitions with what a source's model predicts of them through one mapping.
 
@@ -348,17 +337,43 @@ def prediction_compliances(effects: Floats, predicted: Floats, scales: Floats) -
     return np.exp(-((effects - predicted) ** 2 / scales).sum(axis=1))
 
 
-def division_score(of_parts: Sequence[Floats], actions: Ints, n_in_copies: int, min_gain: float) -> float:
-    """Score a division of the target's variables into copies of the source and variables that stay, by its compliance.
+def running_scales(effects: Floats, smallest: float) -> Floats:
+    """Compute what errors are measured by when the source's own model is judged (``use="prior"``; no equation).
 
-    The logarithm of the product of all parts' mean compliances, that of each target action counted as often as there are
-    transitions with it.
+    Of each variable the mean size of its effects so far. A root mean square would be that of a few large ones.
 
-    :param of_parts: of each copy, with its best source action for each target action, and of each variable that stays
-        (predicted not to change), :func:`prediction_compliances`, shape (t,)
-    :param actions: target action of each transition, shape (t,)
-    :param n_in_copies: number of variables that are in a copy
-    :param min_gain: by what factor a copy must comply better, for each of its variables, than that they stay
+    :param effects: of the target's transitions, in the order in which they came, shape (t, d); so is what is returned
+    :param smallest: the least scale
     """
-    parts = [part[actions == action] for part in of_parts for action in np.unique(actions)]
-    return float(sum(len(part) * np.log(part.mean()) for part in parts) - n_in_copies * len(actions) * np.log(min_gain))
+    so_far = np.cumsum(np.abs(effects), axis=0) / np.arange(1, len(effects) + 1)[:, None]
+    return np.maximum(so_far, smallest)
+
+
+def evidence(effects: Floats, predicted: Floats, scales: Floats, weights: Floats) -> Floats:
+    """Compute the evidence, in nats, that a prediction of target transitions is better than "nothing changes".
+
+    The logarithm of the ratio of two densities, Student's t with one degree of freedom, of errors in parts of their scale: one
+    that nothing foresaw, as at a wall, does not decide. A transition counts by w / (1 + w), where w is the weight of the
+    source's data there. What compliance is in the form of a kernel, Eqs. 2 to 5, with one prediction in place of a weighted
+    mean over instances; it factorises over variables.
+
+    :param effects: s'_i - s_i, shape (t, d); ``predicted`` and ``scales``, see :func:`running_scales`: the same shape
+    :param weights: shape (t,)
+    :return: of each transition and variable, shape (t, d)
+    """
+    ratio = (effects**2 + scales**2) / ((effects - predicted) ** 2 + scales**2)
+    return (weights / (1.0 + weights))[:, None] * np.log(ratio)
+
+
+def division_evidence(of_copies: Sequence[Floats], actions: Ints, n_source_actions: Sequence[int], n_copies: int) -> float:
+    """Compute the evidence for a division of the target's variables into copies of the source, against "all of them stay".
+
+    All copies are as probable beforehand, and so are all source actions for each target action that was taken: a further copy
+    must be worth what it adds to choose from.
+
+    :param of_copies: of each copy, with its best source action for each target action, :func:`evidence`, shape (t, d)
+    :param actions: target action of each transition, shape (t,)
+    :param n_source_actions: of each copy; ``n_copies``: among so many they were chosen
+    """
+    prior = sum(np.log(n_copies) + len(np.unique(actions)) * np.log(n) for n in n_source_actions)
+    return float(sum(each.sum() for each in of_copies) - prior)

@@ -176,15 +176,18 @@ class RegionErrors:
         order = sorted(map(tuple, np.argwhere(worse).tolist()), key=lambda cell: -excess[cell])
         return tuple(self._contradiction(*cell) for cell in order[:MAX_CONTRADICTIONS])
 
-    def report_fields(self, evidence: OutcomeEvidence) -> dict[str, Any]:
-        """Return the fields of a report that say how the target's transitions compare with what was predicted of them."""
+    def report_fields(self, evidence: OutcomeEvidence | None = None) -> dict[str, Any]:
+        """Return the fields of a report that say how the target's transitions compare with what was predicted of them.
+
+        :param evidence: for the ends and rewards of transferred instances; None for a prior, which has none
+        """
         totals = self.of_actions.sum(axis=0)
         found: dict[str, Any] = {"n_compared": int(totals[_N]), "n_worse": int(totals[_WORSE])}
-        outcomes = {
-            "ends": (evidence.confirmed, evidence.contradicted),
-            "rewards": (evidence.rewards_right, evidence.rewards_wrong),
-        }
-        return {**found, "contradictions": self.contradictions(), **outcomes}
+        found["contradictions"] = self.contradictions()
+        if evidence is not None:
+            found["ends"] = evidence.confirmed, evidence.contradicted
+            found["rewards"] = evidence.rewards_right, evidence.rewards_wrong
+        return found
 
     def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
         n, error, effect, _ = self.sums[action, variable, part].tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_COLUMNS = ("states", "effects", "rewards", "actions", "ended")  # the arrays, which grow together
+_COLUMNS = ("states", "effects", "rewards", "actions", "ended", "predicted", "is_predicted")  # the arrays, which grow together
 
 
 class RecordedTransitions:
@@ -17,9 +17,22 @@ class RecordedTransitions:
         self.n = 0
         self.states, self.effects, self.rewards = np.empty((64, n_variables)), np.empty((64, n_variables)), np.empty(64)
         self.actions, self.ended = np.empty(64, dtype=np.int64), np.empty(64, dtype=np.int64)
+        #: Effects that the target's own instances alone predicted, and whether they did.
+        self.predicted, self.is_predicted = np.zeros((64, n_variables)), np.zeros(64, dtype=np.bool_)
 
-    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
-        """Record one transition; ``effect``: next state minus state; return its number."""
+    def add(
+        self,
+        state: np.ndarray,
+        action: int,
+        reward: float,
+        effect: np.ndarray,
+        terminated: bool = False,
+        predicted: np.ndarray | None = None,
+    ) -> int:
+        """Record one transition; ``effect``: next state minus state; return its number.
+
+        :param predicted: the effect that the target's own instances alone predicted; None or NaN for nothing
+        """
         if self.n == len(self.rewards):
             for name in _COLUMNS:
                 old = getattr(self, name)
@@ -28,6 +41,8 @@ class RecordedTransitions:
         self.states[i], self.effects[i] = state, effect
         self.rewards[i], self.actions[i] = reward, action
         self.ended[i] = self.TERMINATED if terminated else self.GOES_ON
+        self.is_predicted[i] = predicted is not None and not np.isnan(predicted[0])
+        self.predicted[i] = predicted if self.is_predicted[i] else 0.0
         self.n += 1
         return i
 
@@ -37,7 +52,10 @@ class RecordedTransitions:
             self.ended[self.n - 1] = self.TIME_LIMIT
 
     def rows(self) -> np.ndarray:
-        """Return all of them, one a row: state, effect, reward, action, ended; shape (n, 2 * n_variables + 3)."""
+        """Return all of them, one a row: state, effect, reward, action, ended, predicted effect, whether it is.
+
+        :return: shape (n, 3 * n_variables + 4)
+        """
         return np.column_stack([getattr(self, name)[: self.n] for name in _COLUMNS])
 
     def restore(self, rows: np.ndarray, n_actions: int) -> None:
@@ -45,4 +63,5 @@ class RecordedTransitions:
         d = self.states.shape[1]
         for row in rows:
             self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])
-        self.ended[: self.n] = rows[:, -1]
+        self.ended[: self.n] = rows[:, 2 * d + 2]
+        self.predicted[: self.n], self.is_predicted[: self.n] = rows[:, 2 * d + 3 : -1], rows[:, -1] > 0.5

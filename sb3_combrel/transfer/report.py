@@ -39,7 +39,7 @@ class MappingReport:
     error: float = np.nan  #: prediction error of what was transferred
     next_best_error: float = np.nan
     n_compared: int = 0  #: transitions that ``error`` is of
-    trust: float = np.nan  #: with ``use="prior"``, how far what the source claims to know is believed, from 0 to 1
+    strength: float = np.nan  #: with ``use="prior"``, as how many of the target's own instances the source counts
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class TransferReport:
     use: str  #: "instances" or "prior"
     sources: tuple[str, ...] = ()
     n_steps: int | None = None  #: steps of the target that were observed; None if the method does not count them
-    #: Of these, steps whose action transferred instances predicted, or whose outcome the source, as a prior, claimed to know.
+    #: Of these, steps whose action transferred instances predicted; None with ``use="prior"``.
     n_rested: int | None = None
     mappings: tuple[MappingReport, ...] = ()  #: one for each target action that was mapped
     error: float = np.nan  #: prediction error of what was transferred, over all actions
@@ -76,7 +76,6 @@ class TransferReport:
     n_compared: int = 0  #: steps on which predictions of the source were compared with what happened
     n_worse: int = 0  #: of these, steps on which they were worse than "no change"
     contradictions: tuple[Contradiction, ...] = ()  #: where they were worse on average, the worst first
-    not_used: tuple[tuple[str, str], ...] = ()  #: target actions and variables that the source explains too little of
     ends: tuple[int, int] = (0, 0)  #: episode ends where the source predicts them, and ends predicted or not, wrongly
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
@@ -94,10 +93,12 @@ class TransferReport:
             lines.append(f"From {'; '.join(self.sources)}.")
         if self.n_steps is not None and self.n_rested is not None:
             share = 100 * self.n_rested / max(self.n_steps, 1)
-            how = "the source claimed to know the outcome" if self.use == "prior" else "transferred instances predicted it"
-            lines.append(f"{self.n_rested:,} of {self.n_steps:,} steps ({share:.0f} %) rested on the source: {how}.")
+            rested = f"{self.n_rested:,} of {self.n_steps:,} steps ({share:.0f} %)"
+            lines.append(f"{rested} rested on the source: transferred instances predicted it.")
         if self.bounds_values:
-            lines.append("The value of what is unknown is bounded by the source's value there.")
+            more = self.statistics.get("transfer/bound_exceeded", 0.0)
+            raised = f", and {more:.3g} more, by which returns exceeded it" if more > 0.0 else ""
+            lines.append(f"The value of what is unknown is bounded by the source's value there{raised}.")
         return "\n".join(lines)
 
     def _mappings(self) -> str:
@@ -108,7 +109,7 @@ class TransferReport:
         for each in self.mappings:
             shares = (_text(each.share), f"{each.n_mappings}") if shared else ()
             compliances = (each.compliance, each.next_best_compliance, each.no_change_compliance)
-            figures = tuple(_text(value) for value in (*compliances, each.error, each.next_best_error, each.trust))
+            figures = tuple(_text(value) for value in (*compliances, each.error, each.next_best_error, each.strength))
             rows.append((each.target_action, each.mapping, *shares, *figures))
         kept = [column for column in zip(*rows, strict=True) if any(cell != "-" for cell in column[1:])]
         shown = [column[0] for column in kept]
@@ -130,9 +131,6 @@ class TransferReport:
         ]
         where = [f"  {each}" for each in self.contradictions]
         lines += ["Contradicted (prediction error above 1):", *where] if where else ["Nowhere was it contradicted on average."]
-        if self.not_used:
-            pairs = ", ".join(f"{variable} under {action}" for action, variable in self.not_used)
-            lines.append(f"Not used any more, as the source explains too little of it: {pairs}.")
         for name, (right, wrong) in (("Ends of episodes", self.ends), ("Rewards", self.rewards)):
             if right or wrong:
                 lines.append(f"{name}: {right:,} as the source predicts, {wrong:,} not.")
@@ -150,12 +148,12 @@ def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
     return tuple(f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances)" for source in sources)
 
 
-_FIGURES = ("compliance", "next best", "no change", "error", "next best's", "trust")
+_FIGURES = ("compliance", "next best", "no change", "error", "next best's", "strength")
 _EXPLANATIONS = {
     "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and "
     'of "no change".',
     "error": 'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.',
-    "trust": "Trust: how far what the source claims to know is believed, 0: not at all.",
+    "strength": "Strength: as how many of the target's own instances the source counts where it has data.",
 }
 
 

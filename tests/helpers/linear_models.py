@@ -63,11 +63,11 @@ def assert_same_rows(model, naive):
     """
     for action, point, pair in pairs_of(naive):
         now, gamma = int(model.pairs.fitted_at[pair]), model.mdp.gamma
-        known, claimed = model.known[pair], naive.claimed(action, point)
-        assert model.mdp.arrays.modelled[pair] == known or claimed
+        known = model.known[pair]
+        assert model.mdp.arrays.modelled[pair] == known
         if now > 0:
             assert known == naive.known(action, point, now)
-        if not known and not claimed:
+        if not known:
             assert row_of(model.mdp, point, action) == {}
             continue
         reward, successors, discount = naive.row(action, point, now, gamma)
@@ -83,11 +83,11 @@ def assert_same_prediction(model, naive, state):
     prediction, given = model.predict_at(state)
     assert given is None, "instances are asked of no prior"
     for action in range(naive.n_actions):
-        expected, claimed = naive.at_state(state, action), naive.prior(state, action)[3]
+        expected = naive.at_state(state, action)
         np.testing.assert_allclose(prediction.weight[action], expected.weight, rtol=1e-9)
-        assert prediction.modelled[action] == (claimed or expected.weight >= naive.threshold * (1.0 - 1e-12))
+        assert prediction.modelled[action] == (expected.weight >= naive.threshold * (1.0 - 1e-12))
         np.testing.assert_allclose(prediction.reward[action], expected.reward, rtol=1e-9, atol=1e-9)
-        predicts = expected.end < 1.0 and (claimed or expected.weight > 0.0)
+        predicts = expected.end < 1.0 and expected.weight > 0.0
         assert prediction.length[action] == (1 if predicts else 0)
         if predicts:
             np.testing.assert_allclose(prediction.probability[action, 0], 1.0 - expected.end, atol=1e-9)
@@ -136,18 +136,18 @@ def assert_restored(model, restored, transitions):
 
 
 def left_half(state, action):
-    return state[0] < 0.5
+    return 2.0 * (state[0] < 0.5)
 
 
 def nothing(state, action):
-    return False
+    return 0.0
 
 
 def renew(model, prior):
-    """Have a model ask its prior again, and update all rows."""
+    """Have a model ask its prior again, and update the rows of what is known."""
     prior.version += 1
     changed = model.renew_prior()
-    np.testing.assert_array_equal(np.sort(changed), np.arange(len(model.known)))
+    np.testing.assert_array_equal(np.sort(changed), np.flatnonzero(model.known))
     model.update_rows(changed)
 
 
@@ -155,13 +155,13 @@ class StubPrior:
     """A transfer method with ``use="prior"``, from functions of state and action.
 
     :param effect: function of (state, action)
-    :param claims: function of (state, action): whether to claim to know
+    :param weight: function of (state, action): as how many own instances it counts, of the last variable half as many
     """
 
     use = "prior"
 
-    def __init__(self, effect, claims=lambda state, action: True, reward=-1.0, end=0.0):
-        self.effect, self.claims, self.reward, self.end = effect, claims, reward, end
+    def __init__(self, effect, weight=lambda state, action: 1.0):
+        self.effect, self.weight = effect, weight
         self.version = 0
 
     def prior(self, states, actions):
@@ -169,17 +169,18 @@ class StubPrior:
         n, d = states.shape
         return PriorPredictions(
             effect=np.array([self.effect(state, int(action)) for state, action in asked]).reshape(n, d),
-            reward=np.full(n, self.reward),
-            end=np.full(n, self.end),
-            weight=np.array([100.0 if self.claims(state, int(action)) else 0.0 for state, action in asked]),
+            weight=np.array([self.weights(state, int(action)) for state, action in asked]).reshape(n, d),
         )
+
+    def weights(self, state, action):
+        return self.weight(state, action) * np.append(np.ones(len(state) - 1), 0.5)
 
     def prior_version(self):
         return self.version
 
     def as_naive(self):
         """The same as a function for the definition."""
-        return lambda state, action: (self.effect(state, action), self.reward, self.end, bool(self.claims(state, action)))
+        return lambda state, action: (self.effect(state, action), self.weights(state, action))
 
 
 class LinearDynamics:

@@ -11,8 +11,7 @@ import numpy as np
 from helpers.naive_fitted_rmax import Instance, NaiveGrid, apart
 
 # Figures of the definition, as the documentation states them.
-LAST_WEIGHT, NARROWEST, RIDGE = 0.05, 0.02, 0.001
-PRIOR_WEIGHT, PRIOR_OUTCOME_WEIGHT = 0.5, 0.1
+LAST_WEIGHT, NARROWEST, RIDGE = 0.05, 1e-6, 0.001
 ON_GRID, MAX_STEPS = 0.5, 50
 # Arrivals farther than so many squared breadths beyond the nearest do not count; this is what the nearest adds to a breadth.
 NEGLIGIBLE, ROUNDING = 9.0, 1e-7
@@ -40,12 +39,13 @@ def ridge_regression(weights, z, numbers, ridge=RIDGE):
 class Fit:
     """Effects, then the reward, as linear functions around a state, within the range of the instances."""
 
-    def __init__(self, away, squared, numbers, ended, breadth, n_neighbors):
+    def __init__(self, away, squared, numbers, ended, breadth, n_neighbors, prior):
         """The instances come nearest first.
 
         :param away: shape (n, d): where they are, seen from the state; ``squared``: their squared distances
         :param numbers: shape (n, d + 1)
         :param breadth: of the broad kernel
+        :param prior: shape (d,): as how many further instances at the state, with effects of 0, it counts
         """
         if len(squared) == n_neighbors:
             breadth = min(breadth, max(NARROWEST * breadth, math.sqrt(squared[-1] / -math.log(LAST_WEIGHT))))
@@ -54,8 +54,14 @@ class Fit:
         numbers = numbers.copy()
         numbers[ended, -1] = np.average(numbers[going_on, -1], weights=weights[going_on])
         self.mean, slopes = ridge_regression(weights, away / breadth, numbers)
-        self.slopes, self.total = slopes / breadth, weights.sum()
+        self.slopes = slopes / breadth
         self.low, self.high = numbers.min(axis=0), numbers.max(axis=0)
+        for v in np.flatnonzero(prior):
+            all_weights = np.append(weights, prior[v] * math.exp(squared[0] / breadth**2))
+            z, more = np.vstack([away, np.zeros(len(prior))]) / breadth, np.append(numbers[:, v], 0.0)
+            [self.mean[v]], [*slopes] = ridge_regression(all_weights, z, more[:, None])
+            self.slopes[:, v] = np.ravel(slopes) / breadth
+            self.low[v], self.high[v] = more.min(), more.max()
 
     def at(self, away):
         return np.clip(self.mean + away @ self.slopes, self.low, self.high)
@@ -66,7 +72,7 @@ class NaiveLocalLinear:
 
     :param grid: (resolution by variable, margin[, periodic])
     :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``
-    :param prior: function of (state, action) that returns effect, reward, end and whether it claims to know; None for none
+    :param prior: function of (state, action) that returns effect and weights, shape (d,) each; None for none
     """
 
     def __init__(self, grid, kernel, n_actions, *, threshold=1.0, prior=None, max_instances=None):
@@ -77,7 +83,7 @@ class NaiveLocalLinear:
         self.outcome_breadth = min(self.breadth, kernel["outcome_breadth"]) ** 2
         self.reach = -math.log(kernel["min_weight"]) * self.breadth**2
         self.threshold, self.max_instances = threshold, max_instances
-        self.prior = (lambda state, action: (np.zeros(self.d), 0.0, 0.0, False)) if prior is None else prior
+        self.prior = (lambda state, action: (np.zeros(self.d), np.zeros(self.d))) if prior is None else prior
         self.has_prior = prior is not None
         self.transitions = []
 
@@ -115,22 +121,23 @@ class NaiveLocalLinear:
         informed = any(i.terminated for i in some) or len({i.reward for i in some}) > 1
         return (ON_GRID if informed else 1.0) * self.threshold
 
-    def prior_effect(self, state, action):
-        """The prior's effect, multilinear between those at the grid points."""
+    def prior_at(self, state, action):
+        """The prior's effect and weights, multilinear between those at the grid points."""
         corners = self.grid.corners(state).items()
-        return sum(part * self.prior(self.points[point], action)[0] for point, part in corners)
+        return sum(part * np.array(self.prior(self.points[point], action)) for point, part in corners)
 
     def fitted(self, at, action, now):
-        """The fit around a state, None without instances; their weight under the broad kernel; and the nearest of them."""
+        """The fit around a state, None without instances; and their weight under the broad kernel."""
         near = self.nearest(at, action, now, self.reach)[: self.n_neighbors]
         if not near:
-            return None, 0.0, None
+            return None, 0.0
         squared, instances = np.array([q for q, _ in near]), [i for _, i in near]
         away = np.array([apart(i.state, at, self.grid.periodic) for i in instances])
-        numbers = [np.append(i.effect - self.prior_effect(i.state, action), i.reward) for i in instances]
+        numbers = [np.append(i.effect - self.prior_at(i.state, action)[0], i.reward) for i in instances]
         ended = np.array([i.terminated for i in instances])
-        fit = Fit(away, squared, np.array(numbers), ended, self.breadth, self.n_neighbors)
-        return fit, np.exp(-squared / self.breadth**2).sum(), instances[0]
+        prior = self.prior_at(at, action)[1]
+        fit = Fit(away, squared, np.array(numbers), ended, self.breadth, self.n_neighbors, prior)
+        return fit, np.exp(-squared / self.breadth**2).sum()
 
     def end_at(self, at, now):
         """The probability that arriving at a state ends the episode, and what an end there pays: all actions' arrivals."""
@@ -146,39 +153,19 @@ class NaiveLocalLinear:
         rewards = np.array([i.reward for i in arrivals])
         return weights[ended].sum() / weights.sum(), np.average(rewards[ended], weights=weights[ended])
 
-    def outcome(self, at, away, reward, nearest, prior, now):
-        """Reward and probability of the end of a step from ``at`` that leads ``away`` from there.
-
-        :param prior: the prior's reward and end, which join the own ones; None if it does not count
-        :param nearest: the instance nearest to ``at``: by way of where it led, some arrival is near
-        """
+    def outcome(self, at, away, reward, now):
+        """Reward and probability of the end of a step from ``at`` that leads ``away`` from there."""
         end, pays = self.end_at(at + away, now)
-        reward = (1.0 - end) * reward + end * pays
-        if prior is None:
-            return reward, end
-        weight = 0.0
-        if nearest is not None:
-            far = math.sqrt(self.squared(at, nearest.state + nearest.effect)) + np.linalg.norm(away)
-            weight = math.exp(-(far**2) / self.outcome_breadth)
-        total = weight + PRIOR_OUTCOME_WEIGHT
-        return tuple((weight * own + PRIOR_OUTCOME_WEIGHT * of) / total for own, of in zip((reward, end), prior, strict=True))
-
-    def share(self, fit, claimed):
-        return fit.total / (fit.total + PRIOR_WEIGHT) if claimed else 1.0
+        return (1.0 - end) * reward + end * pays, end
 
     def at_state(self, state, action):
         """Predict at an exact state, from all transitions."""
-        _, prior_reward, prior_end, claimed = self.prior(state, action)
-        fit, weight, nearest = self.fitted(state, action, self.now)
-        effect, reward = self.prior_effect(state, action), prior_reward
+        fit, weight = self.fitted(state, action, self.now)
+        effect, reward = self.prior_at(state, action)[0], 0.0
         if fit is not None:
-            effect = effect + self.share(fit, claimed) * fit.mean[:-1].clip(fit.low[:-1], fit.high[:-1])
-            reward = fit.at(np.zeros(self.d))[-1]
-        prior = (prior_reward, prior_end) if claimed and weight < self.threshold else None
-        return Predicted(effect, *self.outcome(state, effect, reward, nearest, prior, self.now), weight)
-
-    def claimed(self, action, point):
-        return self.prior(self.points[point], action)[3]
+            *of_fit, reward = fit.at(np.zeros(self.d))
+            effect = effect + of_fit
+        return Predicted(effect, *self.outcome(state, effect, reward, self.now), weight)
 
     def weight_of(self, action, point, now):
         return self.fitted(self.points[point], action, now)[1]
@@ -189,21 +176,17 @@ class NaiveLocalLinear:
     def row(self, action, point, now, gamma):
         """(R, {successor: probability}, discount) of a pair, staying included; the action is held until the cell is left."""
         at, cells = self.points[point], np.array(self.grid.cells, dtype=float)
-        of_prior, prior_reward, prior_end, claimed = self.prior(at, action)
-        fit, weight, nearest = self.fitted(at, action, now)
-        prior = (prior_reward, prior_end) if claimed and weight < self.needed_on_grid(now) else None
+        fit, _ = self.fitted(at, action, now)
         away, total, goes_on, discount = np.zeros(self.d), 0.0, 1.0, 1.0
         for n in range(MAX_STEPS):
-            effect, reward = of_prior + self.prior_change(action, point, away), prior_reward
-            if fit is not None:
-                effect = effect + self.share(fit, claimed) * fit.at(away)[:-1]
-                reward = fit.at(away)[-1]
+            *effect, reward = fit.at(away)
+            effect = effect + self.prior(at, action)[0] + self.prior_change(action, point, away)
             after = self.within_grid(point, away + effect)
             stays = (np.abs(after - away) * cells <= 1e-6).all()
             # The part of the step that leaves the cell.
             beyond = np.abs(after) * cells > 1.0
             part = min([1.0, *((np.sign(after) / cells - away)[beyond] / (after - away)[beyond])])
-            reward, end = self.outcome(at, after, reward, nearest, prior, now)
+            reward, end = self.outcome(at, after, reward, now)
             taken = 1.0 if n == 0 or end > 0.0 or stays else part
             total += discount * goes_on * taken * reward
             goes_on *= 1.0 - end
@@ -220,7 +203,7 @@ class NaiveLocalLinear:
         return np.where(periodic, away, np.clip(away, -coordinates / cells, (last - coordinates) / cells))
 
     def prior_change(self, action, point, away):
-        """By how much the prior's effect changes, linear between the pair and those beside it, if they are claimed alike."""
+        """By how much the prior's effect changes, linear between the pair and those beside it."""
         change = np.zeros(self.d)
         for j in np.flatnonzero(away) if self.has_prior else ():
             side = 1 if away[j] > 0.0 else -1
@@ -229,7 +212,6 @@ class NaiveLocalLinear:
                 side = -side
             beside[j] = (beside[j] + side) % self.grid.shape[j]
             other = self.grid.number[tuple(beside)]
-            if self.claimed(action, other) == self.claimed(action, point):
-                slope = self.prior(self.points[other], action)[0] - self.prior(self.points[point], action)[0]
-                change += slope * side * self.grid.cells[j] * away[j]
+            slope = self.prior(self.points[other], action)[0] - self.prior(self.points[point], action)[0]
+            change += slope * side * self.grid.cells[j] * away[j]
         return change

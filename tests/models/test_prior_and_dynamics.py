@@ -1,12 +1,10 @@
-"""The local linear model with a prior: claims are modelled at once, and own instances are fitted to what is left over."""
+"""The local linear model with a prior: own instances are fitted to what it leaves over."""
 
 import numpy as np
 import pytest
 from helpers import linear_models
 from helpers.kernel_models import N_ACTIONS, learn, make_model
 from helpers.linear_models import LinearDynamics, StubPrior, make_linear_model, renew
-
-from sb3_combrel.common.constants import PRIOR_OUTCOME_WEIGHT
 
 GRID, KERNEL = ((2, 2), 0), dict(breadth=0.3, min_weight=0.05, n_neighbors=8, outcome_breadth=0.1)
 
@@ -17,33 +15,29 @@ def model_with_prior(prior, grid=GRID, kernel=KERNEL, **kwargs):
     return model
 
 
-def test_what_an_exact_prior_claims_is_modelled_exactly_from_the_start_and_nothing_is_left_over():
+def test_an_exact_prior_makes_what_is_known_exact_leaves_nothing_over_and_makes_nothing_known():
     dynamics = LinearDynamics(1, 2)
     model = model_with_prior(StubPrior(dynamics.effect))
-    assert model.mdp.arrays.modelled.all() and not model.known.any()
+    assert not model.mdp.arrays.modelled.any()
+    learn(model, dynamics.transitions(np.random.default_rng(0).random((40, 2))))
     state = np.array([0.37, 0.81])
-    for transitions in ([], dynamics.transitions(np.random.default_rng(0).random((40, 2)))):
-        learn(model, transitions)
-        prediction = model.predict_at(state)[0]
-        for action in range(N_ACTIONS):
-            np.testing.assert_allclose(prediction.effect[action, 0], dynamics.effect(state, action), atol=1e-12)
-        assert prediction.modelled.all()
-        np.testing.assert_allclose(prediction.reward, -1.0, atol=1e-12)
-        np.testing.assert_allclose(prediction.probability[:, 0], 1.0, atol=1e-12)
+    prediction = model.predict_at(state)[0]
+    for action in range(N_ACTIONS):
+        np.testing.assert_allclose(prediction.effect[action, 0], dynamics.effect(state, action), atol=1e-12)
     for action, size in enumerate(model.instances.size):
         np.testing.assert_allclose(model.linear.target[action, :size], 0.0, atol=1e-15)
 
 
-def test_rewards_and_ends_of_the_prior_count_little_where_there_are_arrivals_and_not_at_all_where_all_is_known():
-    prior = StubPrior(lambda state, action: np.zeros(2), reward=-5.0, end=0.5)
-    model, state = model_with_prior(prior, n_actions=1, threshold=4.0), np.array([0.5, 0.5])
-    for n, part in ((0, 1.0), (1, PRIOR_OUTCOME_WEIGHT / (1.0 + PRIOR_OUTCOME_WEIGHT)), (3, None), (4, 0.0)):
-        learn(model, [(state, 0, -1.0, state, False)] * (n - int(model.n_instances)))
-        prediction, part = model.predict_at(state)[0], (
-            PRIOR_OUTCOME_WEIGHT / (1.0 + PRIOR_OUTCOME_WEIGHT) if part is None else part
-        )
-        assert prediction.reward[0] == pytest.approx(-1.0 - 4.0 * part)
-        assert prediction.probability[0, 0] == pytest.approx(1.0 - 0.5 * part)
+@pytest.mark.parametrize("weight", [0.0, 0.5, 3.0])
+def test_a_prior_counts_as_so_many_instances_at_the_state_and_for_more_away_from_own_ones(weight):
+    """With one instance, and a prior that says nothing moves."""
+    model = model_with_prior(StubPrior(lambda state, action: np.zeros(2), lambda state, action: weight), n_actions=1)
+    state, away = np.array([0.5, 0.5]), np.array([0.3, 0.0])
+    learn(model, [(state, 0, -1.0, state + 0.1, False)])
+    near, far = (model.predict_at(at)[0].effect[0, 0].copy() for at in (state, state + away))
+    np.testing.assert_allclose(near, 0.1 / (1.0 + weight * np.array([1.0, 0.5])), rtol=1e-9)
+    assert (far < 0.05 * near).all() if weight else (far == near).all()
+    np.testing.assert_allclose(model.predict_alone(state + away, 0), 0.1, rtol=1e-9)
 
 
 def test_a_prior_is_asked_again_when_its_version_has_grown_and_only_then():
@@ -60,7 +54,7 @@ def test_a_prior_is_asked_again_when_its_version_has_grown_and_only_then():
         states = model.instances.state[action, :size]
         left_over = [one.effect(state, action) - other.effect(state, action) for state in states]
         np.testing.assert_allclose(model.linear.target[action, :size], left_over, atol=1e-12)
-    assert linear_models.assert_same_rows(model, naive) == len(model.known)
+    assert linear_models.assert_same_rows(model, naive) > 0
     assert len(model.renew_prior()) == 0
 
 

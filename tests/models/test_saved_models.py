@@ -39,22 +39,6 @@ def test_a_restored_local_linear_model_is_and_learns_the_same_to_the_last_bit(gr
     linear_models.assert_restored(model, restored, transitions[n:])
 
 
-def test_what_a_prior_claims_is_modelled_in_a_restored_model_that_has_learned_nothing():
-    model, restored = (
-        linear_models.make_linear_model(
-            ((2, 2), 0),
-            linear_models.LINEAR_KERNELS[0],
-            prior=linear_models.StubPrior(linear_models.LinearDynamics(1, 2).effect),
-        )
-        for _ in range(2)
-    )
-    model.update_rows(model.renew_prior())
-    restored.set_state(model.get_state())
-    restored.update_rows(restored.renew_prior())
-    assert restored.mdp.arrays.modelled.all()
-    linear_models.assert_same_to_the_last_bit(model, restored)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_predicted_of_states_is_the_same_after_instances_were_replaced(seed):
     grid, kernel = ((2, 2), 1, (True, False)), linear_models.LINEAR_KERNELS[seed]

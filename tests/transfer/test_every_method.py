@@ -161,7 +161,7 @@ FACTORED = FactoredMapping((InterTaskMapping([0, 1], [0, 1]),))
 REFUSED = [
     *((kind, {"breadth": 0.0}, f"breadth {POSITIVE}, got 0.0") for kind in (MASTER, SampleTransfer, *FEW)),
     *((kind, {"breadth_decay": 1.1}, "breadth_decay .* and at most 1, got 1.1") for kind in (MASTER, *FEW)),
-    *((kind, {"transfer_terminals": 1}, "must be True or False, got 1") for kind in (MASTER, SoftHomomorphism, *FEW)),
+    *((kind, {"transfer_terminals": 1}, "must be True or False, got 1") for kind in (MASTER, *FEW)),
     *((kind, {"source_breadth": np.nan}, f"source_breadth {POSITIVE}, got nan") for kind in (MASTER, SoftHomomorphism)),
     *((kind, {"mappings": "factored"}, "no factored ones, got 'f") for kind in (MASTER, MappingExperts, SampleTransfer)),
     *((kind, {"mappings": FACTORED}, "no factored ones") for kind in (MASTER, MappingExperts, SampleTransfer)),

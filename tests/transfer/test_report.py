@@ -69,7 +69,7 @@ def test_of_another_chooser_the_next_best_is_another_mapping_and_every_transitio
     transfer = bound(MASTER(f.oscillator_source(200), n_random_steps=530, use="prior"), 2, 3)
     transitions = f.walk(f.copies_mapping(1), 530)
     shown(transfer, transitions)
-    np.testing.assert_array_equal(transfer.source_prior.measured_sums().n, np.bincount(transitions[1]))
+    np.testing.assert_array_equal(transfer.source_prior.sums.n, np.bincount(transitions[1]))
     for each in transfer.report().mappings:
         assert each.next_best and each.next_best != each.mapping and each.next_best_error > each.error
 
@@ -103,7 +103,7 @@ def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
     assert transfer.describe_prior() != before and transfer.statistics()["transfer/switches"] >= 1
     prior, errors = transfer.source_prior, RegionErrors(transfer.task)
     for state, action, effect in zip(*(np.concatenate(parts) for parts in zip(wrong, right, strict=True)), strict=True):
-        predicted, _, _, weight = prior.copies.predict(prior._used, prior._work_space, state[None], np.array([action]))
+        predicted, _, weight = prior.copies.predict(prior._used, prior._work_space, state[None], np.array([action]))
         if weight[0] >= prior.copies.threshold:
             errors.note(state, int(action), effect, predicted[0])
     np.testing.assert_allclose(prior.errors.sums, errors.sums, rtol=1e-6, atol=1e-12)

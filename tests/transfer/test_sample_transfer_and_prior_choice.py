@@ -13,15 +13,17 @@ from helpers.factored import measured, predicted_by
 from helpers.naive_transfer import source_of, transitions_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from sb3_combrel import InterTaskMapping, MappingSet, SampleTransfer
 from sb3_combrel.transfer import equations
 from sb3_combrel.transfer.candidates import Candidates, stacked_instances
-from sb3_combrel.transfer.equations import Bandwidths, division_score, prediction_compliances, running_scales
+from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.methods.sample_transfer import candidate_compliances, draw_instances
 from sb3_combrel.transfer.prior import prior_choice
 from sb3_combrel.transfer.prior.copy_sums import CopySums
+from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
 
 POINTS = np.random.default_rng(5).random((12, 3))
 BANDWIDTHS = (0.05, 0.02, 1.0)
@@ -208,39 +210,26 @@ def test_the_best_division_is_the_best_of_all(seed, n_variables, n_copies):
     rng = np.random.default_rng(seed)
     members = rng.random((n_copies, n_variables)) < 0.4
     members[~members.any(axis=1), rng.integers(n_variables)] = True
-    scores, stays = rng.normal(size=n_copies), rng.normal(size=n_variables)
-
-    def total(chosen):
-        left = ~members[list(chosen)].any(axis=0) if chosen else np.ones(n_variables, dtype=bool)
-        return scores[list(chosen)].sum() + stays[left].sum()
-
-    found = prior_choice.best_division(members, scores, stays)
+    scores = rng.normal(size=n_copies)
+    found = prior_choice.best_division(members, scores)
     assert (members[found].sum(axis=0) <= 1).all()
-    assert total(tuple(found)) == pytest.approx(max(map(total, all_divisions(members))))
+    assert scores[found].sum() == pytest.approx(max(scores[list(chosen)].sum() for chosen in all_divisions(members)))
 
 
-def test_the_division_found_has_the_highest_score_of_all():
+def test_the_division_found_has_the_most_evidence_of_all():
     _, copies, sums, (states, actions, effects) = f.measured(2, 30, noise=0.02)
-    scales = running_scales(effects)
-    parts, stays = {}, {}
+    parts = {}
     for copy in range(len(copies)):
-        has = copies.state[copy] >= 0
-        found = [f.predicted_by(copies, copy, u, states)[:, has] for u in range(3)]
-        each = np.array([prediction_compliances(effects[:, has], p, scales[:, has]) for p in found])
+        each = np.array([evidence_of(copies, copy, u, states, effects) for u in range(3)])
         # The best source action of each target action, on its own.
-        part = np.empty(len(actions))
+        part = np.empty_like(effects)
         for a in np.unique(actions):
             rows = actions == a
-            part[rows] = each[each[:, rows].mean(axis=1).argmax()][rows]
+            part[rows] = each[each[:, rows].sum(axis=(1, 2)).argmax()][rows]
         parts[copy] = part
-    for v in range(4):
-        stays[v] = prediction_compliances(effects[:, [v]], np.zeros((len(actions), 1)), scales[:, [v]])
 
     def score(chosen):
-        left = [v for v in range(4) if not (copies.state[list(chosen), v] >= 0).any()]
-        return division_score(
-            [*(parts[c] for c in chosen), *(stays[v] for v in left)], actions, 4 - len(left), prior_choice.MIN_GAIN
-        )
+        return equations.division_evidence([parts[c] for c in chosen], actions, [3] * len(chosen), len(copies))
 
     found = prior_choice.choose_factored(copies, sums)
     chosen = tuple(sorted({c for c in found.copies[0].tolist() if c >= 0}))
@@ -252,7 +241,7 @@ def test_an_action_that_was_never_taken_has_no_source_action():
     fresh = CopySums.zero(len(copies), 3, 5, 4)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         if action != 3:
-            copies.measure(state, action, effect, fresh, False)
+            copies.measure(state, action, effect, fresh)
     choice = prior_choice.choose_factored(copies, fresh)
     assert (choice.actions[3] == -1).all() and (np.delete(choice.actions, 3, axis=0) >= 0).all()
     assert copies.uses(*choice).complete.tolist() == [True, True, True, False, True]
@@ -261,14 +250,14 @@ def test_an_action_that_was_never_taken_has_no_source_action():
 
 
 def test_one_mapping_for_each_action_is_the_best_that_is_allowed():
-    _, copies, sums, _ = f.measured(2, 200, noise=0.01, whole=True)
+    _, copies, sums, _ = f.measured(2, 200, noise=0.01)
     rng = np.random.default_rng(0)
     for _ in range(20):
         allowed = rng.random((len(copies), 5, 3)) < 0.2
         choice = prior_choice.choose_mapping(copies, sums, allowed)
-        mean = np.where(allowed, sums.compliance / sums.n[:, None], -1.0)
+        gain = np.where(allowed, sums.gain.sum(axis=3), -np.inf)
         for a, (copy, u) in enumerate(zip(choice.copies[:, 0], choice.actions[:, 0], strict=True)):
-            assert mean[copy, a, u] == mean[:, a].max()
+            assert gain[copy, a, u] == gain[:, a].max()
 
 
 def test_what_is_drawn_is_allowed_and_of_every_kind():
@@ -291,54 +280,32 @@ def test_what_is_drawn_is_allowed_and_of_every_kind():
     assert len(seen) == 12
 
 
-def test_compliances_are_those_of_the_equations():
+def evidence_of(copies, copy, u, states, effects):
+    """The evidence for a copy with a source action of each transition and variable, 0 for variables that it does not have."""
+    uses = copies.uses(np.array([[copy]]), np.array([[u]]))
+    weights = copies.predict(uses, copies.work_space(uses), states, np.zeros(len(states), dtype=np.int64))[2]
+    predicted = predicted_by(copies, copy, u, states)
+    scales = equations.running_scales(effects, SMALLEST_ERROR)
+    each = equations.evidence(effects, np.nan_to_num(predicted), scales, weights)
+    return np.where(np.isnan(predicted), 0.0, each)
+
+
+def test_evidence_is_that_of_the_equations():
     _, copies, sums, (states, actions, effects) = measured(2, 40, noise=0.01)
-    scales = running_scales(effects)
     for copy in (0, 3, 11, 12, 19):
         has = copies.state[copy] >= 0
         for u in range(3):
-            predicted = predicted_by(copies, copy, u, states)[:, has]
-            each = prediction_compliances(effects[:, has], predicted, scales[:, has])
-            errors = (predicted - effects[:, has]) ** 2
+            each = evidence_of(copies, copy, u, states, effects)
+            errors = (predicted_by(copies, copy, u, states)[:, has] - effects[:, has]) ** 2
             for a in range(5):
                 rows = actions == a
-                np.testing.assert_allclose(sums.compliance[copy, a, u], each[rows].sum(), rtol=1e-6)
+                np.testing.assert_allclose(sums.gain[copy, a, u], each[rows].sum(axis=0), rtol=1e-4, atol=1e-6)
                 np.testing.assert_allclose(sums.error[copy, a, u, has], errors[rows].sum(axis=0), rtol=1e-5)
-    for a in range(5):
-        stays = [
-            prediction_compliances(effects[:, [v]], np.zeros((40, 1)), scales[:, [v]])[actions == a].sum() for v in range(4)
-        ]
-        np.testing.assert_allclose(sums.stay[a], stays)
 
 
-def test_with_whole_mappings_compliance_is_over_all_variables_those_unmapped_stay():
-    _, copies, sums, (states, actions, effects) = measured(2, 25, noise=0.01, whole=True)
-    scales = running_scales(effects)
-    each = prediction_compliances(effects, np.nan_to_num(predicted_by(copies, 3, 1, states)), scales)
-    np.testing.assert_allclose(sums.compliance[3, :, 1], [each[actions == a].sum() for a in range(5)], rtol=1e-6)
-
-
-def test_what_is_unexplained_is_compared_with_what_the_target_moves_so_far_within_what_the_source_does():
-    _, copies, sums, (states, actions, effects) = measured(2, 40, noise=0.01)
-    [source] = copies.sources
-    sizes = np.abs(source.scaling.to_unit(source.next_states) - source.scaling.to_unit(source.states))
-    low = np.median(sizes, axis=0)
-    high = np.max([np.median(sizes[source.actions == u], axis=0) for u in range(3)], axis=0)
-    for copy, u in ((0, 0), (3, 2), (11, 1), (12, 1), (19, 0)):
-        v = int(np.flatnonzero(copies.state[copy] >= 0)[-1])
-        k, predicted = copies.state[copy, v], predicted_by(copies, copy, u, states)[:, v]
-        expected = np.zeros(5)
-        for i, action in enumerate(actions.tolist()):
-            seen = [np.abs(effects[: i + 1, v][actions[: i + 1] == a]) for a in range(5)]
-            motion = max(each.mean() for each in seen if len(each))
-            compared = max(effects[i, v] ** 2, (0.25 * min(max(motion, low[k]), high[k])) ** 2)
-            expected[action] += covered(copies, states[[i]], copy, u) * min(
-                2.0, (effects[i, v] - predicted[i]) ** 2 / compared
-            )
-        np.testing.assert_allclose(sums.unexplained[copy, :, u, v], expected, rtol=1e-4, err_msg=str((copy, v, u)))
-
-
-def covered(copies, state, copy, u):
-    """The weight of the source's data at a state, at most 1."""
-    uses = copies.uses(np.array([[copy]]), np.array([[u]]))
-    return min(1.0, copies.predict(uses, copies.work_space(uses), state, np.array([0]))[3][0])
+def test_evidence_of_one_transition_is_the_logarithm_of_a_ratio_of_densities_of_students_t():
+    effects, predicted, scales = np.array([[0.2, 0.0]]), np.array([[0.15, 0.1]]), np.array([[0.1, 0.05]])
+    densities = [stats.t.logpdf((effects - each) / scales, df=1) for each in (predicted, 0.0)]
+    for weight, part in ((1.0, 0.5), (3.0, 0.75), (0.0, 0.0)):
+        found = equations.evidence(effects, predicted, scales, np.array([weight]))
+        np.testing.assert_allclose(found, part * (densities[0] - densities[1]))

@@ -41,7 +41,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
     states, actions = inside(100, 2, 3)
     predicted, expected = method.prior(states, actions), f.target_effects(SWAPPED, states, actions)
     assert ((predicted.effect - expected) ** 2).sum() < 0.01 * (expected**2).sum()
-    assert method._claims.trust.min() >= 0.8 and predicted.weight.min() > 1.0
+    assert predicted.weight.min() > 0.5
     assert method.statistics()["transfer/prediction_error"] < 0.1
     assert 10 <= method.statistics()["transfer/steps_to_find_mapping"] <= 100
 
@@ -94,29 +94,12 @@ def test_before_the_first_fit_nothing_is_predicted():
         method.mixture()
 
 
-def test_a_target_that_has_nothing_in_common_is_not_claimed_to_be_known():
+def test_of_a_target_that_has_nothing_in_common_it_weighs_next_to_nothing_once_the_learner_predicts_better():
     rng = np.random.default_rng(2)
     states, actions = rng.random((100, 2)), rng.integers(3, size=100)
     method = bound(SoftHomomorphism(f.oscillator_source(), n_starts=1), 2, 3)
-    show(method, (states, actions, 0.1 * np.sin(40.0 * states[:, ::-1])))
-    assert method._claims.trust.tolist() == [0.0, 0.0, 0.0] and method.prior(*inside(50, 2, 3)).weight.max() == 0.0
-
-
-def test_no_end_is_claimed_before_one_was_confirmed_and_none_where_they_are_doubted():
-    method = bound(SoftHomomorphism(f.oscillator_source(1500), mirrored=False, n_starts=1), 2, 3)
-    show(method, f.walk(SWAPPED, 100))
-    # The source's x, which ends episodes above 0.9, is the target's second variable.
-    at_end, actions, amid = np.array([[0.5, 0.93]]), np.array([0]), inside(5, 2, 3)
-    assert method.prior(at_end, actions).end[0] > 0.5 and method.prior(at_end, actions).weight[0] == 0.0
-    before, [after] = method.prior_version(), at_end + f.target_effects(SWAPPED, at_end, actions)
-    method.observe(at_end[0], 0, -1.0, after, True)
-    assert method.prior_version() == before + 1 and method.prior(at_end, actions).weight[0] > 0.0
-    for _ in range(2):
-        # It stays for an episode where an end is predicted.
-        method.observe(at_end[0], 0, -1.0, after, False)
-        method.end_episode(truncated=True)
-    assert method.statistics()["transfer/prior_doubted"] == 0.0
-    assert method.prior(at_end, actions).weight[0] == 0.0 and method.prior(*amid).weight.min() > 0.0
+    show(method, (states, actions, 0.1 * np.sin(40.0 * states[:, ::-1])), own_error=0.001)
+    assert 0.0 < method.prior(*inside(50, 2, 3)).weight.max() < 0.05
 
 
 def test_periodic_variables_are_taken():
@@ -286,17 +269,17 @@ def mixture(sample, n_target=3):
 
 
 def naive_mixture(predictions, state, action):
-    """Effect, reward, end and weight, term by term."""
+    """Effect, reward and weight, term by term."""
     terms, readings = predictions.terms, predictions.readings
-    effect, outcomes = np.zeros(len(state)), np.zeros((3, 2))
+    effect, outcomes = np.zeros(len(state)), np.zeros((2, 2))
     for t in range(terms.first[action], terms.first[action + 1]):
         variable, sign = readings.variable[terms.mapping[t]], readings.sign[terms.mapping[t]]
         at = np.array([state[v] if s > 0 else 1.0 - state[v] for v, s in zip(variable, sign, strict=True)])
         found = predictions.model.predict(at[None], terms.action[t : t + 1])
         for k, v in enumerate(variable):
             effect[v] += terms.share[t] * sign[k] * found.effect[0, k]
-        outcomes[:, terms.copy[t]] += terms.share[t] * np.array([found.reward[0], found.end[0], found.weight[0]])
-    return effect, outcomes[0].mean(), outcomes[1].prod(), outcomes[2].min()
+        outcomes[:, terms.copy[t]] += terms.share[t] * np.array([found.reward[0], found.weight[0]])
+    return effect, outcomes[0].mean(), outcomes[1].min()
 
 
 @pytest.mark.parametrize("at_sample", [False, True])

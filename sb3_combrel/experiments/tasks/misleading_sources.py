@@ -48,6 +48,11 @@ def wrong_rewards(source: SourceInstances) -> SourceInstances:
     return replace(source, rewards=-source.rewards)
 
 
+def scaled_rewards(source: SourceInstances) -> SourceInstances:
+    """The dynamics are right, rewards are ten times as large."""
+    return replace(source, rewards=10.0 * source.rewards)
+
+
 def few(source: SourceInstances) -> SourceInstances:
     """Twenty instances only."""
     return source.subset(20, seed=0)
@@ -60,5 +65,6 @@ MISLEADING: dict[str, Callable[[SourceInstances], SourceInstances]] = {
     "mirrored": mirrored,
     "wrong-goal": wrong_goal,
     "wrong-rewards": wrong_rewards,
+    "scaled-rewards": scaled_rewards,
     "few": few,
 }

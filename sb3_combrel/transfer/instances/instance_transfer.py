@@ -39,6 +39,8 @@ class InstanceTransfer:
         self.task = task = selector.task
         self.candidates: Candidates = selector.candidates
         self.sources = selector.candidates.sources
+        #: Number of the environment that transitions come from, which makes no difference.
+        self.environment = 0
         #: Transitions of the target that were observed.
         self.n_observed = 0
         self.transitions = selector.transitions

@@ -16,6 +16,7 @@ from sb3_combrel.transfer.instances.compliance_selector import ComplianceSelecto
 from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_either
 from sb3_combrel.transfer.prior.prior_sets import is_factored
+from sb3_combrel.transfer.prior.report_of_prior import compliance_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 # Arguments of COMBREL that have a meaning for a prior as well.
@@ -34,10 +35,10 @@ class COMBREL(MappingTransfer):
     That is one reading of the paper (Section 5.1). Its Table 2 contradicts it, where two mappings with the same source action
     for an action have different shares: ``neighbors="state_action"`` is the other reading.
 
-    With ``use="prior"`` compliance is that of the predictions of the source's model with the target's transitions, and one
-    mapping is chosen for all states, or with sets that are not factored one for each target action: after 10 transitions, and
-    again whenever there are 1.4 times as many. How the source's values bound those of what is unknown is said in
-    :class:`~sb3_combrel.transfer.prior.value_bound.ValueBound`.
+    With ``use="prior"`` one mapping is chosen for all states, or with sets that are not factored one for each target action,
+    by its evidence (``equations.evidence``), the likelihood of the target's transitions under the source's model, of which the
+    paper's compliance is the form of a kernel: after 10 transitions, and again whenever there are 1.4 times as many. How the
+    source's values bound those of what is unknown is said in :class:`~sb3_combrel.transfer.prior.value_bound.ValueBound`.
 
     Arguments that are not listed here: see :class:`~sb3_combrel.transfer.methods.mapping_transfer.MappingTransfer`.
 
@@ -151,5 +152,5 @@ class COMBREL(MappingTransfer):
         :param pairs: pairs ``action * n_points + point`` of the sample, int64, shape (n,)
         """
         if self.use == "prior":
-            return self.source_prior.mean_compliance()[pairs // len(self._bound_task.sample_states)]
+            return compliance_of_prior(self.source_prior)[pairs // len(self._bound_task.sample_states)]
         return self._compliance_selector.mean_compliance(pairs)

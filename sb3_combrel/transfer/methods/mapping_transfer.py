@@ -67,8 +67,8 @@ class MappingTransfer(Transfer):
         2; None: from the data, that of starts in proportion to how many variables a mapping compares
     :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own local linear
         model, seen through the mappings, is the prior of the target's (``FittedRMax(degree=1)``), whose own instances are
-        fitted to what it leaves over. :class:`~sb3_combrel.transfer.prior.claims.Claims` says what it claims to know without
-        them. ``breadth``, ``breadth_decay``, relevance and its arguments have no meaning then
+        fitted to what it leaves over. :class:`~sb3_combrel.transfer.prior.evidence.PriorEvidence` says how much it weighs.
+        ``breadth``, ``breadth_decay``, relevance and its arguments have no meaning then
     :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
@@ -210,10 +210,15 @@ class MappingTransfer(Transfer):
     def lowest_reward(self) -> float:
         return min(float(source.rewards.min()) for source in self.sources)
 
+    def note_prediction(self, effect: np.ndarray) -> None:
+        self.source_prior.note_prediction(effect)
+
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        self._source_use.environment = self.environment
         self._source_use.observe(state, action, reward, differences(next_state, state, self._periodic), terminated)
 
     def end_episode(self, truncated: bool) -> None:
+        self._source_use.environment = self.environment
         self._source_use.end_episode(truncated)
 
     def note_use(self, transferred: TransferredInstances) -> None:

@@ -167,7 +167,7 @@ class LeastErrorSelector(FixedSelector):
 
     def add_transition(self, i: int) -> None:
         seen = self.transitions
-        self.copies.measure(seen.states[i], int(seen.actions[i]), seen.effects[i], self.sums, True)
+        self.copies.measure(seen.states[i], int(seen.actions[i]), seen.effects[i], self.sums)
         if i + 1 == self.n_transitions:
             self.choice = choose_least_error(self.copies, self.candidates.sets, self.sums)
             for action, (row, source_action) in enumerate(np.hstack(self.choice).tolist()):

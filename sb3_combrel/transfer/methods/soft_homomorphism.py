@@ -14,8 +14,7 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
 from sb3_combrel.transfer.methods import soft_mapping as soft
 from sb3_combrel.transfer.methods.soft_mapping import Logits
-from sb3_combrel.transfer.prior.claims import FIRST_RENEWAL, RENEWAL_GROWTH, Claims
-from sb3_combrel.transfer.prior.copy_sums import LARGEST_MISS, LEAST_EFFECT
+from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, PriorEvidence
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
 
@@ -44,7 +43,7 @@ class SoftHomomorphism(Transfer):
     a target with twice the source's variables is taken for two copies, whose predictions are added. An action can come out as
     a mean of others.
 
-    What it claims to know without instances of the target: see :class:`~sb3_combrel.transfer.prior.claims.Claims`.
+    How much its effects weigh: see :class:`~sb3_combrel.transfer.prior.evidence.PriorEvidence`.
 
     Example::
 
@@ -56,7 +55,6 @@ class SoftHomomorphism(Transfer):
     :param mirrored: whether target variables may be read mirrored as well
     :param n_starts: random starts of each fit, besides the parameters of the last one
     :param max_transitions: target transitions that are recorded, at most; of these, 500 drawn at random are fitted to
-    :param transfer_terminals: whether the source's ends are used
     :param source_breadth: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if there are more than 2,000 mappings
     """
@@ -69,7 +67,6 @@ class SoftHomomorphism(Transfer):
     mirrored: bool = True
     n_starts: int = 4
     max_transitions: int = 3000
-    transfer_terminals: bool = True
     source_breadth: float = DEFAULT_SOURCE_BREADTH
 
     def __post_init__(self) -> None:
@@ -77,10 +74,8 @@ class SoftHomomorphism(Transfer):
         check_count("n_starts", self.n_starts)
         check_count("max_transitions", self.max_transitions, min=FIRST_RENEWAL)
         check_boolean("mirrored", self.mirrored)
-        check_boolean("transfer_terminals", self.transfer_terminals)
         check_positive("source_breadth", self.source_breadth)
         self.mirrored = bool(self.mirrored)
-        self.transfer_terminals = bool(self.transfer_terminals)
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
@@ -104,7 +99,8 @@ class SoftHomomorphism(Transfer):
         self._mixture = soft.MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
         self._periodic = np.array(task.periodic)
         self._transitions = RecordedTransitions(d)
-        self._claims = Claims(source.rewards, task, self.transfer_terminals)
+        self._evidence = PriorEvidence(task.n_actions, d)
+        self._own: np.ndarray | None = None
         self._squares = np.zeros(2)  # squared errors of predictions, and squared effects, of transitions as they came
         self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
         self._fit_due, self._seconds = float(FIRST_RENEWAL), 0.0
@@ -124,32 +120,31 @@ class SoftHomomorphism(Transfer):
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         if self._logits is None:
             return PriorPredictions.nothing(len(actions), self._bound_task.n_variables)
-        effect, reward, end, weight = self._mixture.predict(states, actions)
-        return self._claims.restrict(effect, reward, end, weight, actions)
+        effect, _, weight = self._mixture.predict(states, actions)
+        return PriorPredictions(effect, self._evidence.weights(weight, actions))
+
+    def note_prediction(self, effect: np.ndarray) -> None:
+        self._own = None if np.isnan(effect[0]) else effect
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         effect = differences(next_state, state, self._periodic)
         self._n_observed += 1
         if self._n_observed <= self.max_transitions:
-            self._transitions.add(state, action, reward, effect, terminated)
+            self._transitions.add(state, action, reward, effect, terminated, self._own)
         if self._logits is not None:
-            [expected], [mean_reward], [end], [weight] = self._mixture.predict(state[None], np.array([action]))
+            [expected], [mean_reward], [weight] = self._mixture.predict(state[None], np.array([action]))
             self._squares += ((expected - effect) ** 2).sum(), effect @ effect
-            self._claims.evidence.note(float(weight), float(end), float(mean_reward), reward, terminated)
+            self._evidence.note(action, effect, expected, self._own, (reward, float(mean_reward)), float(weight))
         if self._fit_due <= self._n_observed <= self.max_transitions:
             self._fit_due = RENEWAL_GROWTH * self._n_observed
             self._fit()
-        self._version += self._claims.have_changed()
 
     def end_episode(self, truncated: bool) -> None:
         if truncated and self._n_observed <= self.max_transitions:
             self._transitions.note_time_limit()
-        if self._logits is not None:
-            self._claims.evidence.end_episode(truncated)
-            self._version += self._claims.have_changed()
 
     def _fit(self) -> None:
-        """Fit the mixture to the recorded transitions; what it claims to know is decided anew."""
+        """Fit the mixture to the recorded transitions; the evidence for it is gathered anew."""
         began = perf_counter()
         n, seen = self._transitions.n, self._transitions
         rows = np.arange(n) if n <= MAX_FITTED else np.sort(self.rng.choice(n, MAX_FITTED, replace=False))
@@ -160,9 +155,9 @@ class SoftHomomorphism(Transfer):
         self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, int(self.rng.integers(2**63))))
         if self._state_mappings() != found:
             self._steps_to_find = self._n_observed
-        predicted = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
-        self._judge(predicted)
-        self._claims.replay(seen, *predicted[1:])
+        effect, expected, weight = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
+        self._evidence.replay(seen, effect, expected, weight)
+        self._evidence.renew()
         self._n_fits += 1
         self._version += 1
         self._seconds += perf_counter() - began
@@ -181,17 +176,6 @@ class SoftHomomorphism(Transfer):
             effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect
             found[:, :, b] = soft.to_target(effects, self._readings, mapping, d).reshape(n, m, d)
         return found
-
-    def _judge(self, predicted: soft.Predicted) -> None:
-        """Decide by the recorded transitions how far the mixture is trusted, by target action, and of which variables."""
-        effects, actions = (column[: self._transitions.n] for column in (self._transitions.effects, self._transitions.actions))
-        effect, _, _, weight = predicted
-        taken = np.arange(self._bound_task.n_actions)[:, None] == actions
-        size = (taken @ np.abs(effects) / np.maximum(taken.sum(axis=1), 1)[:, None]).max(axis=0)
-        each = np.minimum(1.0, weight / self._bound_task.exploration_threshold)
-        compared = np.maximum(effects**2, np.maximum((LEAST_EFFECT * size) ** 2, 1e-300))
-        missed = taken @ (each[:, None] * np.minimum(LARGEST_MISS, (effect - effects) ** 2 / compared))
-        self._claims.renew(missed, np.repeat((taken @ each)[:, None], len(size), axis=1))
 
     def _state_mappings(self) -> list[int]:
         """The most probable mapping of states of each copy, in any order of the copies; none before the first fit."""
@@ -242,8 +226,7 @@ class SoftHomomorphism(Transfer):
         of_mapping = soft.probabilities(self._logits, self._readings)[0] if self._logits else np.full((1, 1), np.nan)
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
-            "transfer/prior_trust": float(self._claims.trust.mean()),
-            "transfer/prior_doubted": float(self._claims.evidence.doubted),
+            "transfer/prior_strength": self._evidence.mean_strength(),
             "transfer/mapping_probability": float(of_mapping.max(axis=1).mean()),
             "transfer/steps_to_find_mapping": self._steps_to_find,
             "transfer/fits": self._n_fits,
@@ -258,7 +241,7 @@ class SoftHomomorphism(Transfer):
             "transitions": self._transitions.rows(),
             "soft_state_logits": logits.state.ravel().copy(),
             "soft_action_logits": logits.action.ravel().copy(),
-            **self._claims.get_state("soft_"),
+            "soft_evidence": self._evidence.get_state(),
             "soft_figures": np.array(figures, dtype=np.float64),
         }
 
@@ -270,4 +253,4 @@ class SoftHomomorphism(Transfer):
         if self._n_fits:
             given = state["soft_state_logits"], state["soft_action_logits"]
             self._use(Logits(*(array.reshape(like.shape).copy() for array, like in zip(given, self._shape, strict=True))))
-        self._claims.set_state(state, "soft_")
+        self._evidence.set_state(state["soft_evidence"])

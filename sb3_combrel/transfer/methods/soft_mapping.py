@@ -18,7 +18,7 @@ NOTHING = -1
 MAX_STORED = 128  # predictions of the sample are stored for so many mappings with a source action
 BATCH = 4096  # pairs that are predicted at once
 
-Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Predicted = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Readings(NamedTuple):
@@ -149,7 +149,7 @@ def most_probable(of_mapping: np.ndarray, of_action: np.ndarray, max_terms: int,
 
 
 class MixturePredictions:
-    """Predicts by the mean over a mixture: of copies the sum of effects, mean reward, product of ends, least weight."""
+    """Predicts by the mean over a mixture: of copies the sum of effects, mean reward, least weight."""
 
     terms: Terms
 
@@ -163,11 +163,11 @@ class MixturePredictions:
         self.n_copies = 1 + int(terms.copy.max())
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
-        """Return effects, shape (n, n_target_variables); rewards, probabilities of termination, and weights, shape (n,)."""
+        """Return effects, shape (n, n_target_variables); rewards and weights, shape (n,)."""
         n, d = states.shape
         if n == len(self.sample) and n > 1 and (actions == actions[0]).all() and np.array_equal(states, self.sample):
             return self._predict_sample(int(actions[0]))
-        found = np.zeros((n, d)), np.zeros(n), np.ones(n), np.zeros(n)
+        found = np.zeros((n, d)), np.zeros(n), np.zeros(n)
         for first in range(0, n, BATCH):
             rows = slice(first, first + BATCH)
             for array, part in zip(found, self._predict_some(states[rows], actions[rows]), strict=True):
@@ -184,20 +184,21 @@ class MixturePredictions:
         effects = share[:, None] * to_target(predicted.effect, self.readings, mapping, d)
         effect = np.column_stack([np.bincount(row, effects[:, v], n) for v in range(d)])
         size = n * self.n_copies
-        each = [np.bincount(place, share * of_terms, size).reshape(n, self.n_copies) for of_terms in predicted[1:]]
-        return _joined(effect, each[0], each[1], each[2])
+        outcomes = predicted.reward, predicted.weight
+        each = [np.bincount(place, share * of_terms, size).reshape(n, self.n_copies) for of_terms in outcomes]
+        return effect, each[0].mean(axis=1), each[1].min(axis=1)
 
     def _predict_sample(self, action: int) -> Predicted:
         """Predict the whole sample, one term after the other; different states of the source once."""
         terms, (n, d) = self.terms, self.sample.shape
-        effect, each = np.zeros((n, d)), np.zeros((3, n, self.n_copies))
+        effect, each = np.zeros((n, d)), np.zeros((2, n, self.n_copies))
         for t in range(terms.first[action], terms.first[action + 1]):
             mapping = int(terms.mapping[t])
             kind, predicted = self._of_sample(mapping, int(terms.action[t]))
             effect += terms.share[t] * to_target(predicted.effect, self.readings, mapping, d)[kind]
-            for sums, of_kinds in zip(each, predicted[1:], strict=True):
+            for sums, of_kinds in zip(each, (predicted.reward, predicted.weight), strict=True):
                 sums[:, terms.copy[t]] += terms.share[t] * of_kinds[kind]
-        return _joined(effect, each[0], each[1], each[2])
+        return effect, each[0].mean(axis=1), each[1].min(axis=1)
 
     def _of_sample(self, mapping: int, action: int) -> tuple[np.ndarray, SourcePredictions]:
         """The number of each state's prediction, int32, shape (n_points,), and the predictions."""
@@ -209,8 +210,3 @@ class MixturePredictions:
                 del self._stored[next(iter(self._stored))]
             self._stored[mapping, action] = kind.astype(np.int32), predicted
         return self._stored[mapping, action]
-
-
-def _joined(effect: np.ndarray, reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> Predicted:
-    """Join what copies predict, shape (n, n_copies) each; effects have been added."""
-    return effect, reward.mean(axis=1), end.prod(axis=1), weight.min(axis=1)

@@ -9,13 +9,12 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.periodic import differences
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.prior.copy_predictions import CopyTable, UsePredictions, Uses, join_many, predict_pairs
-from sb3_combrel.transfer.prior.copy_sums import LEAST_EFFECT, CopyScratch, CopySums, add_transition, add_used
+from sb3_combrel.transfer.prior.copy_sums import CopySums, add_transition, add_used
 from sb3_combrel.transfer.source_model import SourceModel
 
 # From so many pairs on the different states of each copy are predicted once.
@@ -24,15 +23,13 @@ MANY = 256
 _add_transition, _add_used = EntryPoint(add_transition), EntryPoint(add_used)
 _predict_pairs, _join_many = EntryPoint(predict_pairs), EntryPoint(join_many)
 
-Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Predicted = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Copies:
     """Copies of sources in the target: each makes some target variables variables of a source.
 
-    A copy that leaves out source variables is predicted by a local linear model of the others alone. Where an end depends on
-    those left out, its probability is an average over them, and small everywhere; so it is in parts of the largest that the
-    model predicts of the instances which have ended an episode.
+    A copy that leaves out source variables is predicted by a local linear model of the others alone.
 
     :param source: number of each copy's source, int64, shape (n_copies,)
     :param state: source variable of each target variable, int64, shape (n_copies, n_target_variables), -1: not in the copy
@@ -66,36 +63,32 @@ class Copies:
                 n_actions += sources[key[0]].n_actions
         self.model = SourceModel(_seen_through(sources, list(first)), breadth)
         n_variables = self.model.n_variables
-        end_scales = {key: self._end_scale(*key, first[key]) for key in first}
         count = (state[:, :, None] == np.arange(n_variables)).sum(axis=1)
         self.table = CopyTable(
             variable=np.ascontiguousarray(state, dtype=np.int64),
             sign=np.ascontiguousarray(sign, dtype=np.float64),
             share=1.0 / np.maximum(count, 1),
-            least=(LEAST_EFFECT * self._typical_effects(by_action=False)) ** 2,
-            most=(LEAST_EFFECT * self._typical_effects(by_action=True)) ** 2,
-            end_scale=np.array([end_scales[key] for key in keys]),
             first=np.array([first[key] for key in keys], dtype=np.int64),
             n_actions=np.array([sources[s].n_actions for s in source], dtype=np.int64),
         )
         self._plain_table = tuple(self.table)
         #: Number of actions of the source that has most.
         self.most_actions = int(self.table.n_actions.max())
-        d = state.shape[1]
-        self._scratch = tuple(CopyScratch(np.empty(n_variables), np.empty(n_variables), np.empty(d), np.empty(d)))
+        self._scratch = np.empty(n_variables), np.empty(n_variables), np.empty(state.shape[1])
 
     def __len__(self) -> int:
         return len(self.source)
 
-    def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums, whole: bool) -> None:
-        """Add a target transition to the sums; ``whole``: variables that a copy does not have count as well, as staying."""
-        rules = whole, self.threshold
-        _add_transition.call(self.model.plain, self._plain_table, rules, (state, action, effect), tuple(sums), self._scratch)
+    def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums) -> None:
+        """Add a target transition to the sums."""
+        _add_transition.call(self.model.plain, self._plain_table, (state, action, effect), tuple(sums), self._scratch)
 
     def measure_used(self, uses: Uses, action: int, effect: np.ndarray, predicted: Predicted, sums: CopySums) -> None:
         """Add a target transition to the sums, for what makes up its action alone; ``predicted``: by :meth:`predict`."""
-        covered = min(1.0, float(predicted[3][0]) / self.threshold)
-        _add_used.call(self._plain_table, tuple(uses), (action, effect, predicted[0][0], covered), tuple(sums))
+        effects, _, [weight] = predicted
+        _add_used.call(
+            self._plain_table, tuple(uses), (action, effect, effects[0], float(weight)), tuple(sums), self._scratch[2]
+        )
 
     def uses(self, copies: np.ndarray, actions: np.ndarray) -> Uses:
         """List what makes up each target action; ``copies`` and ``actions`` as of ``Choice``."""
@@ -112,16 +105,16 @@ class Copies:
         """Make what :meth:`predict` works in."""
         n = len(uses.copy)
         # The last row is for a state as a copy has it.
-        return UsePredictions(np.zeros(n, dtype=np.bool_), np.empty((n + 1, self.model.n_variables)), np.empty((n + 1, 3)))
+        return UsePredictions(np.zeros(n, dtype=np.bool_), np.empty((n + 1, self.model.n_variables)), np.empty((n + 1, 2)))
 
     def predict(self, uses: Uses, found: UsePredictions, states: np.ndarray, actions: np.ndarray) -> Predicted:
         """Predict pairs of the target, in work space ``found``.
 
-        :return: effects, shape (n, n_target_variables), 0 for variables in no copy; mean rewards; products of probabilities of
-            termination; and the least weights of all copies, 0 for actions that are not complete
+        :return: effects, shape (n, n_target_variables), 0 for variables in no copy; mean rewards; and the least weights of all
+            copies, 0 for actions that are not complete
         """
         n, d = states.shape
-        predicted = np.empty((n, d)), np.empty(n), np.empty(n), np.empty(n)
+        predicted = np.empty((n, d)), np.empty(n), np.empty(n)
         plain_uses = tuple(uses)
         if n < MANY:
             _predict_pairs.call(self.model.plain, self._plain_table, plain_uses, (states, actions), predicted, tuple(found))
@@ -136,7 +129,7 @@ class Copies:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Predict each different state of each use once; the number of each pair's prediction, and the predictions."""
         rows = np.zeros((len(uses.copy), len(actions)), dtype=np.int64)
-        effects, outcomes, n = [np.empty((0, self.model.n_variables))], [np.empty((0, 3))], 0
+        effects, outcomes, n = [np.empty((0, self.model.n_variables))], [np.empty((0, 2))], 0
         for use, (copy, action) in enumerate(zip(uses.copy.tolist(), uses.action.tolist(), strict=True)):
             asked = np.flatnonzero((uses.of_action == use).any(axis=1)[actions])
             variables = np.flatnonzero(self.table.variable[copy] >= 0)
@@ -145,7 +138,7 @@ class Copies:
             found = self.model.predict(at, np.full(len(at), action, dtype=np.int64))
             rows[use, asked] = n + inverse
             effects.append(found.effect)
-            outcomes.append(np.column_stack([found.reward, found.end, found.weight]))
+            outcomes.append(np.column_stack([found.reward, found.weight]))
             n += len(at)
         return rows, np.concatenate(effects), np.concatenate(outcomes)
 
@@ -165,38 +158,6 @@ class Copies:
         sign = tuple(int(s) for s in np.where(self.sign[copy] < 0, -1, 1))
         mapping = InterTaskMapping(state, action, sign)
         return mapping.with_names(source.state_names, task.state_names, source.action_names, task.action_names)
-
-    def _end_scale(self, number: int, used: tuple[int, ...], first: int) -> float:
-        """One over the largest probability of termination where episodes ended, or 1 for a copy of all variables."""
-        source = self.sources[number]
-        ended = np.flatnonzero(source.terminated)
-        if len(used) == source.n_variables or len(ended) == 0:
-            return 1.0
-        states = np.zeros((len(ended), self.model.n_variables))
-        states[:, list(used)] = source.scaling.to_unit(source.states[ended])[:, list(used)]
-        largest = float(self.model.predict(states, first + source.actions[ended]).end.max())
-        return 1.0 / largest if largest > 0.0 else 1.0
-
-    def _typical_effects(self, by_action: bool) -> np.ndarray:
-        """How much each source moves its copies, shape (n_copies, n_target_variables); 0 for variables not in one."""
-        typical = [_typical_effects_of(source, by_action) for source in self.sources]
-        found = np.zeros(self.state.shape)
-        for copy, (number, row) in enumerate(zip(self.source.tolist(), self.state, strict=True)):
-            found[copy, row >= 0] = typical[number][row[row >= 0]]
-        return found
-
-
-def _typical_effects_of(source: SourceInstances, by_action: bool) -> np.ndarray:
-    """Median size of the effects, or their mean if most are 0: the largest of all actions', or over all; (n_variables,)."""
-    to_unit = source.scaling.to_unit
-    size = np.abs(differences(to_unit(source.next_states), to_unit(source.states), np.array(source.periodic)))
-    largest = np.zeros(source.n_variables)
-    groups = source.actions if by_action else np.zeros_like(source.actions)
-    for action in np.unique(groups):
-        of_action = size[groups == action]
-        median = np.median(of_action, axis=0)
-        largest = np.maximum(largest, np.where(median > 0.0, median, of_action.mean(axis=0)))
-    return largest
 
 
 def distinct_rows(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

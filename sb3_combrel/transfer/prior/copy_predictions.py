@@ -16,11 +16,6 @@ class CopyTable(NamedTuple):
     variable: np.ndarray  # int64, shape (n_copies, n_target_variables): source variable that a target variable is, -1: none
     sign: np.ndarray  # float64, same shape: -1 where it is mirrored
     share: np.ndarray  # float64, shape (n_copies, n_source_variables): 1 / number of target variables that it has
-    # Float64, shape (n_copies, n_target_variables): squared effect that errors are compared with at least, as of all actions;
-    # and what it may grow to where the target moves more, as of the action that moves the variable most.
-    least: np.ndarray
-    most: np.ndarray
-    end_scale: np.ndarray  # float64, shape (n_copies,): factor on probabilities of termination, which are 1 at most
     first: np.ndarray  # int64, shape (n_copies,): the model's number of the source's first action
     n_actions: np.ndarray  # int64, same shape
 
@@ -39,7 +34,7 @@ class UsePredictions(NamedTuple):
 
     done: np.ndarray  # bool, shape (n_uses,)
     effect: np.ndarray  # float64, shape (n_uses + 1, n_source_variables): the last row is for a state as a copy has it
-    outcome: np.ndarray  # float64, shape (n_uses + 1, 3): reward, probability of termination, weight
+    outcome: np.ndarray  # float64, shape (n_uses + 1, 2): reward, weight
 
 
 @inlined
@@ -72,7 +67,7 @@ def predict_pairs(source, table, uses, pairs, predicted, found):
                 copy = uses.copy[use]
                 see_state(table, copy, states[i], at)
                 effect, outcome = found.effect[use], found.outcome[use]
-                outcome[0], outcome[1], outcome[2] = predict_source(instances, kernel, fit, away, uses.action[use], at, effect)
+                outcome[0], _, outcome[1] = predict_source(instances, kernel, fit, away, uses.action[use], at, effect)
                 found.done[use] = True
         join_copies(table, uses, actions[i], i, found.effect, found.outcome, predicted)
 
@@ -80,11 +75,10 @@ def predict_pairs(source, table, uses, pairs, predicted, found):
 @inlined
 def join_copies(table, uses, action, i, effects, outcomes, predicted):
     """Write to ``predicted``, see ``Copies.predict``, what all copies predict of pair ``i``; the others: of each use."""
-    effect, reward, end, weight = predicted
+    effect, reward, weight = predicted
     effect[i, :] = 0.0
     n = 0
     total = 0.0
-    ends = 1.0
     least = np.inf
     for c in range(uses.of_action.shape[1]):
         use = uses.of_action[action, c]
@@ -92,14 +86,12 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
             continue
         n += 1
         total += outcomes[use, 0]
-        ends *= min(1.0, table.end_scale[uses.copy[use]] * outcomes[use, 1])
-        least = min(least, outcomes[use, 2])
+        least = min(least, outcomes[use, 1])
         for v in range(effect.shape[1]):
             k = table.variable[uses.copy[use], v]
             if k >= 0:
                 effect[i, v] = table.sign[uses.copy[use], v] * effects[use, k]
     reward[i] = total / n if n > 0 else 0.0
-    end[i] = ends if n > 0 else 0.0
     weight[i] = least if n > 0 and uses.complete[action] else 0.0
 
 
@@ -119,6 +111,6 @@ def join_many(table, uses, actions, found, predicted):
                 row = rows[use, i]
                 for k in range(effects.shape[1]):
                     effect_here[use, k] = effects[row, k]
-                for k in range(3):
+                for k in range(2):
                     outcome_here[use, k] = outcomes[row, k]
         join_copies(table, uses, actions[i], i, effect_here, outcome_here, predicted)

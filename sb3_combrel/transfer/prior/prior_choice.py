@@ -1,4 +1,4 @@
-"""Which copies of the source the target is made of, and which source action moves each: chosen by compliance, or drawn."""
+"""Which copies of the source the target is made of, and which source action moves each: chosen by evidence, or drawn."""
 
 from __future__ import annotations
 
@@ -10,10 +10,6 @@ import numpy as np
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 
-# A mean compliance below this counts as this: one that is nothing must not outweigh all others.
-SMALLEST_COMPLIANCE = 1e-9
-# By this factor, for each of its variables, a copy must comply better than "they stay": some source action fits any noise.
-MIN_GAIN = 1.05
 # Divisions are searched subset by subset of the target's variables.
 MAX_FACTORED_VARIABLES = 12
 
@@ -38,46 +34,41 @@ Chooser = Callable[[CopySums], Choice]
 
 
 def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Find the source action of highest mean compliance for each copy and target action, each on its own.
+    """Find the source action with most evidence for each copy and target action, each on its own.
 
     :param allowed: bool, shape (n_copies, n_target_actions, most source actions): what may be chosen; None: everything
-    :return: the actions, int64, shape (n_copies, n_target_actions), -1 for none; and their mean compliances
+    :return: the actions, int64, shape (n_copies, n_target_actions), -1 for none; and the evidence, -inf for none
     """
-    exists = np.arange(copies.most_actions) < copies.table.n_actions[:, None, None]
-    exists = np.broadcast_to(exists, sums.compliance.shape)
-    mean = sums.compliance / np.maximum(sums.n, 1.0)[:, None]
-    mean = np.where(exists if allowed is None else exists & allowed, mean, -1.0)
-    action = mean.argmax(axis=2)
-    best = mean.max(axis=2)
-    return np.where((best < 0.0) | (sums.n == 0.0), -1, action), np.maximum(best, 0.0)
+    gain = sums.gain.sum(axis=3)
+    exists = np.broadcast_to(np.arange(copies.most_actions) < copies.table.n_actions[:, None, None], gain.shape)
+    gain = np.where(exists if allowed is None else exists & allowed, gain, -np.inf)
+    best = np.where(sums.n == 0.0, -np.inf, gain.max(axis=2))
+    return np.where(best == -np.inf, -1, gain.argmax(axis=2)), best
 
 
 def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choice:
-    """Choose for each target action the state mapping (a copy) and source action of highest mean compliance."""
-    action, mean = best_actions(copies, sums, allowed)
-    mean = np.where(action < 0, -1.0, mean)
-    best = mean.argmax(axis=0)
+    """Choose for each target action the state mapping (a copy) and source action with most evidence."""
+    action, gain = best_actions(copies, sums, allowed)
+    best = gain.argmax(axis=0)
     chosen = action[best, np.arange(len(best))]
     return Choice(np.where(chosen < 0, -1, best)[:, None], chosen[:, None])
 
 
 def choose_factored(copies: Copies, sums: CopySums) -> Choice:
-    """Choose the division into copies and variables that stay of the highest ``equations.division_score``."""
-    action, mean = best_actions(copies, sums)
-    scores = np.log(np.maximum(mean, SMALLEST_COMPLIANCE)) @ sums.n
-    scores -= np.log(MIN_GAIN) * sums.n.sum() * (copies.state >= 0).sum(axis=1)
-    stay = sums.stay / np.maximum(sums.n, 1.0)[:, None]
-    stays = sums.n @ np.log(np.maximum(stay, SMALLEST_COMPLIANCE))
-    chosen = best_division(copies.state >= 0, scores, stays)
+    """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``."""
+    action, gain = best_actions(copies, sums)
+    taken = sums.n > 0.0
+    scores = np.where(taken, gain, 0.0).sum(axis=1) - taken.sum() * np.log(copies.table.n_actions) - np.log(len(copies))
+    chosen = best_division(copies.state >= 0, scores)
     n_actions = len(sums.n)
     return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), action[chosen].T.copy())
 
 
-def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) -> list[int]:
-    """Find the disjoint copies whose scores, with those of the variables in none, add up to most; by their first variable.
+def best_division(members: np.ndarray, scores: np.ndarray) -> list[int]:
+    """Find the disjoint copies whose scores add up to most; by their first variable.
 
     By dynamic programming over the subsets of the variables that are divided already. ``members``: the variables of each copy,
-    bool, shape (n_copies, n_variables); ``scores``: of each copy; ``stays``: of each variable in no copy.
+    bool, shape (n_copies, n_variables); ``scores``: of each copy; of variables in no copy it is 0.
     """
     n_variables = members.shape[1]
     masks = members @ (1 << np.arange(n_variables))
@@ -96,7 +87,7 @@ def best_division(members: np.ndarray, scores: np.ndarray, stays: np.ndarray) ->
         score, chosen = found[taken]
         v = (~taken & (taken + 1)).bit_length() - 1
         options = [(mask, float(scores[copy]), (*chosen, copy)) for mask, copy in starting[v] if not mask & taken]
-        for mask, more, with_it in [*options, (1 << v, float(stays[v]), chosen)]:
+        for mask, more, with_it in [*options, (1 << v, 0.0, chosen)]:
             if taken | mask not in found or score + more > found[taken | mask][0]:
                 found[taken | mask] = score + more, with_it
     return list(found[full][1])

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sb3_combrel.transfer.equations import prediction_compliances
-from sb3_combrel.transfer.prior.copy_sums import SMALLEST_SCALE
+from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
 from sb3_combrel.transfer.prior.prior_choice import Choice, best_actions
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
@@ -24,7 +24,7 @@ class _Sample:
         rows = np.linspace(0.0, seen.n, min(seen.n, MAX_TRANSITIONS), endpoint=False).astype(np.int64)
         self.states, self.actions, self.effects = seen.states[rows], seen.actions[rows], seen.effects[rows]
         size = np.abs(self.effects).sum(axis=0) / max(len(rows), 1)
-        self.scale = np.maximum(size**2, SMALLEST_SCALE)
+        self.scale = np.maximum(size**2, SMALLEST_ERROR**2)
 
     def judge(self, choice: Choice | None, action: int | None = None) -> tuple[float, float]:
         """Mean compliance of a choice, or of "no change", and its error over that of "no change"; NaN for none."""
@@ -41,10 +41,17 @@ class _Sample:
         return float(compliance.mean()), error / moved if moved > 0.0 else np.nan
 
 
+def compliance_of_prior(prior: SourcePrior) -> np.ndarray:
+    """Mean compliance of what each target action is taken for, shape (n_target_actions,); NaN where nothing is chosen."""
+    sample = _Sample(prior)
+    chosen = [
+        prior.choice if prior.choice is not None and prior.choice.moves(a) else None for a in range(prior.task.n_actions)
+    ]
+    return np.array([np.nan if choice is None else sample.judge(choice, a)[0] for a, choice in enumerate(chosen)])
+
+
 def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, float]) -> TransferReport:
     """Report what a source was taken for; ``method``: with its arguments, as text; ``statistics``: its figures of the log."""
-    names = prior.task.action_names
-    pairs = np.argwhere(~prior.claims.explains)
     choice, sample = prior.choice, _Sample(prior)
     mappings: tuple[MappingReport, ...] = ()
     next_best = "", np.nan
@@ -57,15 +64,13 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         use="prior",
         sources=describe_sources(prior.sources),
         n_steps=prior.n_observed,
-        n_rested=prior.n_claimed,
         mappings=mappings,
         error=prior.error(),
         next_best=next_best[0],
         next_best_error=next_best[1],
-        not_used=tuple((names[a], prior.task.state_names[v]) for a, v in pairs.tolist()),
         bounds_values=prior.value_bound() is not None,
         statistics=statistics,
-        **prior.errors.report_fields(prior.claims.evidence),
+        **prior.errors.report_fields(),
     )
 
 
@@ -96,7 +101,7 @@ def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, o
         error=error,
         next_best_error=next_best[2],
         n_compared=n_compared,
-        trust=float(prior.claims.trust[action]),
+        strength=float(np.exp(np.log(prior.evidence.strength[action]).mean())),
     )
 
 
@@ -105,7 +110,7 @@ def _alternatives(prior: SourcePrior, choice: Choice) -> list[Choice]:
     if prior.choose is None:
         return []
     used = np.nonzero((choice.copies >= 0) & (choice.actions >= 0))
-    sums = prior.measured_sums().excluding(choice.copies[used], used[0], choice.actions[used])
+    sums = prior.sums.excluding(choice.copies[used], used[0], choice.actions[used])
     if prior.whole:
         return [prior.choose(sums)]
     other_actions, _ = best_actions(prior.copies, sums)
@@ -125,7 +130,7 @@ def _next_division(prior: SourcePrior, choice: Choice, sample: _Sample) -> tuple
         return "", np.nan
     best, name, error = -1.0, "", np.nan
     for copy in np.unique(choice.copies[choice.copies >= 0]).tolist():
-        other = prior.choose(prior.measured_sums().excluding(copy, slice(None), slice(None)))
+        other = prior.choose(prior.sums.excluding(copy, slice(None), slice(None)))
         its_compliance, its_error = sample.judge(other)
         if its_compliance > best:
             best, name, error = its_compliance, prior.candidates.describe_copies(other), its_error

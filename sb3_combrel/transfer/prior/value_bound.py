@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sb3_combrel.planning.planner import Planner
@@ -12,6 +14,9 @@ from sb3_combrel.transfer.prior.prior_choice import Choice
 from sb3_combrel.transfer.source_model import SourceModel
 from sb3_combrel.transfer.source_policy import MAX_STEPS, MAX_SWEEPS, planning_tolerance, source_mdp
 
+# What a source's data must weigh to bound a value: an instance that lies one and a half breadths away does.
+LEAST_WEIGHT = 0.1
+
 
 class ValueBound:
     """Bounds the values of the target's states by those of the source's states that they are taken for.
@@ -20,15 +25,16 @@ class ValueBound:
     learning", AAAI 2008), which comes from another task through a mapping, as in Mann & Choe, "Directed exploration in
     reinforcement learning with transferred knowledge", EWRL 2012.
 
-    The source's values are those of Fitted R-Max's planning with its local linear model: where it has too few data (a weight
-    below ``min_weight``), a pair is worth ``max_value``. A target of several copies ends when all of them have ended: if every
-    step costs the same, the least of their values bounds it. Otherwise nothing is said of several.
+    The source's values are those of Fitted R-Max's planning with its local linear model: where it has no data to speak of (a
+    weight below ``LEAST_WEIGHT``), a pair is worth ``max_value``. A target of several copies ends when all of them have ended:
+    if every step costs the same, the least of their values bounds it. Otherwise nothing is said of several.
+
+    A bound is contradicted by one thing only: a return to go that exceeds it, see :meth:`excess`.
     """
 
-    def __init__(self, copies: Copies, task: TargetTask, min_weight: float):
+    def __init__(self, copies: Copies, task: TargetTask):
         self._copies = copies
         self._task = task
-        self._min_weight = min_weight
         #: By number of the source: a planner that has its values.
         self._planners: dict[int, Planner] = {}
         self._of_copy: dict[int, np.ndarray] = {}
@@ -45,6 +51,27 @@ class ValueBound:
         bounds = [self._bound(copy) for copy in used if self._is_whole(copy)]
         return np.minimum.reduce(bounds) if bounds else None
 
+    def excess(self, choice: Choice, episode: Sequence[tuple[np.ndarray, float]]) -> float:
+        """Return by how much the returns to go of an episode exceed what the source's values bound them by, at least 0.
+
+        Within a cell of the source's grid a value is no more than the largest at its corners.
+
+        :param choice: that bounds values, see :meth:`through`
+        :param episode: states, unit coordinates, and rewards
+        """
+        largest, to_go = 0.0, 0.0
+        used = [copy for copy in choice.copies[0].tolist() if copy >= 0 and self._is_whole(copy)]
+        for state, reward in reversed(episode):
+            to_go = reward + self._task.gamma * to_go
+            bounds = []
+            for copy in used:
+                planner = self._planner(copy)
+                grid = planner.mdp.grid
+                at = self._copies.as_copy(copy, state[None])[0, : grid.n_variables]
+                bounds.append(float(planner.values[grid.cell_around(at)].max()))
+            largest = max(largest, to_go - min(bounds))
+        return largest
+
     def _costs_are_alike(self, used: list[int]) -> bool:
         rewards = np.concatenate([self._copies.sources[self._copies.source[copy]].rewards for copy in used])
         return bool(rewards.max() <= 0.0 and rewards.max() - rewards.min() <= 1e-9)
@@ -57,21 +84,24 @@ class ValueBound:
     def _bound(self, copy: int) -> np.ndarray:
         """The source's value at the state that each state of the target's sample is in a copy."""
         if copy not in self._of_copy:
-            number = int(self._copies.source[copy])
-            if number not in self._planners:
-                self._planners[number] = self._plan(number)
-            planner = self._planners[number]
+            planner = self._planner(copy)
             grid = planner.mdp.grid
             at = self._copies.as_copy(copy, self._task.sample_states)[:, : grid.n_variables]
             different, kind = distinct_rows(at)
             self._of_copy[copy] = np.array([grid.interpolate(planner.values, at[i]) for i in different])[kind]
         return self._of_copy[copy]
 
+    def _planner(self, copy: int) -> Planner:
+        number = int(self._copies.source[copy])
+        if number not in self._planners:
+            self._planners[number] = self._plan(number)
+        return self._planners[number]
+
     def _plan(self, number: int) -> Planner:
         """Plan in a source, from above: values are upper bounds after any number of sweeps."""
         source, breadth = self._copies.sources[number], self._copies.breadth
         model = SourceModel(stacked_instances([source]), breadth)
-        mdp = source_mdp(source, model, self._task.gamma, breadth, self._min_weight)
+        mdp = source_mdp(source, model, self._task.gamma, breadth, LEAST_WEIGHT)
         highest = self._task.max_value
         # Lower than so many sweeps can get.
         lowest = min(0.0, highest) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
