@@ -123,6 +123,12 @@ def fit_around(at, action, length, instances, target, kernel, fit):
 
 
 @inlined
+def weight_of_nearest(fit, length, kernel):
+    """The weight of a fit's nearest instance, in parts of which those of all are."""
+    return np.exp(fit.distance[0] * kernel_scale(fit, length, kernel))
+
+
+@inlined
 def join_prior(weights, kernel, length, fit):
     """Let a fit to residuals know that a prior says of each effect that they are 0, as so many instances at its very state.
 
@@ -132,8 +138,7 @@ def join_prior(weights, kernel, length, fit):
     :param weights: float64, shape (n_variables,)
     """
     d = len(weights)
-    # A fit's weights are seen from its nearest instance.
-    nearest = np.exp(fit.distance[0] * kernel_scale(fit, length, kernel))
+    nearest = weight_of_nearest(fit, length, kernel)
     for v in range(d):
         p = weights[v] / nearest
         if p > 0.0:

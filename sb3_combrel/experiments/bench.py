@@ -31,6 +31,7 @@ def _kernel(breadth: float, resolution: int = 3, min_fraction: float = 0.1) -> d
 _CAR_2D, _CAR_4D, _CAR_6D = (f"combrel/MountainCar{n}D-v0" for n in (2, 4, 6))
 _SHORT: dict[str, Any] = dict(max_episode_steps=2000)
 CASES = (
+    Case("Mountain Car 2D, local linear", _CAR_2D, _SHORT, {}, 50),
     Case("Mountain Car 2D, breadth 1/16, resolution 4", _CAR_2D, dict(start="fixed"), _kernel(1 / 16, 4, 0.01), 50),
     Case("Mountain Car 4D, breadth 0.4, resolution 3", _CAR_4D, {}, _kernel(0.4), 200),
     Case("the same with COMBREL", _CAR_4D, {}, _kernel(0.4), 200, transfers=True),
@@ -42,6 +43,7 @@ CASES = (
     Case("Mountain Car 6D, local linear, resolution 2", _CAR_6D, _SHORT, {}, 8),
 )
 COMPARED_EPISODES = 200
+DQN_STEPS = 2000
 
 _IMPORT = """
 import time
@@ -111,8 +113,23 @@ def learn(case: Case, n_episodes: int, seed: int = 0) -> tuple[int, float]:
     return model.num_timesteps, time.process_time() - start
 
 
-def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, float, float]:
-    """Measure steps, milliseconds a step and MiB beyond the imports of case ``number``, all compiled, in a new process."""
+def dqn_milliseconds(case: Case, n_steps: int = DQN_STEPS) -> float:
+    """Measure the milliseconds of processor time that a step of Stable-Baselines3's DQN takes on the environment of a case."""
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.env_util import make_vec_env
+
+    env = make_vec_env(case.env_id, seed=0, env_kwargs=case.env_kwargs)
+    model = DQN("MlpPolicy", env, learning_starts=100, seed=0)
+    start = time.process_time()
+    model.learn(n_steps, log_interval=None)  # type: ignore[arg-type]
+    return 1000.0 * (time.process_time() - start) / n_steps
+
+
+def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, float, float, float]:
+    """Measure a case in a new process, all compiled.
+
+    :return: steps, milliseconds a step, MiB beyond the imports, and milliseconds that a step of DQN takes there
+    """
     code = (
         "import torch; torch.set_num_threads(1)\n"
         "from sb3_combrel.experiments import bench\n"
@@ -121,10 +138,10 @@ def measure(number: int, fraction: float = 1.0, seed: int = 0) -> tuple[int, flo
         "bench.learn(case, 1, seed=1)\n"
         "before = bench.resident_memory()\n"
         f"steps, seconds = bench.learn(case, max(1, round({fraction} * case.n_episodes)), {seed})\n"
-        "print(steps, 1000 * seconds / steps, bench.resident_memory() - before)"
+        "print(steps, 1000 * seconds / steps, bench.resident_memory() - before, bench.dqn_milliseconds(case))"
     )
-    steps, milliseconds, memory = _printed(code)[-3:]
-    return int(steps), float(milliseconds), float(memory)
+    steps, milliseconds, memory, of_dqn = _printed(code)[-4:]
+    return int(steps), float(milliseconds), float(memory), float(of_dqn)
 
 
 def compare(n_pairs: int, fraction: float) -> None:
@@ -137,14 +154,14 @@ def compare(n_pairs: int, fraction: float) -> None:
         fractions = [fraction * COMPARED_EPISODES / CASES[n].n_episodes for n in numbers]
         with ThreadPoolExecutor(2) as pool:
             for seed in range(n_pairs):
-                (_, without, _), (_, transferring, _) = pool.map(measure, numbers, fractions, (seed, seed))
+                (_, without, *_), (_, transferring, *_) = pool.map(measure, numbers, fractions, (seed, seed))
                 added.append(transferring / without - 1.0)
                 print(f"seed {seed:2}: {without:.3f} {transferring:.3f} {added[-1]:+.0%}", flush=True)
         print(f"mean {sum(added) / n_pairs:+.0%}, from {min(added):+.0%} to {max(added):+.0%}")
 
 
 def main() -> None:
-    """Run the command line: print the table."""
+    """Run the command line: print the table; "of DQN": a step over one of Stable-Baselines3's DQN, in the same process."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--fraction", "--part", type=float, default=1.0, help="fraction of each case's episodes to run")
     parser.add_argument("--pairs", type=int, default=0, help="instead: what transfer adds to a step, in so many pairs of runs")
@@ -153,11 +170,12 @@ def main() -> None:
     if arguments.pairs > 0:
         compare(arguments.pairs, fraction)
         return
-    print(f"{'case':45} {'episodes':>8} {'steps':>7} {'ms/step':>8} {'MiB':>6}")
+    print(f"{'case':45} {'episodes':>8} {'steps':>7} {'ms/step':>8} {'MiB':>6} {'of DQN':>7}")
     for number, case in enumerate(CASES):
-        steps, milliseconds, memory = measure(number, fraction)
+        steps, milliseconds, memory, of_dqn = measure(number, fraction)
         n_episodes = max(1, round(fraction * case.n_episodes))
-        print(f"{case.name:45} {n_episodes:8} {steps:7} {milliseconds:8.2f} {memory:6.0f}", flush=True)
+        figures = f"{steps:7} {milliseconds:8.2f} {memory:6.0f} {milliseconds / of_dqn:7.2f}"
+        print(f"{case.name:45} {n_episodes:8} {figures}", flush=True)
     print(f"import, beyond that of Stable-Baselines3: {import_seconds():.2f} s")
     without, transferring = first_use_seconds()
     print(f"first use, nothing compiled: {without:.1f} s, and the first use of COMBREL {transferring:.1f} s more")

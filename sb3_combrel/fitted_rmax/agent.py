@@ -222,7 +222,7 @@ class FittedRMaxAgent:
     def _take_in(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         """Give a transition to the model and to the transfer method."""
         if self.transfer is not None and self.transfer.use == "prior":
-            self.transfer.note_prediction(self.model.predict_alone(state, action))
+            self.transfer.note_prediction(*self.model.predict_alone(state, action))
         self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
         if self.transfer is not None:
             self.transfer.observe(state, action, reward, next_state, terminated)

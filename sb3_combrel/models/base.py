@@ -161,9 +161,12 @@ class Model(ABC):
         arrays = map(np.ascontiguousarray, (predictions.probability, predictions.effect))
         return Prediction(modelled, weight, predictions.reward, length, *arrays), given
 
-    def predict_alone(self, state: np.ndarray, action: int) -> np.ndarray:
-        """Predict the effect of an action without a prior, shape (n_variables,); NaN where nothing is predicted."""
-        return np.full(self.grid.n_variables, np.nan)
+    def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
+        """Predict the effect of an action at a state without a prior.
+
+        :return: shape (n_variables,); and by how much the variance of one instance is multiplied, 0 if nothing is predicted
+        """
+        return np.zeros(self.grid.n_variables), 0.0
 
     def renew_prior(self) -> np.ndarray:
         """Ask the transfer method for its prior again if that may have changed; the pairs whose rows are to be updated."""

@@ -8,7 +8,7 @@ from sb3_combrel.common.compiled import compiled, inlined, part
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances, squared_distance
-from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, join_prior, known_weight, number_at
+from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, join_prior, known_weight, number_at, weight_of_nearest
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
@@ -117,15 +117,19 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
 
 @compiled
 def predict_alone(instances, kernel, state, action, fit, scratch, effect):
-    """Write to ``effect`` what the instances alone predict of an action, NaN without any near the state; plain tuples."""
+    """Write to ``effect`` what the instances alone predict of an action, without a prior; plain tuples.
+
+    :return: the fit's leverage, by which the variance of one instance is multiplied; 0 without any instance near the state
+    """
     instances, kernel, fit, scratch = Instances(*instances), Kernel(*kernel), LocalFit(*fit), LinearScratch(*scratch)
     length = find_nearest(state, action, 0, instances, kernel, fit)
-    effect[:] = np.nan
+    if length == 0:
+        return 0.0
+    fit_around(state, action, length, instances, instances.effect, kernel, fit)
     scratch.away[:] = 0.0
-    if length > 0:
-        fit_around(state, action, length, instances, instances.effect, kernel, fit)
-        for v in range(len(state)):
-            effect[v] = number_at(fit, v, scratch.away)
+    for v in range(len(state)):
+        effect[v] = number_at(fit, v, scratch.away)
+    return fit.solution[0, len(state) + 1] / weight_of_nearest(fit, length, kernel)
 
 
 @compiled

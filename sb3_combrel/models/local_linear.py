@@ -131,11 +131,10 @@ class LocalLinear(GridModel):
         _weigh.call(self._plain_experience[0], self.grid.plain, self._plain_kernel, pairs, self._fit, at, found)
         return found
 
-    def predict_alone(self, state: np.ndarray, action: int) -> np.ndarray:
-        """Predict the effect of an action without a prior, shape (n_variables,); NaN without any instance near the state."""
-        found = np.empty(self.grid.n_variables)
-        _predict_alone.call(self._plain_experience[0], self._plain_kernel, state, action, self._fit, self._scratch, found)
-        return found
+    def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
+        found = np.zeros(self.grid.n_variables)
+        given = self._plain_experience[0], self._plain_kernel, state, action
+        return found, float(_predict_alone.call(*given, self._fit, self._scratch, found))
 
     def _predict_own(self, state: np.ndarray) -> float:
         model, prior = (self._plain_experience, self._plain_linear), self._prior_at(state)

@@ -129,12 +129,13 @@ class Transfer(ABC):
         :param terminated: the episode ended in a terminal state; a time limit is none
         """
 
-    def note_prediction(self, effect: np.ndarray) -> None:  # noqa: B027 - a method may well ignore it
+    def note_prediction(self, effect: np.ndarray, leverage: float) -> None:  # noqa: B027 - a method may well ignore it
         """Take in what the target's own instances alone predict of the transition that :meth:`observe` takes in next.
 
         Called only if :attr:`use` is "prior": whether a source helps to predict is measured by it.
 
-        :param effect: next state minus state, unit coordinates, shape (n_variables,); NaN where nothing is predicted
+        :param effect: next state minus state, unit coordinates, shape (n_variables,)
+        :param leverage: by how much the variance of one instance is multiplied in it; 0 if nothing is predicted
         """
 
     def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it

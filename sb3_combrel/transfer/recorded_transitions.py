@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_COLUMNS = ("states", "effects", "rewards", "actions", "ended", "predicted", "is_predicted")  # the arrays, which grow together
+_COLUMNS = ("states", "effects", "rewards", "actions", "ended", "predicted", "leverage")  # the arrays, which grow together
 
 
 class RecordedTransitions:
@@ -17,8 +17,8 @@ class RecordedTransitions:
         self.n = 0
         self.states, self.effects, self.rewards = np.empty((64, n_variables)), np.empty((64, n_variables)), np.empty(64)
         self.actions, self.ended = np.empty(64, dtype=np.int64), np.empty(64, dtype=np.int64)
-        #: Effects that the target's own instances alone predicted, and whether they did.
-        self.predicted, self.is_predicted = np.zeros((64, n_variables)), np.zeros(64, dtype=np.bool_)
+        #: Effects that the target's own instances alone predicted, and with which leverage; 0 where they did not.
+        self.predicted, self.leverage = np.zeros((64, n_variables)), np.zeros(64)
 
     def add(
         self,
@@ -27,11 +27,11 @@ class RecordedTransitions:
         reward: float,
         effect: np.ndarray,
         terminated: bool = False,
-        predicted: np.ndarray | None = None,
+        own: tuple[np.ndarray, float] | None = None,
     ) -> int:
         """Record one transition; ``effect``: next state minus state; return its number.
 
-        :param predicted: the effect that the target's own instances alone predicted; None or NaN for nothing
+        :param own: the effect that the target's own instances alone predicted, and its leverage; None for nothing
         """
         if self.n == len(self.rewards):
             for name in _COLUMNS:
@@ -41,8 +41,7 @@ class RecordedTransitions:
         self.states[i], self.effects[i] = state, effect
         self.rewards[i], self.actions[i] = reward, action
         self.ended[i] = self.TERMINATED if terminated else self.GOES_ON
-        self.is_predicted[i] = predicted is not None and not np.isnan(predicted[0])
-        self.predicted[i] = predicted if self.is_predicted[i] else 0.0
+        self.predicted[i], self.leverage[i] = (0.0, 0.0) if own is None else own
         self.n += 1
         return i
 
@@ -52,7 +51,7 @@ class RecordedTransitions:
             self.ended[self.n - 1] = self.TIME_LIMIT
 
     def rows(self) -> np.ndarray:
-        """Return all of them, one a row: state, effect, reward, action, ended, predicted effect, whether it is.
+        """Return all of them, one a row: state, effect, reward, action, ended, predicted effect, its leverage.
 
         :return: shape (n, 3 * n_variables + 4)
         """
@@ -64,4 +63,4 @@ class RecordedTransitions:
         for row in rows:
             self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])
         self.ended[: self.n] = rows[:, 2 * d + 2]
-        self.predicted[: self.n], self.is_predicted[: self.n] = rows[:, 2 * d + 3 : -1], rows[:, -1] > 0.5
+        self.predicted[: self.n], self.leverage[: self.n] = rows[:, 2 * d + 3 : -1], rows[:, -1]

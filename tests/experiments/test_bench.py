@@ -22,5 +22,6 @@ def test_what_transfer_adds_is_printed_pair_by_pair_and_in_the_mean(monkeypatch,
 
 
 def test_a_fraction_of_a_cases_episodes_is_learnt_with_the_same_steps_each_time():
-    steps, milliseconds, memory = bench.measure(0, fraction=0.04)
+    steps, milliseconds, memory, of_dqn = bench.measure(0, fraction=0.04)
     assert (steps, milliseconds > 0.0, memory > 0.0) == (bench.learn(bench.CASES[0], 2)[0], True, True)
+    assert of_dqn > 0.0

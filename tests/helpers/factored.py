@@ -142,7 +142,7 @@ def show(transfer, transitions, rewards=None, ends=None, own_error=None):
     versions = []
     for i, (state, action, effect) in enumerate(zip(states, actions.tolist(), effects, strict=True)):
         reward = -1.0 if rewards is None else float(rewards[i])
-        transfer.note_prediction(np.full(len(effect), np.nan) if own_error is None else effect + own_error)
+        transfer.note_prediction(effect + (own_error or 0.0), 0.0 if own_error is None else 1.0)
         transfer.observe(state, action, reward, state + effect, False if ends is None else bool(ends[i]))
         versions.append(transfer.prior_version())
     return versions

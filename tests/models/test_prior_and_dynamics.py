@@ -37,7 +37,10 @@ def test_a_prior_counts_as_so_many_instances_at_the_state_and_for_more_away_from
     near, far = (model.predict_at(at)[0].effect[0, 0].copy() for at in (state, state + away))
     np.testing.assert_allclose(near, 0.1 / (1.0 + weight * np.array([1.0, 0.5])), rtol=1e-9)
     assert (far < 0.05 * near).all() if weight else (far == near).all()
-    np.testing.assert_allclose(model.predict_alone(state + away, 0), 0.1, rtol=1e-9)
+    alone, leverage = model.predict_alone(state, 0)
+    np.testing.assert_allclose(alone, 0.1, rtol=1e-9)
+    assert leverage == pytest.approx(1.0) and model.predict_alone(state + away, 0)[1] > 10.0
+    assert model.predict_alone(state + 5.0, 0)[1] == 0.0, "nothing is near"
 
 
 def test_a_prior_is_asked_again_when_its_version_has_grown_and_only_then():

@@ -8,10 +8,11 @@ from helpers import factored as f
 from helpers.factored import bound, inside, naive_prediction, show
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR, PriorEvidence
+from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR, STRENGTHS, PriorEvidence
 from sb3_combrel.transfer.source_model import SourceModel
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
@@ -243,24 +244,30 @@ def test_predictions_are_those_of_a_weighted_regression(seed, d, n, breadth, n_n
 # How much a source's effects weigh.
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 40))
-def test_strength_is_the_mean_ratio_of_squared_errors_with_one_transition_that_says_nothing(seed, d, n):
+def test_strength_is_the_mean_of_the_posterior_of_as_how_many_own_instances_it_counts(seed, d, n):
     rng = np.random.default_rng(seed)
     evidence, actions = PriorEvidence(2, d), rng.integers(2, size=n)
-    effects, predicted, own = rng.normal(size=(3, n, d)) * np.array([1.0, 1e-5, 1.0])[:, None, None]
-    has_own, weights = rng.random(n) < 0.8, rng.gamma(1.0, size=n)
+    effects, predicted, own = rng.normal(size=(3, n, d)) * np.array([1.0, 0.1, 1.0])[:, None, None]
+    leverage, weights = np.maximum(0.0, rng.normal(size=n)), rng.gamma(1.0, size=n)
     for i in range(n):
-        at = int(actions[i]), effects[i], predicted[i], own[i] if has_own[i] else None
-        evidence.note(*at, (-1.0, -1.0), float(weights[i]))
-    np.testing.assert_array_equal(evidence.strength, 1.0)
+        evidence.note(int(actions[i]), effects[i], predicted[i], (own[i], leverage[i]), (-1.0, -1.0), weights[i])
+    np.testing.assert_array_equal(evidence.strength, np.mean(STRENGTHS))
     evidence.renew()
-    part = weights / (1.0 + weights)
-    errors = [(effects - each) ** 2 + SMALLEST_ERROR**2 for each in (own, predicted)]
     for a in range(2):
-        rows = has_own & (actions == a)
-        mean = (part[rows, None] * np.log(errors[0] / errors[1])[rows]).sum(axis=0) / (1.0 + part[rows].sum())
-        np.testing.assert_allclose(evidence.strength[a], np.exp(mean), rtol=1e-9)
+        for v in range(d):
+            rows = [i for i in range(n) if actions[i] == a and leverage[i] > 0.0]
+            squared = [(effects[i, v] - own[i, v]) ** 2 + SMALLEST_ERROR**2 for i in rows]
+            density = np.zeros(len(STRENGTHS))
+            for k, i in enumerate(rows):
+                scale = np.exp(0.5 * np.mean(np.log(squared[: k + 1])))
+                # The mean of so many instances at the state, and of own ones that are worth 1 / leverage of them.
+                p = STRENGTHS * weights[i] / (1.0 + weights[i])
+                mean = (p * predicted[i, v] + own[i, v] / leverage[i]) / (p + 1.0 / leverage[i])
+                density += stats.t.logpdf((effects[i, v] - mean) / scale, df=1)
+            posterior = np.exp(density - density.max())
+            np.testing.assert_allclose(evidence.strength[a, v], posterior @ STRENGTHS / posterior.sum(), rtol=1e-6)
     found = evidence.weights(weights, actions)
-    np.testing.assert_allclose(found, part[:, None] * evidence.strength[actions])
+    np.testing.assert_allclose(found, (weights / (1.0 + weights))[:, None] * evidence.strength[actions])
     restored = PriorEvidence(2, d)
     restored.set_state(evidence.get_state())
     np.testing.assert_array_equal(restored.get_state(), evidence.get_state())
@@ -284,13 +291,24 @@ def test_rewards_that_are_another_function_are_noticed(rewards, expected, explai
     assert evidence.explains_rewards() == explained
 
 
+def strength_after(n, predicted, own_error, **wall):
+    """After so many transitions with an effect of 0.1; ``wall``: transitions besides, that nobody foresaw."""
+    evidence = PriorEvidence(1, 1)
+    for _ in range(n):
+        evidence.note(0, np.array([0.1]), np.array([predicted]), (np.array([0.1 + own_error]), 1.0), (-1.0, -1.0), 100.0)
+    for _ in range(wall.get("n_walls", 0)):
+        evidence.note(0, np.array([0.0]), np.array([predicted]), (np.array([0.1 + own_error]), 1.0), (-1.0, -1.0), 100.0)
+    evidence.renew()
+    return evidence.strength[0, 0]
+
+
+def test_a_source_that_is_right_counts_most_and_one_that_is_wrong_next_to_nothing():
+    assert strength_after(50, 0.1, 0.02) > 0.95 * max(STRENGTHS)
+    assert strength_after(50, 0.3, 0.02) < 0.01
+    # As good as the learner itself, but wrong the other way: their mean is best.
+    assert 0.5 < strength_after(50, 0.08, 0.02) < 2.0
+
+
 def test_no_single_transition_decides():
     """One that hits a wall, which neither foresaw, among many of which the source is right."""
-    evidence = PriorEvidence(1, 1)
-    for _ in range(20):
-        evidence.note(0, np.array([0.1]), np.array([0.101]), np.array([0.12]), (-1.0, -1.0), 100.0)
-    evidence.renew()
-    before = evidence.strength[0, 0]
-    evidence.note(0, np.array([0.0]), np.array([0.1]), np.array([0.09]), (-1.0, -1.0), 100.0)
-    evidence.renew()
-    assert before > 100.0 and evidence.strength[0, 0] > 0.7 * before
+    assert strength_after(30, 0.1, 0.02, n_walls=1) > 0.9 * strength_after(30, 0.1, 0.02)

@@ -1,10 +1,13 @@
 """Sources, mappings and arguments of transfer that cannot work: an error that says what to change, before the first step."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from gymnasium import Env, spaces
 from helpers import factored as f
 from helpers import naive_transfer as naive
+from helpers.oscillators import episodes
 from helpers.own_method import Mine
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
@@ -159,3 +162,52 @@ def test_what_is_asked_of_a_prior_needs_one(source):
     assert Promising().prior_version() == 0
     with pytest.raises(ValueError, match='use must be "prior"'):
         f.bound(COMBREL(source)).describe_prior()
+
+
+# Sources that are poor but not wrong: learning goes on, whatever they lack.
+def without_action(source):
+    return dataclasses.replace(source, **rows_of(source, source.actions != 2))
+
+
+def one_transition(source):
+    return dataclasses.replace(source, **rows_of(source, np.arange(len(source)) == 7))
+
+
+def constant_effects(source):
+    after = np.clip(source.states + [0.02, 0.0], source.scaling.low, source.scaling.high)
+    return dataclasses.replace(source, next_states=after)
+
+
+def at_rest(source):
+    return dataclasses.replace(source, next_states=source.states)
+
+
+def at_one_place(source):
+    states = np.tile(source.states[0], (len(source), 1))
+    return dataclasses.replace(source, states=states, next_states=states + (source.next_states - source.states))
+
+
+def rows_of(source, chosen):
+    return {name: getattr(source, name)[chosen] for name in ("states", "actions", "rewards", "next_states", "terminated")}
+
+
+@pytest.mark.parametrize("use", ["prior", "instances"])
+@pytest.mark.parametrize("poor", [without_action, one_transition, constant_effects, at_rest, at_one_place])
+@pytest.mark.filterwarnings("ignore:what was transferred")
+def test_learning_goes_on_with_a_poor_source_and_predicts_finite_numbers(poor, use):
+    source = poor(f.oscillator_source(60))
+    model, _ = episodes(COMBREL(source, use=use, mappings=None), 1, 2, 0)
+    values = model.agent.planner.values
+    assert np.isfinite(values).all() and np.isfinite(model.agent.q_values(np.array([0.5, 0.5]))).all()
+    assert str(model.transfer.report())
+    if use == "prior":
+        found = model.agent.transfer.prior(np.random.default_rng(0).random((20, 2)), np.arange(20) % 3)
+        assert all(np.isfinite(array).all() for array in found)
+
+
+def test_a_source_of_the_target_itself_makes_the_prior_exact_and_bounds_the_values():
+    model, _ = episodes(COMBREL(f.oscillator_source(600)), 1, 2, 0)
+    transfer = model.agent.transfer
+    states, actions = f.inside(50, 2, 3)
+    np.testing.assert_allclose(transfer.prior(states, actions).effect, f.oscillate(states, actions), atol=2e-3)
+    assert transfer.value_bound() is not None and transfer.source_prior.evidence.strength.mean() > 0.5

@@ -210,8 +210,8 @@ class MappingTransfer(Transfer):
     def lowest_reward(self) -> float:
         return min(float(source.rewards.min()) for source in self.sources)
 
-    def note_prediction(self, effect: np.ndarray) -> None:
-        self.source_prior.note_prediction(effect)
+    def note_prediction(self, effect: np.ndarray, leverage: float) -> None:
+        self.source_prior.note_prediction(effect, leverage)
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         self._source_use.environment = self.environment

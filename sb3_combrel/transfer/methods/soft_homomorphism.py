@@ -14,7 +14,7 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
 from sb3_combrel.transfer.methods import soft_mapping as soft
 from sb3_combrel.transfer.methods.soft_mapping import Logits
-from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, PriorEvidence
+from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH, SourceModel
 
@@ -100,7 +100,7 @@ class SoftHomomorphism(Transfer):
         self._periodic = np.array(task.periodic)
         self._transitions = RecordedTransitions(d)
         self._evidence = PriorEvidence(task.n_actions, d)
-        self._own: np.ndarray | None = None
+        self._own: OwnPrediction | None = None
         self._squares = np.zeros(2)  # squared errors of predictions, and squared effects, of transitions as they came
         self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
         self._fit_due, self._seconds = float(FIRST_RENEWAL), 0.0
@@ -123,8 +123,8 @@ class SoftHomomorphism(Transfer):
         effect, _, weight = self._mixture.predict(states, actions)
         return PriorPredictions(effect, self._evidence.weights(weight, actions))
 
-    def note_prediction(self, effect: np.ndarray) -> None:
-        self._own = None if np.isnan(effect[0]) else effect
+    def note_prediction(self, effect: np.ndarray, leverage: float) -> None:
+        self._own = effect, leverage
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         effect = differences(next_state, state, self._periodic)

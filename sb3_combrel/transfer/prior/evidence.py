@@ -8,34 +8,40 @@ from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # Errors of a step that are smaller than this part of a variable's range tell nothing.
 SMALLEST_ERROR = 1e-4
+# As how many own instances a source may count; 0: the learner without the source.
+STRENGTHS = np.array([0.0, *4.0 ** np.arange(-4, 2)])
+#: What the target's own instances alone predict, shape (n_variables,), and the leverage of their fit, 0 for nothing.
+OwnPrediction = tuple[np.ndarray, float]
 # What the evidence is good for is renewed first after so many transitions of the target, and whenever this many times as much
 # has been observed as at the last time.
 FIRST_RENEWAL, RENEWAL_GROWTH = 10, 2**0.5
 
 
 class PriorEvidence:
-    """Evidence for a source, by target action and variable: whether it predicts the target better than the learner without it.
+    """Evidence for a source, by target action and variable: whether the learner predicts the target better with it.
 
-    The source competes with the learner itself *without* the source, which predicts each transition before it is seen as well.
-    Its effect counts as so many own instances as the ratio of their squared errors says, as one instance predicts with the
-    variance of the learner's errors: the geometric mean of the ratio, so that no single transition decides, as one that hits a
-    wall would. Where the source has data of weight w it counts by w / (1 + w) of this, as its variance is 1 + 1 / w times that
-    of its errors. A transition counts by the same part as evidence.
+    Hypotheses are that the source counts as so many own instances, ``STRENGTHS``; "no source" is one of them. Each predicts a
+    transition before it is seen: with an own prediction of leverage h, from a fit to own instances alone, and with data of the
+    source of weight w, the source's effect has the part p h / (1 + p h), where p is the strength times w / (1 + w) (see
+    ``join_prior``). The likelihood is Student's t with one degree of freedom, whose scale is the geometric mean of the own
+    errors so far; before any transition all are equally probable. :attr:`strength` is the mean of the posterior.
 
     :param n_actions: target actions
     :param n_variables: target variables
     """
 
     def __init__(self, n_actions: int, n_variables: int):
-        #: The ratio of the learner's own squared errors to the source's, as last renewed; shape (n_actions, n_variables).
-        self.strength = np.ones((n_actions, n_variables))
+        #: As how many own instances the source counts, as last renewed; shape (n_actions, n_variables).
+        self.strength = np.full((n_actions, n_variables), STRENGTHS.mean())
         self.forget()
 
     def forget(self) -> None:
         """Forget all transitions."""
         shape = self.strength.shape
-        # Sums over transitions of logarithms of ratios: to the learner's own squared errors, and how many these are.
-        self._to_own, self._n_own = np.zeros(shape), np.zeros(shape[0])
+        #: Logarithms of the likelihoods, up to what all hypotheses have in common, shape (n_actions, n_variables, n).
+        self.likelihood = np.zeros((*shape, len(STRENGTHS)))
+        # Sums of logarithms of own squared errors, and of how many.
+        self._own_errors, self._n_own = np.zeros(shape), np.zeros(shape[0])
         #: Sums of the errors of rewards: of the source's, and of the mean of those before.
         self.reward_errors = np.zeros(2)
         self._rewards = np.zeros(2)
@@ -45,21 +51,26 @@ class PriorEvidence:
         action: int,
         effect: np.ndarray,
         predicted: np.ndarray,
-        own: np.ndarray | None,
+        own: OwnPrediction | None,
         rewards: tuple[float, float],
         weight: float,
     ) -> None:
         """Take in a transition.
 
-        :param predicted: effect by the source; ``own``: by the learner without it, None for nothing; shape (n_variables,)
+        :param predicted: effect by the source, shape (n_variables,)
+        :param own: by the learner without it, and its leverage, 0 where it predicts nothing; None for the same
         :param rewards: the reward, and what the source predicts
         :param weight: of the source's data there
         """
         part = weight / (1.0 + weight)
-        error = _log_error(effect - predicted)
-        if own is not None:
-            self._to_own[action] += part * (_log_error(effect - own) - error)
-            self._n_own[action] += part
+        if own is not None and own[1] > 0.0:
+            error = effect - own[0]
+            self._own_errors[action] += np.log(error * error + SMALLEST_ERROR**2)
+            self._n_own[action] += 1.0
+            squared_scale = np.exp(self._own_errors[action] / self._n_own[action])[:, None]
+            pull = STRENGTHS * part * own[1]
+            errors = error[:, None] - pull / (1.0 + pull) * (predicted - own[0])[:, None]
+            self.likelihood[action] -= np.log1p(errors * errors / squared_scale)
         reward, expected = rewards
         n, total = self._rewards.tolist()
         if n > 0.0:
@@ -70,17 +81,18 @@ class PriorEvidence:
         """Gather the evidence anew, from what is predicted now of transitions ``seen``."""
         self.forget()
         for i in range(seen.n):
-            own = seen.predicted[i] if seen.is_predicted[i] else None
+            own = seen.predicted[i], float(seen.leverage[i])
             expected = float(seen.rewards[i]), float(rewards[i])
             self.note(int(seen.actions[i]), seen.effects[i], effects[i], own, expected, float(weights[i]))
 
     def mean_strength(self) -> float:
-        """The geometric mean of :attr:`strength`."""
-        return float(np.exp(np.log(self.strength).mean()))
+        """The mean of :attr:`strength`."""
+        return float(self.strength.mean())
 
     def renew(self) -> None:
-        """Renew :attr:`strength`; one transition without any evidence is counted besides."""
-        self.strength = np.exp(self._to_own / (self._n_own[:, None] + 1.0))
+        """Renew :attr:`strength`."""
+        posterior = np.exp(self.likelihood - self.likelihood.max(axis=2, keepdims=True))
+        self.strength = posterior @ STRENGTHS / posterior.sum(axis=2)
 
     def weights(self, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """As how many own instances the source counts where its data have the weight ``coverage``, shape (n, n_variables)."""
@@ -91,17 +103,15 @@ class PriorEvidence:
         source, mean = self.reward_errors.tolist()
         return bool(source <= mean + SMALLEST_ERROR * self._rewards[0])
 
+    def _parts(self) -> tuple[np.ndarray, ...]:
+        return self.strength, self.likelihood, self._own_errors, self._n_own, self.reward_errors, self._rewards
+
     def get_state(self) -> np.ndarray:
         """What was learned, float64, for :meth:`set_state`."""
-        parts = self.strength, self._to_own, self._n_own, self.reward_errors, self._rewards
-        return np.concatenate([part.ravel() for part in parts])
+        return np.concatenate([part.ravel() for part in self._parts()])
 
     def set_state(self, state: np.ndarray) -> None:
         """Take over what :meth:`get_state` returned."""
-        parts = self.strength, self._to_own, self._n_own, self.reward_errors, self._rewards
-        for part, values in zip(parts, np.split(state, np.cumsum([part.size for part in parts])[:-1]), strict=True):
+        sizes = np.cumsum([part.size for part in self._parts()])
+        for part, values in zip(self._parts(), np.split(state, sizes[:-1]), strict=True):
             part.ravel()[:] = values
-
-
-def _log_error(error: np.ndarray) -> np.ndarray:
-    return np.asarray(np.log(error * error + SMALLEST_ERROR**2))

@@ -13,7 +13,7 @@ from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, RegionErrors, warn_of_error
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, PriorEvidence
+from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.value_bound import ValueBound
@@ -68,7 +68,7 @@ class SourcePrior:
         self.evidence = PriorEvidence(task.n_actions, task.n_variables)
         #: Errors of the mapping in use, where the source has data.
         self.errors = RegionErrors(task)
-        self._own: np.ndarray | None = None
+        self._own: OwnPrediction | None = None
         #: Number of the environment that the transitions observed now come from.
         self.environment = 0
         # By environment: states and rewards of the present episode.
@@ -103,8 +103,8 @@ class SourcePrior:
         effect, _, coverage = self._raw(np.ascontiguousarray(states, dtype=np.float64), actions)
         return PriorPredictions(effect, np.where(self._in_copies()[actions], self.evidence.weights(coverage, actions), 0.0))
 
-    def note_prediction(self, effect: np.ndarray) -> None:
-        self._own = None if np.isnan(effect[0]) else effect
+    def note_prediction(self, effect: np.ndarray, leverage: float) -> None:
+        self._own = effect, leverage
 
     def _raw(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
         """Predictions and coverage. Those of many pairs at once are stored: their weights change more often."""
