@@ -174,7 +174,7 @@ def one_transition(source):
 
 
 def constant_effects(source):
-    after = np.clip(source.states + [0.02, 0.0], source.scaling.low, source.scaling.high)
+    after = np.clip(source.states + np.array([0.02, 0.0]), source.scaling.low, source.scaling.high)
     return dataclasses.replace(source, next_states=after)
 
 
