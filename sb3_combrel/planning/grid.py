@@ -202,14 +202,16 @@ class StateGrid:
         position = state * self.arrays.cells + self.arrays.margin
         return interpolate_once(values, position, self.arrays, self._corner_index, self._corner_weight)
 
-    def cell_around(self, state: np.ndarray) -> np.ndarray:
-        """The numbers of the corners of the cell that a state is in, shape (2 ** n_variables,), or of the nearest one."""
+    def cells_around(self, states: np.ndarray) -> np.ndarray:
+        """The numbers of the corners of the cells that states are in, or of the nearest ones, shape (n, 2 ** n_variables)."""
         shape, strides, _, _, periodic = self.arrays
-        position = state * self.arrays.cells + self.arrays.margin
-        low = np.where(periodic, np.floor(position) % shape, np.clip(np.floor(position), 0, shape - 2)).astype(np.int64)
+        below = np.floor(states * self.arrays.cells + self.arrays.margin)
+        low = np.where(periodic, below % shape, np.clip(below, 0, shape - 2)).astype(np.int64)
         high = np.where(periodic, (low + 1) % shape, low + 1)
-        sides = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1)
-        return np.asarray(sides.reshape(-1, self.n_variables) @ strides)
+        corners = np.zeros((len(states), 1), dtype=np.int64)
+        for k in range(self.n_variables):
+            corners = np.hstack([corners + side[:, k : k + 1] * strides[k] for side in (low, high)])
+        return corners
 
 
 def coarsest_in_reach(n_variables: int, reach: float) -> int:

@@ -9,7 +9,7 @@ from helpers.naive_fitted_rmax import NaiveGrid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.planning.grid import StateGrid, fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
 
 
@@ -157,3 +157,17 @@ def test_a_default_grid_has_a_million_pairs_at_most():
     with pytest.warns(UserWarning, match="coarse"):
         grid = fitting_grid(4, 5, None, 0.01, 0.01)
     assert 5 * grid.n_points <= 10**6 < 5 * (2 ** (grid.resolution[0] + 1) + 1) ** 4
+
+
+@pytest.mark.parametrize(
+    ("resolution", "margin", "periodic"), [((2, 3), 0, None), ((2, 2), 1, (True, False)), ((3,), 0, (True,))]
+)
+def test_the_cells_around_states_have_the_corners_that_are_interpolated_between(resolution, margin, periodic):
+    grid = StateGrid(len(resolution), resolution, margin, periodic)
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-0.3, 1.3, (40, len(resolution)))
+    for state, corners in zip(states, grid.cells_around(states), strict=True):
+        for point in range(grid.n_points):
+            values = np.zeros(grid.n_points)
+            values[point] = 1.0
+            assert point in corners or grid.interpolate(values, state) < 1e-8

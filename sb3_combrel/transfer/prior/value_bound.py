@@ -59,18 +59,17 @@ class ValueBound:
         :param choice: that bounds values, see :meth:`through`
         :param episode: states, unit coordinates, and rewards
         """
-        largest, to_go = 0.0, 0.0
-        used = [copy for copy in choice.copies[0].tolist() if copy >= 0 and self._is_whole(copy)]
-        for state, reward in reversed(episode):
-            to_go = reward + self._task.gamma * to_go
-            bounds = []
-            for copy in used:
+        states, returns, to_go = np.array([state for state, _ in episode]), np.zeros(len(episode)), 0.0
+        for i in range(len(episode) - 1, -1, -1):
+            returns[i] = to_go = episode[i][1] + self._task.gamma * to_go
+        bounds = np.full(len(episode), np.inf)
+        for copy in choice.copies[0].tolist():
+            if copy >= 0 and self._is_whole(copy):
                 planner = self._planner(copy)
                 grid = planner.mdp.grid
-                at = self._copies.as_copy(copy, state[None])[0, : grid.n_variables]
-                bounds.append(float(planner.values[grid.cell_around(at)].max()))
-            largest = max(largest, to_go - min(bounds))
-        return largest
+                at = self._copies.as_copy(copy, states)[:, : grid.n_variables]
+                bounds = np.minimum(bounds, planner.values[grid.cells_around(at)].max(axis=1))
+        return float((returns - bounds).max(initial=0.0))
 
     def _costs_are_alike(self, used: list[int]) -> bool:
         rewards = np.concatenate([self._copies.sources[self._copies.source[copy]].rewards for copy in used])
