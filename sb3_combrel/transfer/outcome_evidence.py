@@ -16,11 +16,8 @@ from sb3_combrel.transfer.report import Contradiction
 # border of where episodes end, a kernel average decides nothing.
 ENDS, GOES_ON = 0.5, 0.1
 STEPS_OF_A_VISIT = 10  # so many steps in a row where an end is predicted, and none comes, contradict it once
-EPISODES_IN_VAIN = 3  # so many episodes that ran into their time limit, and never an end where one is predicted
-MIN_REWARDS = 10  # rewards from which on wrong ones count
-MIN_ABSENT = 3  # so many visits to where an end is predicted, and none has come yet: one or two may be near misses
 # What is counted, in the order in which it is saved.
-COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "in_vain", "steps_of_visit")
+COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "steps_of_visit")
 TRANSITIONS_BEFORE_WARNING = 300  # transitions from which on predictions worse than "no change" are warned of
 N_PARTS = 4  # each state variable's range is divided into so many parts
 MIN_IN_PART = 10  # a part with fewer transitions says nothing
@@ -40,7 +37,7 @@ def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> N
 
 
 class OutcomeEvidence:
-    """Counts what confirms and what contradicts the ends and rewards that a source predicts, where it has data.
+    """Counts what confirms and what contradicts the ends and rewards that transferred instances predict, where there are any.
 
     *Ends.* An episode that ends where that is predicted confirms it. An episode that ends where none is predicted contradicts
     it, and so does each visit to where one is predicted that leaves without an end or stays for long. Visits are counted, not
@@ -49,24 +46,15 @@ class OutcomeEvidence:
     *Rewards.* Each transition confirms or contradicts the predicted reward, by whether it is off by more than half a standard
     deviation of the source's rewards plus a tenth of their mean size.
 
-    Both are :attr:`doubted` while ends that were not predicted outnumber those that were by two, or wrong rewards right ones;
-    while no predicted end has come but ``MIN_ABSENT`` have failed to; and after ``EPISODES_IN_VAIN`` episodes that ran into
-    their time limit without a confirmed end, if all rewards were alike, so that nothing but an end tells states apart.
-    Predicted ends are :attr:`ends_believed` once they have come, unless those that did not outnumber them.
-
-    From the weight ``threshold`` on the source has data, from ``no_end`` on (None: the same) it says that there is no end.
+    From the weight ``threshold`` on there are data.
     """
 
-    def __init__(self, rewards: np.ndarray, threshold: float, no_end: float | None = None):
+    def __init__(self, rewards: np.ndarray, threshold: float):
         self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
-        self.threshold, self.no_end = threshold, threshold if no_end is None else no_end
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all transitions."""
+        self.threshold = threshold
         # Unpredicted: ends; absent: visits to where an end is predicted that have left without one, or lasted for long.
         self.confirmed = self.unpredicted = self.absent = 0
-        self.rewards_right = self.rewards_wrong = self.in_vain = self.steps_of_visit = 0
+        self.rewards_right = self.rewards_wrong = self.steps_of_visit = 0
         self.reward_range = (np.inf, -np.inf)
 
     def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
@@ -79,7 +67,7 @@ class OutcomeEvidence:
         if terminated:
             if end >= GOES_ON or self.steps_of_visit:
                 self.confirmed += 1
-            elif weight >= self.no_end:
+            elif has_data:
                 self.unpredicted += 1
             self.steps_of_visit = 0
         elif (has_data and end > ENDS) or (self.steps_of_visit and end >= GOES_ON):
@@ -92,7 +80,6 @@ class OutcomeEvidence:
         """Take in the end of an episode; ``truncated``: by its time limit."""
         if truncated:
             self._leave()
-            self.in_vain += self.confirmed == 0
 
     def _leave(self) -> None:
         self.absent += 0 < self.steps_of_visit < STEPS_OF_A_VISIT
@@ -103,25 +90,8 @@ class OutcomeEvidence:
         """How often a predicted end did not come, or one came that was not predicted."""
         return self.unpredicted + self.absent
 
-    @property
-    def ends_believed(self) -> bool:
-        """Whether predicted ends come more often than not, as far as has been seen."""
-        return self.confirmed > 0 and self.absent <= self.confirmed
-
-    @property
-    def doubted(self) -> bool:
-        """Whether the source's ends and rewards are not to be used."""
-        low, high = self.reward_range
-        rewards = self.rewards_right + self.rewards_wrong
-        return (
-            self.unpredicted > self.confirmed + 1
-            or (self.confirmed == 0 and self.absent >= MIN_ABSENT)
-            or (rewards >= MIN_REWARDS and self.rewards_wrong > self.rewards_right)
-            or (self.confirmed == 0 and self.in_vain >= EPISODES_IN_VAIN and not high - low > 1e-9)
-        )
-
     def get_state(self) -> np.ndarray:
-        """What was counted, float64, shape (9,)."""
+        """What was counted, float64, shape (8,)."""
         counts = [getattr(self, name) for name in COUNTS]
         return np.array([*counts, *np.clip(self.reward_range, -1e300, 1e300)], dtype=np.float64)
 
