@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_combrel.common.constants import TOO_WIDE
+
 if TYPE_CHECKING:
     from gymnasium import spaces
 
 Bounds = tuple[ArrayLike, ArrayLike]
+Limits = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 # A limit of the order of the largest float stands for "unbounded" (3.4e38 in older Gymnasium spaces): a range that
 # dwarfs every state would put all states at one unit coordinate.
@@ -59,8 +62,19 @@ class StateScaling:
             )
         return cls(low, high)
 
+    @classmethod
+    def from_observed(cls, limits: Limits, states: NDArray[np.float64]) -> StateScaling:
+        """Take limits of :meth:`limits_of`, and for variables without any the range of some states, shape (n, n_variables)."""
+        low, high = limits
+        least, most = states.min(axis=0), states.max(axis=0)
+        # A variable that never changes has no scale.
+        around = np.where(most > least, 0.0, 0.5)
+        found_low, found_high = around_zero(least - around, most + around)
+        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
+        return cls(np.where(unbounded, found_low, low), np.where(unbounded, found_high, high))
+
     @staticmethod
-    def limits_of(space: spaces.Space[Any], bounds: Bounds | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def limits_of(space: spaces.Space[Any], bounds: Bounds | None = None) -> Limits:
         """As :meth:`from_space`, but the limits themselves, some of which may be infinite: (low, high)."""
         n_variables = _count_variables(space)
         if bounds is not None:
@@ -91,6 +105,16 @@ class StateScaling:
 
     def __repr__(self) -> str:
         return f"StateScaling(low={self.low.tolist()}, high={self.high.tolist()})"
+
+
+def around_zero(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Make bounds that reach about as far on either side of 0 reach equally far: 0 is a grid point then.
+
+    There, where things are at rest, interpolated values would be too high, and keep the agent.
+    """
+    far, near = np.maximum(-low, high), np.minimum(-low, high)
+    alike = near * TOO_WIDE >= far
+    return np.where(alike, -far, low), np.where(alike, far, high)
 
 
 def _as_vector(name: str, values: ArrayLike) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel.common.constants import BEYOND, TOO_WIDE
-from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling
+from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling, around_zero
 
 
 class FoundScales:
@@ -77,13 +77,3 @@ class FoundScales:
         # Whatever a file says.
         least, most = np.minimum(low, high), np.maximum(low, high)
         self.scaling = StateScaling(least, np.where(most > least, most, least + 1.0))
-
-
-def around_zero(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make bounds that reach about as far on either side of 0 reach equally far: 0 is a grid point then.
-
-    There, where things are at rest, interpolated values would be too high, and keep the agent.
-    """
-    far, near = np.maximum(-low, high), np.minimum(-low, high)
-    alike = near * TOO_WIDE >= far
-    return np.where(alike, -far, low), np.where(alike, far, high)

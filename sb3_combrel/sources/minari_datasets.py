@@ -23,7 +23,7 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     """All transitions of a Minari dataset; see :meth:`SourceInstances.from_minari`."""
     minari = _import_minari()
     data = minari.load_dataset(dataset) if isinstance(dataset, str) else dataset
-    scaling = StateScaling.from_space(data.observation_space, bounds)
+    limits = StateScaling.limits_of(data.observation_space, bounds)
     n_actions = count_actions(data.action_space)
     parts = [(e.observations[:-1], e.actions, e.rewards, e.observations[1:], e.terminations) for e in data.iterate_episodes()]
     if not parts:
@@ -32,6 +32,7 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     unnamed = {"env": None if data.env_spec is None else data.env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
     names: dict[str, Any] = {name: tuple(each) for name, each in kept.get("names", {}).items()}
+    scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
     columns = states, actions - int(data.action_space.start), rewards, next_states, terminated
     return Transitions(*columns, scaling.low, scaling.high, n_actions, origin=kept.get("origin", unnamed), **names)
 

@@ -196,7 +196,7 @@ def learn_q_learning(
         made.learn(total_timesteps, log.add)
         origin = describe_origin(made.env, type(made).__name__, seed)
         origin |= {"recorded_while_learning": True, "total_timesteps": total_timesteps}
-        return log.transitions(made.scaling, made.n_actions, task_names(made.env), origin)
+        return log.transitions((made.scaling.low, made.scaling.high), made.n_actions, task_names(made.env), origin)
     finally:
         if isinstance(env, str):
             made.env.close()

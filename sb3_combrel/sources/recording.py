@@ -37,7 +37,7 @@ def record(
     task = env if isinstance(env, VecEnv) else make_env(env)
     venv = task if isinstance(task, VecEnv) else DummyVecEnv([lambda: task])
     try:
-        scaling = StateScaling.from_space(venv.observation_space, bounds)
+        limits = StateScaling.limits_of(venv.observation_space, bounds)
         n_actions = count_actions(venv.action_space)
         log = TransitionLog()
         act = _actor(model, venv, seed, deterministic)
@@ -54,7 +54,7 @@ def record(
                 states = log_step(log, venv, states, actions, step, n_instances)
                 seen, _, starts, _ = step
         recorder = "random actions" if model is None else getattr(model, "__name__", type(model).__name__)
-        return log.transitions(scaling, n_actions, task_names(venv), describe_origin(venv, recorder, seed))
+        return log.transitions(limits, n_actions, task_names(venv), describe_origin(venv, recorder, seed))
     finally:
         if isinstance(env, str):
             venv.close()

@@ -127,8 +127,8 @@ class SourceInstances:
         :param n_instances: number of transitions to record
         :param seed: seed of the environment, the random actions and the model's own randomness; None for none
         :param deterministic: whether an SB3 model takes its deterministic actions
-        :param bounds: ``(low, high)`` of the states if the observation space has none
-        :raises ValueError: if the spaces are not a Box of shape (n_variables,) with bounds and a Discrete, if ``n_instances``
+        :param bounds: ``(low, high)`` of the states; None: those of the observation space, or the range of what is recorded
+        :raises ValueError: if the spaces are not a Box of shape (n_variables,) and a Discrete, if ``n_instances``
             is not a whole number of at least 1, or if the environment returns something that is not finite
         """
         return cls(*recording.record(model, env, n_instances, seed, deterministic, bounds))
@@ -196,7 +196,7 @@ class SourceInstances:
         :param dataset: a dataset, or the id of one that has been downloaded
         :param n_instances: size of a random sample of them; None for all
         :param seed: seed of the sample
-        :param bounds: ``(low, high)`` of the states if the dataset's observation space has none
+        :param bounds: ``(low, high)`` of the states; None: those of the observation space, or else the range of the data
         :raises ImportError: if Minari is missing
         :raises ValueError: as of :meth:`record`
         """

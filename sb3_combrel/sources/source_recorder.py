@@ -19,7 +19,7 @@ class SourceRecorder(BaseCallback):
     Under ``VecNormalize`` the original states and rewards are recorded.
 
     :param max_instances: how many to keep at most, a uniform random sample of all; None for all
-    :param bounds: ``(low, high)`` of the states if the observation space has none
+    :param bounds: ``(low, high)`` of the states; None: those of the observation space, or the range of what is recorded
     :param seed: seed of the sample
     :param verbose: SB3's verbosity
     """
@@ -34,7 +34,7 @@ class SourceRecorder(BaseCallback):
 
     def _on_training_start(self) -> None:
         # Refuse spaces now, not after hours of learning.
-        self._scaling = StateScaling.from_space(self.training_env.observation_space, self.bounds)
+        self._limits = StateScaling.limits_of(self.training_env.observation_space, self.bounds)
         self._n_actions = count_actions(self.training_env.action_space)
         self._names = task_names(self.training_env)
         self._origin = describe_origin(self.training_env, type(self.model).__name__, self.model.seed)
@@ -56,7 +56,7 @@ class SourceRecorder(BaseCallback):
         if self._states is None:
             raise ValueError("nothing has been recorded yet: pass the recorder to learn(callback=...) first")
         origin = {**self._origin, "recorded_while_learning": True, "n_seen": self.log.n_seen}
-        return self.log.transitions(self._scaling, self._n_actions, self._names, origin)
+        return self.log.transitions(self._limits, self._n_actions, self._names, origin)
 
     def source_instances(self) -> SourceInstances:
         """What has been recorded so far; ``ValueError`` if nothing has been."""

@@ -75,14 +75,18 @@ class TransitionLog:
             self._rows[position] = row
 
     def transitions(
-        self, scaling: StateScaling, n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
+        self, limits: tuple[Floats, Floats], n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
     ) -> Transitions:
-        """What is in the log; ``ValueError`` if that is nothing."""
+        """What is in the log; ``ValueError`` if that is nothing.
+
+        :param limits: (low, high) of the states; what is infinite is found from them
+        """
         if not self._rows:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
         _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
         kinds = np.float64, np.int64, np.float64, np.float64, np.bool_
         arrays: list[Any] = [np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)]
+        scaling = StateScaling.from_observed(limits, np.concatenate([arrays[0], arrays[3]]))
         fields: dict[str, Any] = {**dict(zip(Transitions._fields, arrays, strict=False)), **names}
         return Transitions(**fields, low=scaling.low, high=scaling.high, n_actions=n_actions, origin=origin)
 

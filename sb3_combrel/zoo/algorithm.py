@@ -59,7 +59,7 @@ class ZooFittedRMax(FittedRMax):
             raise ValueError(f'resolution must be a whole number, one for each variable, "coarser" or "finer", got {wanted!r}')
         check_actions(self.action_space)
         n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
-        n_variables = StateScaling.from_space(self.observation_space, self.bounds).n_variables
+        n_variables = len(StateScaling.limits_of(self.observation_space, self.bounds)[0])
         settings = self.settings.model_settings(n_variables)
         suited, *_ = fitting_grid(n_variables, n_actions, None, settings.model_breadth, settings.min_weight).resolution
         if wanted == "coarser":

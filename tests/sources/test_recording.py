@@ -11,7 +11,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_combrel import SourceInstances
-from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.sources.source_recorder import SourceRecorder
 from sb3_combrel.sources.transitions import TransitionLog
 
@@ -79,9 +78,16 @@ class TestRecord:
         # The corridor's states are never negative.
         assert min(seen) < 0
 
-    def test_unbounded_spaces_need_bounds(self):
-        with pytest.raises(ValueError, match="bounds"):
-            SourceInstances.record(None, "CartPole-v1", 10)
+    def test_bounds_of_unbounded_variables_are_found_and_others_stay(self):
+        source = SourceInstances.record(None, "CartPole-v1", 200, seed=0)
+        both = np.concatenate([source.states, source.next_states])
+        box = gym.make("CartPole-v1").observation_space
+        for k, unbounded in enumerate((False, True, False, True)):
+            if unbounded:
+                far = np.abs(both[:, k]).max()
+                assert (source.low[k], source.high[k]) == (-far, far)
+            else:
+                assert (source.low[k], source.high[k]) == (box.low[k], box.high[k])
         source = SourceInstances.record(None, "CartPole-v1", 60, seed=0, bounds=(-5, 5))
         assert source.low.tolist() == [-5] * 4 and source.terminated.any()
 
@@ -140,14 +146,14 @@ class TestSourceRecorder:
             log = TransitionLog(10, seed)
             for i in range(30):
                 log.add(np.array([float(i)]), 0, 0.0, np.array([0.0]), False)
-            kept = log.transitions(StateScaling([0.0], [30.0]), 1, {}, {}).states[:, 0].astype(int)
+            kept = log.transitions((np.array([0.0]), np.array([30.0])), 1, {}, {}).states[:, 0].astype(int)
             counts[kept] += 1
         # 400 draws of probability 1/3: 5 standard deviations are 47.
         assert abs(counts - 400 / 3).max() < 47
 
-    def test_unbounded_spaces_are_refused_at_once_and_an_empty_recorder_says_so(self):
+    def test_other_spaces_are_refused_at_once_and_an_empty_recorder_says_so(self):
         recorder = SourceRecorder()
-        with pytest.raises(ValueError, match="bounds"):
-            PPO("MlpPolicy", "CartPole-v1").learn(100, callback=recorder)
+        with pytest.raises(ValueError, match="Discrete"):
+            PPO("MlpPolicy", "Pendulum-v1").learn(100, callback=recorder)
         with pytest.raises(ValueError, match="nothing has been recorded"):
             recorder.source_instances()
