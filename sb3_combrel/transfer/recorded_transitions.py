@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_COLUMNS = ("states", "effects", "rewards", "actions", "ended", "predicted", "leverage")  # the arrays, which grow together
+_COLUMNS = ("states", "effects", "rewards", "actions", "ended")  # the arrays, which grow together
 
 
 class RecordedTransitions:
@@ -17,22 +17,9 @@ class RecordedTransitions:
         self.n = 0
         self.states, self.effects, self.rewards = np.empty((64, n_variables)), np.empty((64, n_variables)), np.empty(64)
         self.actions, self.ended = np.empty(64, dtype=np.int64), np.empty(64, dtype=np.int64)
-        #: Effects that the target's own instances alone predicted, and with which leverage; 0 where they did not.
-        self.predicted, self.leverage = np.zeros((64, n_variables)), np.zeros(64)
 
-    def add(
-        self,
-        state: np.ndarray,
-        action: int,
-        reward: float,
-        effect: np.ndarray,
-        terminated: bool = False,
-        own: tuple[np.ndarray, float] | None = None,
-    ) -> int:
-        """Record one transition; ``effect``: next state minus state; return its number.
-
-        :param own: the effect that the target's own instances alone predicted, and its leverage; None for nothing
-        """
+    def add(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool = False) -> int:
+        """Record one transition; ``effect``: next state minus state; return its number."""
         if self.n == len(self.rewards):
             for name in _COLUMNS:
                 old = getattr(self, name)
@@ -41,7 +28,6 @@ class RecordedTransitions:
         self.states[i], self.effects[i] = state, effect
         self.rewards[i], self.actions[i] = reward, action
         self.ended[i] = self.TERMINATED if terminated else self.GOES_ON
-        self.predicted[i], self.leverage[i] = (0.0, 0.0) if own is None else own
         self.n += 1
         return i
 
@@ -51,10 +37,7 @@ class RecordedTransitions:
             self.ended[self.n - 1] = self.TIME_LIMIT
 
     def rows(self) -> np.ndarray:
-        """Return all of them, one a row: state, effect, reward, action, ended, predicted effect, its leverage.
-
-        :return: shape (n, 3 * n_variables + 4)
-        """
+        """Return all of them, one a row: state, effect, reward, action, ended; shape (n, 2 * n_variables + 3)."""
         return np.column_stack([getattr(self, name)[: self.n] for name in _COLUMNS])
 
     def restore(self, rows: np.ndarray, n_actions: int) -> None:
@@ -62,5 +45,4 @@ class RecordedTransitions:
         d = self.states.shape[1]
         for row in rows:
             self.add(row[:d], int(np.clip(row[2 * d + 1], 0, n_actions - 1)), float(row[2 * d]), row[d : 2 * d])
-        self.ended[: self.n] = rows[:, 2 * d + 2]
-        self.predicted[: self.n], self.leverage[: self.n] = rows[:, 2 * d + 3 : -1], rows[:, -1]
+        self.ended[: self.n] = rows[:, -1]

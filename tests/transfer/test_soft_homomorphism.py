@@ -41,7 +41,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
     states, actions = inside(100, 2, 3)
     predicted, expected = method.prior(states, actions), f.target_effects(SWAPPED, states, actions)
     assert ((predicted.effect - expected) ** 2).sum() < 0.01 * (expected**2).sum()
-    assert predicted.weight.min() > 0.5
+    assert predicted.weight.min() > 0.35
     assert method.statistics()["transfer/prediction_error"] < 0.1
     assert 10 <= method.statistics()["transfer/steps_to_find_mapping"] <= 100
 

@@ -12,7 +12,7 @@ from scipy import stats
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, InterTaskMapping
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR, STRENGTHS, PriorEvidence
+from sb3_combrel.transfer.prior.evidence import PROBABILITIES, SMALLEST_ERROR, STRENGTHS, PriorEvidence
 from sb3_combrel.transfer.source_model import SourceModel
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
@@ -67,7 +67,7 @@ def test_before_any_transition_a_mapping_that_is_given_or_drawn_predicts_and_one
     np.testing.assert_allclose(given.prior(states, actions).effect, f.target_effects(TWO, states, actions), atol=1e-3)
     # As much as one own instance where it has many data, and never more.
     weight = given.prior(states, actions).weight
-    assert (weight > 0.5).all() and (weight < 1.0).all()
+    assert (weight > 0.35).all() and (weight < 1.0).all()
     assert not any(array.any() for array in chosen.prior(states, actions))
     assert drawn.prior(states, actions).effect.any()
 
@@ -80,7 +80,7 @@ def test_an_exact_source_is_found(n_copies, seed):
     states, actions = inside(300, 2 * n_copies, 2 * n_copies + 1)
     found = transfer.prior(states, actions)
     np.testing.assert_allclose(found.effect, f.target_effects(mapping, states, actions), atol=1e-3)
-    assert (found.weight > 0.5).all()
+    assert (found.weight > 0.35).all()
     assert transfer.statistics()["transfer/prediction_error"] < 0.01
     # Ever more rarely.
     assert max(show(transfer, f.walk(mapping, 300, seed + 100))) <= versions[-1] + 3 and 1 <= versions[-1] <= 30
@@ -169,7 +169,7 @@ def test_angles_go_around():
     for turns in (0.0, 1.0, -1.0):
         found = transfer.prior(np.column_stack([(inner[:, 0] + 0.5) % 1.0 + turns, inner[:, 1]]), actions)
         np.testing.assert_allclose(found.effect, f.oscillate(inner, actions), atol=2e-3)
-        assert (found.weight > 0.5).mean() > 0.95
+        assert (found.weight > 0.35).mean() > 0.95
 
 
 @settings(max_examples=15, deadline=None)
@@ -251,7 +251,7 @@ def test_strength_is_the_mean_of_the_posterior_of_as_how_many_own_instances_it_c
     leverage, weights = np.maximum(0.0, rng.normal(size=n)), rng.gamma(1.0, size=n)
     for i in range(n):
         evidence.note(int(actions[i]), effects[i], predicted[i], (own[i], leverage[i]), (-1.0, -1.0), weights[i])
-    np.testing.assert_array_equal(evidence.strength, np.mean(STRENGTHS))
+    np.testing.assert_array_equal(evidence.strength, STRENGTHS @ PROBABILITIES)
     evidence.renew()
     for a in range(2):
         for v in range(d):
@@ -264,7 +264,7 @@ def test_strength_is_the_mean_of_the_posterior_of_as_how_many_own_instances_it_c
                 p = STRENGTHS * weights[i] / (1.0 + weights[i])
                 mean = (p * predicted[i, v] + own[i, v] / leverage[i]) / (p + 1.0 / leverage[i])
                 density += stats.t.logpdf((effects[i, v] - mean) / scale, df=1)
-            posterior = np.exp(density - density.max())
+            posterior = PROBABILITIES * np.exp(density - density.max())
             np.testing.assert_allclose(evidence.strength[a, v], posterior @ STRENGTHS / posterior.sum(), rtol=1e-6)
     found = evidence.weights(weights, actions)
     np.testing.assert_allclose(found, (weights / (1.0 + weights))[:, None] * evidence.strength[actions])

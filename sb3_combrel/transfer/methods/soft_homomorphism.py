@@ -130,7 +130,7 @@ class SoftHomomorphism(Transfer):
         effect = differences(next_state, state, self._periodic)
         self._n_observed += 1
         if self._n_observed <= self.max_transitions:
-            self._transitions.add(state, action, reward, effect, terminated, self._own)
+            self._transitions.add(state, action, reward, effect, terminated)
         if self._logits is not None:
             [expected], [mean_reward], [weight] = self._mixture.predict(state[None], np.array([action]))
             self._squares += ((expected - effect) ** 2).sum(), effect @ effect
@@ -144,7 +144,7 @@ class SoftHomomorphism(Transfer):
             self._transitions.note_time_limit()
 
     def _fit(self) -> None:
-        """Fit the mixture to the recorded transitions; the evidence for it is gathered anew."""
+        """Fit the mixture to the recorded transitions."""
         began = perf_counter()
         n, seen = self._transitions.n, self._transitions
         rows = np.arange(n) if n <= MAX_FITTED else np.sort(self.rng.choice(n, MAX_FITTED, replace=False))
@@ -155,8 +155,6 @@ class SoftHomomorphism(Transfer):
         self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, int(self.rng.integers(2**63))))
         if self._state_mappings() != found:
             self._steps_to_find = self._n_observed
-        effect, expected, weight = self._mixture.predict(seen.states[:n].copy(), seen.actions[:n].copy())
-        self._evidence.replay(seen, effect, expected, weight)
         self._evidence.renew()
         self._n_fits += 1
         self._version += 1

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
-
 # Errors of a step that are smaller than this part of a variable's range tell nothing.
 SMALLEST_ERROR = 1e-4
-# As how many own instances a source may count; 0: the learner without the source.
+# As how many own instances a source may count; 0: the learner without the source, beforehand as probable as all others.
 STRENGTHS = np.array([0.0, *4.0 ** np.arange(-4, 2)])
+PROBABILITIES = np.array([0.5, *np.full(len(STRENGTHS) - 1, 0.5 / (len(STRENGTHS) - 1))])
 #: What the target's own instances alone predict, shape (n_variables,), and the leverage of their fit, 0 for nothing.
 OwnPrediction = tuple[np.ndarray, float]
 # What the evidence is good for is renewed first after so many transitions of the target, and whenever this many times as much
@@ -24,7 +23,8 @@ class PriorEvidence:
     transition before it is seen: with an own prediction of leverage h, from a fit to own instances alone, and with data of the
     source of weight w, the source's effect has the part p h / (1 + p h), where p is the strength times w / (1 + w) (see
     ``join_prior``). The likelihood is Student's t with one degree of freedom, whose scale is the geometric mean of the own
-    errors so far; before any transition all are equally probable. :attr:`strength` is the mean of the posterior.
+    errors so far. :attr:`strength` is the mean of the posterior. What was predicted through a mapping that is no longer in use
+    counts as well: it says how well mappings are chosen.
 
     :param n_actions: target actions
     :param n_variables: target variables
@@ -32,11 +32,7 @@ class PriorEvidence:
 
     def __init__(self, n_actions: int, n_variables: int):
         #: As how many own instances the source counts, as last renewed; shape (n_actions, n_variables).
-        self.strength = np.full((n_actions, n_variables), STRENGTHS.mean())
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all transitions."""
+        self.strength = np.full((n_actions, n_variables), STRENGTHS @ PROBABILITIES)
         shape = self.strength.shape
         #: Logarithms of the likelihoods, up to what all hypotheses have in common, shape (n_actions, n_variables, n).
         self.likelihood = np.zeros((*shape, len(STRENGTHS)))
@@ -77,21 +73,13 @@ class PriorEvidence:
             self.reward_errors += part * abs(reward - expected), part * abs(reward - total / n)
         self._rewards += 1.0, reward
 
-    def replay(self, seen: RecordedTransitions, effects: np.ndarray, rewards: np.ndarray, weights: np.ndarray) -> None:
-        """Gather the evidence anew, from what is predicted now of transitions ``seen``."""
-        self.forget()
-        for i in range(seen.n):
-            own = seen.predicted[i], float(seen.leverage[i])
-            expected = float(seen.rewards[i]), float(rewards[i])
-            self.note(int(seen.actions[i]), seen.effects[i], effects[i], own, expected, float(weights[i]))
-
     def mean_strength(self) -> float:
         """The mean of :attr:`strength`."""
         return float(self.strength.mean())
 
     def renew(self) -> None:
         """Renew :attr:`strength`."""
-        posterior = np.exp(self.likelihood - self.likelihood.max(axis=2, keepdims=True))
+        posterior = PROBABILITIES * np.exp(self.likelihood - self.likelihood.max(axis=2, keepdims=True))
         self.strength = posterior @ STRENGTHS / posterior.sum(axis=2)
 
     def weights(self, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:

@@ -126,7 +126,7 @@ class SourcePrior:
         self.n_observed += 1
         recorded = self.n_observed <= self.max_transitions
         if recorded:
-            self.transitions.add(state, action, reward, effect, terminated, self._own)
+            self.transitions.add(state, action, reward, effect, terminated)
             if self._is_measured(self.n_observed):
                 self.copies.measure(state, action, effect, self.sums)
         if self.choice is not None:
@@ -218,10 +218,9 @@ class SourcePrior:
         """Count anew what confirms and contradicts what is predicted through another mapping."""
         self.errors.forget()
         n, seen = self.transitions.n, self.transitions
-        effect, expected, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
+        effect, _, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
         for i in range(n):
             self._compare(seen.states[i], int(seen.actions[i]), seen.effects[i], effect[i], float(weight[i]))
-        self.evidence.replay(seen, effect, expected, weight)
 
     def _in_copies(self) -> np.ndarray:
         """Which variables each target action's copies have, bool, shape (n_target_actions, n_variables)."""
