@@ -96,13 +96,12 @@ class GridModel(Model):
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )
-        self.pairs = PairArrays.empty(self.grid.n_points, self.n_actions, self.kernel.reach, self._n_fitted)
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._n_fitted)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
         self._plain_pairs, self._plain_kernel = tuple(self.pairs), tuple(self.kernel)
         # Where instances are transferred, what is not known is updated when its instances are twice as many.
         few = 0 if self._giver is None else 1
-        has_prior = self.takes_prior and transfer is not None and transfer.use == "prior"
-        self._rules = self.kernel.scale, self.exploration_threshold, few, has_prior
+        self._rules = self.kernel.scale, self.exploration_threshold, few
         # Whether an outcome has told states apart.
         self._informed, self._first_reward, self._informed_at = not self._known_by_less, np.nan, 0
         # Sums of the sizes of effects and rewards, by action.
@@ -189,13 +188,10 @@ class GridModel(Model):
             return due
         self._informed_at = self.n_added
         self._set_informed()
-        enough = self.own_weight >= self._rules[1]
-        if self._rules[3]:
-            enough |= np.tile(self.pairs.visited >= self._rules[1], self.n_actions)
-        return np.union1d(due, np.flatnonzero(~self.known & enough))
+        return np.union1d(due, np.flatnonzero(~self.known & (self.own_weight >= self._rules[1])))
 
     def _set_informed(self) -> None:
-        self._informed, self._rules = True, (self._rules[0], ON_GRID * self.exploration_threshold, *self._rules[2:])
+        self._informed, self._rules = True, (self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2])
 
     def _numbers_of(self, action: int, slot: int) -> np.ndarray:
         """Effect and reward of an instance."""

@@ -22,15 +22,13 @@ class PairArrays(NamedTuple):
     known: np.ndarray  # bool, (n_pairs,)
     # How much new instances may have changed of what is predicted, in parts of the mean effect; inf: it is fitted at once.
     surprise: np.ndarray  # float64, (n_pairs,)
-    visited: np.ndarray  # float64, (n_points,): weight of the instances of all actions so far
     fit: (
         np.ndarray
     )  # float64, (n_pairs, d + 1, d + 1): means and slopes of effects and reward; (n_pairs, 0, 0) for a model without
 
     @classmethod
-    def empty(cls, n_points: int, n_actions: int, reach: float, n_numbers: int) -> "PairArrays":
+    def empty(cls, n_pairs: int, reach: float, n_numbers: int) -> "PairArrays":
         """Pairs none of which has been fitted; ``n_numbers``: d + 1, or 0 for a model without fits."""
-        n_pairs = n_points * n_actions
         return cls(
             reach=np.full(n_pairs, reach),
             n_new=np.zeros(n_pairs, dtype=np.int32),
@@ -39,7 +37,6 @@ class PairArrays(NamedTuple):
             weight=np.zeros(n_pairs),
             known=np.zeros(n_pairs, dtype=np.bool_),
             surprise=np.zeros(n_pairs),
-            visited=np.zeros(n_points),
             fit=np.zeros((n_pairs, n_numbers, n_numbers)),
         )
 
@@ -81,7 +78,7 @@ def surprise_of(pair, distance, pairs, numbers, state, at, grid, size):
 def look_at(pair, distance, why, pairs, instance, at, grid, rules):
     """Note at one pair what has happened near it; whether it is to be fitted at once."""
     state, numbers, size = instance
-    scale, threshold, few, _ = rules
+    scale, threshold, few = rules
     if why != ENDED and distance > pairs.reach[pair]:
         return False
     if why != CAME:
@@ -96,24 +93,6 @@ def look_at(pair, distance, why, pairs, instance, at, grid, rules):
     return pairs.surprise[pair] > MAX_SURPRISE or pairs.n_new[pair] * 2 >= pairs.length[pair]
 
 
-@inlined
-def visit(noted, distance, pairs, rules, due, scratch):
-    """Note at the point of pair ``noted`` that it was visited; from when on a prior may know what the other actions do there.
-
-    :param due: how many pairs are in ``scratch.pair``; how many are then is returned
-    """
-    scale, threshold, _, has_prior = rules
-    point = noted % len(pairs.visited)
-    before = pairs.visited[point]
-    pairs.visited[point] += np.exp(distance * scale)
-    if has_prior and before < threshold <= pairs.visited[point]:
-        for pair in range(point, len(pairs.known), len(pairs.visited)):
-            if pair != noted and not pairs.known[pair]:
-                scratch.pair[due] = pair
-                due += 1
-    return due
-
-
 @compiled
 def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch):
     """Note an instance at all pairs of an action that it concerns; how many are to be fitted, in ``scratch.pair``.
@@ -123,8 +102,7 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
     :param widest: squared distance beyond which no pair is concerned
     :param why: CAME, WENT, or ENDED: then the state is where an episode ended
     :param rules: (-1 / model_breadth ** 2, threshold, 1 if a pair that is not known is fitted when its instances are twice as
-        many, or 0: it waits until it becomes known; whether there is a prior, which may know what all actions do at a point as
-        soon as it has been visited)
+        many, or 0: it waits until it becomes known)
     """
     pairs, grid, scratch = PairArrays(*pairs), GridArrays(*grid), PointScratch(*scratch)
     first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]
@@ -158,8 +136,6 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
                 if distance <= widest and look_at(base + j, distance, why, pairs, instance, at, grid, rules):
                     scratch.pair[due] = base + j
                     due += 1
-                if why == CAME and distance <= widest:
-                    due = visit(base + j, distance, pairs, rules, due, scratch)
         k = inner - 1
         while k >= 0:
             at[k] += 1

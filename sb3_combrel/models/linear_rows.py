@@ -110,12 +110,8 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
         prediction.length[action] = 1 if end < 1.0 and length > 0 else 0
         prediction.probability[action, 0] = 1.0 - end
         prediction.weight[action] = weight
+        prediction.modelled[action] = weight >= threshold
         least = min(least, weight)
-    visited = 0.0
-    for action in range(len(linear.n_near)):
-        visited += prediction.weight[action]
-    for action in range(len(linear.n_near)):
-        prediction.modelled[action] = known_by(prediction.weight[action], visited, prior[action, d:], threshold)
     return least
 
 
@@ -223,28 +219,13 @@ def follow(pair, action, length, linear, experience, kernel, fit, grid, at, plan
 
 
 @inlined
-def known_by(weight, visited, prior, threshold):
-    """Whether an action is known: by the weight of its instances, or, where one has been, with a prior that counts as some.
-
-    :param visited: weight of the instances of all actions; ``prior``: weights of the prior, shape (n_variables,)
-    """
-    if weight >= threshold:
-        return True
-    if weight == 0.0 or visited < threshold:
-        return False
-    least = np.inf
-    for v in range(len(prior)):
-        least = min(least, prior[v])
-    return weight + least >= threshold
-
-
-@inlined
-def note_fit(pair, length, weight, known, transitions, pairs, kernel, fit):
-    """Note that a pair is fitted to its instances, and whether it is known."""
+def note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit):
+    """Note that a pair is fitted to its instances; whether these suffice."""
     full = length == kernel.n_neighbors
     pairs.reach[pair] = fit.distance[length - 1] if full else kernel.reach
     pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
-    pairs.weight[pair], pairs.known[pair], pairs.surprise[pair] = weight, known, 0.0
+    pairs.weight[pair], pairs.known[pair], pairs.surprise[pair] = weight, weight >= threshold, 0.0
+    return pairs.known[pair]
 
 
 @compiled
@@ -280,8 +261,7 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         length = find_nearest(scratch.at, action, length if action == action_before else 0, instances, kernel, fit)
         action_before = action
         weight = known_weight(fit, length, kernel)
-        known = known_by(weight, pairs.visited[point], linear.prior[pair, len(scratch.at) :], threshold)
-        note_fit(pair, length, weight, known, transitions, pairs, kernel, fit)
+        known = note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit)
         joined = not known and transferred.length[done] > 0
         if known or joined:
             total = total_weight(weight, transferred, done) if joined else weight

@@ -40,8 +40,7 @@ class LocalLinear(GridModel):
 
     With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and the prior
     counts as an instance at the very state that agrees with it, of the weight that it has there. Its effects and weights are
-    those at the grid points, interpolated between them. Where one has been, it counts as so many instances for what is known
-    of other actions, too: how they move, but not what is there. Rewards and ends are by the own instances alone.
+    those at the grid points, interpolated between them. What is known, rewards and ends are by the own instances alone.
 
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
@@ -118,8 +117,7 @@ class LocalLinear(GridModel):
             given = self._prior.prior(points, np.full(n_points, action))
             self.linear.prior[pairs] = np.column_stack(given)
         self._renew_targets()
-        visited = np.tile(self.pairs.visited >= self._rules[1], self.n_actions)
-        return np.flatnonzero(self.known | visited)
+        return np.flatnonzero(self.known)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, has_prior = self.mdp, self._prior is not None

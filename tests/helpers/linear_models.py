@@ -85,7 +85,7 @@ def assert_same_prediction(model, naive, state):
     for action in range(naive.n_actions):
         expected = naive.at_state(state, action)
         np.testing.assert_allclose(prediction.weight[action], expected.weight, rtol=1e-9)
-        assert prediction.modelled[action] == naive.known_at_state(state, action)
+        assert prediction.modelled[action] == (expected.weight >= naive.threshold * (1.0 - 1e-12))
         np.testing.assert_allclose(prediction.reward[action], expected.reward, rtol=1e-9, atol=1e-9)
         predicts = expected.end < 1.0 and expected.weight > 0.0
         assert prediction.length[action] == (1 if predicts else 0)

@@ -67,11 +67,6 @@ class Fit:
         return np.clip(self.mean + away @ self.slopes, self.low, self.high)
 
 
-def known_by(weight, visited, prior, needed):
-    needed *= 1.0 - 1e-12
-    return weight >= needed or (weight > 0.0 and visited >= needed and weight + prior >= needed)
-
-
 class NaiveLocalLinear:
     """The model of a task.
 
@@ -176,18 +171,7 @@ class NaiveLocalLinear:
         return self.fitted(self.points[point], action, now)[1]
 
     def known(self, action, point, now):
-        """By its own instances; or, where one has been, with a prior that counts as some."""
-        visited = sum(self.visit(self.points[point], i) for i in self.transitions[:now])
-        prior = self.prior(self.points[point], action)[1].min()
-        return known_by(self.weight_of(action, point, now), visited, prior, self.needed_on_grid(now))
-
-    def visit(self, at, instance):
-        squared = self.squared(at, instance.state)
-        return math.exp(-squared / self.breadth**2) if squared <= self.reach else 0.0
-
-    def known_at_state(self, state, action):
-        weights = [self.fitted(state, each, self.now)[1] for each in range(self.n_actions)]
-        return known_by(weights[action], sum(weights), self.prior_at(state, action)[1].min(), self.threshold)
+        return self.weight_of(action, point, now) >= self.needed_on_grid(now) * (1.0 - 1e-12)
 
     def row(self, action, point, now, gamma):
         """(R, {successor: probability}, discount) of a pair, staying included; the action is held until the cell is left."""

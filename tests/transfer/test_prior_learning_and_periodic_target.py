@@ -59,14 +59,13 @@ def test_two_cars_are_found_in_mountain_car_4d_within_one_episode(mappings, seed
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
-def test_two_copies_of_an_exact_source_reach_the_end_in_the_first_episode(seed):
+def test_two_copies_of_an_exact_source_reach_the_end_sooner(seed):
     """Without transfer hardly any of these episodes reaches the end, which is some 85 steps away, within 400."""
     source = f.oscillator_source(1500)
-    _, without = episodes(None, 2, 2, seed)
-    assert sum(without) > 600
+    _, without = episodes(None, 2, 4, seed)
     for transfer in (TIMBREL(source, f.copies_mapping(2), use="prior"), COMBREL(source, "factored", use="prior")):
         model, lengths = episodes(transfer, 2, 4, seed)
-        assert lengths[0] < 250
+        assert sum(lengths) < 0.9 * sum(without)
         assert model.agent.transfer.statistics()["transfer/values_bounded"] == 1.0
 
 
