@@ -107,7 +107,7 @@ class StateScaling:
         return f"StateScaling(low={self.low.tolist()}, high={self.high.tolist()})"
 
 
-def around_zero(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def around_zero(low: NDArray[np.float64], high: NDArray[np.float64]) -> Limits:
     """Make bounds that reach about as far on either side of 0 reach equally far: 0 is a grid point then.
 
     There, where things are at rest, interpolated values would be too high, and keep the agent.

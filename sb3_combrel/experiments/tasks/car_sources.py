@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -88,8 +89,6 @@ def never_neutral(seed: int, n: int = N_INSTANCES) -> SourceInstances:
 
 def noisy(seed: int, n: int = N_INSTANCES) -> SourceInstances:
     """Q-learning's, by sensors that are noisy: every state and successor is."""
-    from dataclasses import replace
-
     source, rng = q_learning(seed, n), np.random.default_rng(seed)
     low, high = source.scaling.low, source.scaling.high
     size = SENSOR_NOISE * (high - low)

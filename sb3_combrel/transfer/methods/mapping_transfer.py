@@ -58,7 +58,8 @@ class MappingTransfer(Transfer):
         was transferred (:class:`~sb3_combrel.transfer.instances.instances_check.InstancesCheck` says which), so that pairs for
         which the source is wrong are explored in the end. 1: never, as in the papers
     :param transfer_terminals: whether a source instance that ended its episode ends the target's too (the papers do not say).
-        Where this is wrong the target's own transitions correct it; without it no path leads to an end at first
+        Where this is wrong the target's own transitions correct it; without it no path leads to an end at first. With
+        ``use="prior"``: whether the source's values, which depend on its ends, bound the target's
     :param relevance: True: instances come in the order of their relevance (Eq. 7) to the target's transitions, not of their
         distance. COMBREL's paper finds it harmful: it favours instances that are far from these. "near": of a relevance that
         does not, times the weight, see ``equations.near_relevances``
