@@ -169,3 +169,17 @@ def test_an_episode_that_a_time_limit_ends_exceeds_nothing_where_steps_cost():
     transfer.observe(np.array([0.1]), 0, -1.0, np.array([0.1 + STEP]), False)
     transfer.end_episode(truncated=True)
     assert transfer.source_prior.excess == 0.0
+
+
+def test_returns_are_of_one_episode_also_where_nobody_says_that_it_ended():
+    """As when all transitions are taken in once more, in other unit coordinates; and an episode of nothing exceeds nothing."""
+    source = line_source(reward=1.0)
+    transfer = bound(TIMBREL(source, InterTaskMapping([0], [1, 0]), use="prior"), 1, 2)
+    for _ in range(2):
+        for k in range(12):
+            at = 0.31 + k * STEP
+            transfer.observe(np.array([at]), 0, 1.0, np.array([at + STEP]), k == 11)
+    assert len(transfer.source_prior._episodes[0]) == 12
+    for _ in range(2):
+        transfer.end_episode(truncated=False)
+    assert len(transfer.source_prior._episodes) == 0

@@ -73,6 +73,8 @@ class SourcePrior:
         self.environment = 0
         # By environment: states and rewards of the present episode.
         self._episodes: defaultdict[int, list[tuple[np.ndarray, float]]] = defaultdict(list)
+        # Environments whose last transition was to a terminal state.
+        self._over: set[int] = set()
         #: Whether the mapping in use explains all target actions, as last renewed; a given one does until it is shown not to.
         self.explains = isinstance(choose, Choice)
         #: By how much a return that was seen exceeds what the source bounds it by.
@@ -137,7 +139,13 @@ class SourcePrior:
             if not self._warned and self.n_observed >= TRANSITIONS_BEFORE_WARNING and self.error() > 1.0:
                 self._warned = True
                 warn_of_error(self.sources, self.n_observed, self.error())
+        if self.environment in self._over:
+            # Nobody has said that the episode before ended: transitions are taken in once more, in other unit coordinates.
+            self._over.remove(self.environment)
+            self._episodes[self.environment].clear()
         self._episodes[self.environment].append((state, reward))
+        if terminated:
+            self._over.add(self.environment)
 
     def _is_measured(self, number: Any) -> Any:
         """Whether recorded transitions with these numbers, from 1 on, are compared with what all copies predict."""
@@ -188,9 +196,10 @@ class SourcePrior:
         if truncated and self.n_observed <= self.max_transitions:
             self.transitions.note_time_limit()
         episode = self._episodes.pop(self.environment, [])
+        self._over.discard(self.environment)
         # What follows a time limit may cost more than was gained until then.
         complete = not truncated or all(reward >= 0.0 for _, reward in episode)
-        if complete and self.choice is not None and self._bound() is not None:
+        if episode and complete and self.choice is not None and self._bound() is not None:
             excess = self._value_bound.excess(self.choice, episode)
             if excess > self.excess:
                 self.excess, self.version = excess, self.version + 1
