@@ -281,11 +281,16 @@ class FittedRMaxAgent:
     def _follow_rewards(self) -> None:
         """Plan with other optimism, or another discount, if what rewards have shown asks for it."""
         gamma, max_value = self.rewards.gamma, self.rewards.max_value
+        if gamma == self.mdp.gamma and max_value == self.planner.bounds[1]:
+            return
         if gamma != self.mdp.gamma:
             self.mdp.gamma = gamma
             self._outdated.append(np.flatnonzero(self.mdp.arrays.modelled))
-        if max_value != self.planner.bounds[1]:
-            self.planner.set_max_value(max_value)
+        self.planner.set_max_value(max_value)
+        if self.transfer is not None:
+            self.transfer.change_optimism(gamma, max_value)
+            if self.transfer.use == "prior":
+                self.planner.set_upper(self.transfer.value_bound())
 
     def _changed_by(self, transfer: Transfer) -> np.ndarray:
         """The pairs for which transfer has changed: all for a new prior, or those, not known, that may have new instances."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +23,7 @@ FOR_THE_ALGORITHM = frozenset(
     (
         *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
         *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "makes_choices"),
-        *("informs_model", "value_bound", "note_prediction"),
+        *("informs_model", "value_bound", "note_prediction", "change_optimism"),
     )
 )
 
@@ -177,6 +177,13 @@ class Transfer(ABC):
         :return: raw, shape (n_points,); None: ``task.max_value`` everywhere, which is the default
         """
         return None
+
+    def change_optimism(self, gamma: float, max_value: float) -> None:
+        """Take in another discount factor and upper bound on returns, found from rewards; :meth:`value_bound` follows.
+
+        :param gamma: discount factor; ``max_value``: raw
+        """
+        self.task = replace(self._bound_task, gamma=gamma, max_value=max_value)
 
     def check_degree(self, degree: int) -> None:
         """Check that a model of this degree can take what is transferred.

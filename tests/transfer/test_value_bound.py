@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import factored as f
+from helpers.agents import make_agent
 from helpers.factored import bound, show
 
 from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
@@ -183,3 +184,23 @@ def test_returns_are_of_one_episode_also_where_nobody_says_that_it_ended():
     for _ in range(2):
         transfer.end_episode(truncated=False)
     assert len(transfer.source_prior._episodes) == 0
+
+
+def test_found_optimism_reaches_the_source():
+    """A target whose every step pays: discount and ``max_value`` are found from the first reward on."""
+    source = line_source(reward=1.0, goal=0.5)
+    agent = make_agent(1, 2, TIMBREL(source, InterTaskMapping((0,), (0, 1)), use="prior"))
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        x, action = rng.random(1), int(rng.integers(2))
+        after = np.clip(x + (STEP if action else -STEP), 0.0, 1.0)
+        agent.update(x, action, 1.0, after, False)
+    assert (agent.mdp.gamma, agent.planner.bounds[1]) == pytest.approx((0.99, 100.0))
+    x = agent.grid.points()[:, 0]
+    there = (x > 0.55) & (x < 0.85)
+    # Whatever it does, an episode that begins near the end of the source's ends at the next step.
+    assert agent.planner.upper[there].max() < 100.0
+    assert agent.planner.upper[(x >= 0.0) & (x < 0.3)].min() > 90.0
+    again = make_agent(1, 2, TIMBREL(source, InterTaskMapping((0,), (0, 1)), use="prior"))
+    again.set_state(agent.get_state())
+    np.testing.assert_array_equal(again.planner.upper, agent.planner.upper)

@@ -205,6 +205,11 @@ class MappingTransfer(Transfer):
     def value_bound(self) -> np.ndarray | None:
         return self._source_use.value_bound()
 
+    def change_optimism(self, gamma: float, max_value: float) -> None:
+        super().change_optimism(gamma, max_value)
+        if self.use == "prior":
+            self.source_prior.change_optimism(gamma, max_value)
+
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         return self._source_use.changed(known)
 

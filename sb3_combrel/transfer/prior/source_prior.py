@@ -238,6 +238,10 @@ class SourcePrior:
             found[a] |= has
         return found
 
+    def change_optimism(self, gamma: float, max_value: float) -> None:
+        """As of ``Transfer``."""
+        self._value_bound.change_optimism(gamma, max_value)
+
     def _moved(self, action: int) -> list[tuple[int, int]]:
         """The copies that a target action moves, and the source actions by which it does."""
         return [] if self.choice is None else self.choice.moves(action)

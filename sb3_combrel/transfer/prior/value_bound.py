@@ -34,7 +34,12 @@ class ValueBound:
 
     def __init__(self, copies: Copies, task: TargetTask):
         self._copies = copies
-        self._task = task
+        self._sample_states = task.sample_states
+        self.change_optimism(task.gamma, task.max_value)
+
+    def change_optimism(self, gamma: float, max_value: float) -> None:
+        """Plan in the sources anew, with another discount factor and another value of what is unknown there."""
+        self._gamma, self._max_value = gamma, max_value
         #: By number of the source: a planner that has its values.
         self._planners: dict[int, Planner] = {}
         self._of_copy: dict[int, np.ndarray] = {}
@@ -61,7 +66,7 @@ class ValueBound:
         """
         states, returns, to_go = np.array([state for state, _ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
-            returns[i] = to_go = episode[i][1] + self._task.gamma * to_go
+            returns[i] = to_go = episode[i][1] + self._gamma * to_go
         bounds = np.full(len(episode), np.inf)
         for copy in choice.copies[0].tolist():
             if copy >= 0 and self._is_whole(copy):
@@ -85,7 +90,7 @@ class ValueBound:
         if copy not in self._of_copy:
             planner = self._planner(copy)
             grid = planner.mdp.grid
-            at = self._copies.as_copy(copy, self._task.sample_states)[:, : grid.n_variables]
+            at = self._copies.as_copy(copy, self._sample_states)[:, : grid.n_variables]
             different, kind = distinct_rows(at)
             self._of_copy[copy] = np.array([grid.interpolate(planner.values, at[i]) for i in different])[kind]
         return self._of_copy[copy]
@@ -100,8 +105,8 @@ class ValueBound:
         """Plan in a source, from above: values are upper bounds after any number of sweeps."""
         source, breadth = self._copies.sources[number], self._copies.breadth
         model = SourceModel(stacked_instances([source]), breadth)
-        mdp = source_mdp(source, model, self._task.gamma, breadth, LEAST_WEIGHT)
-        highest = self._task.max_value
+        mdp = source_mdp(source, model, self._gamma, breadth, LEAST_WEIGHT)
+        highest = self._max_value
         # Lower than so many sweeps can get.
         lowest = min(0.0, highest) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
         planner = Planner(mdp, max_value=highest, min_value=lowest, tolerance=planning_tolerance(source))
