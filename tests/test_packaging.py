@@ -30,6 +30,11 @@ def files_on_disk(package):
     }
 
 
+def configurations():
+    """RL-Zoo's settings, which the wheel has inside the package, by their path in it."""
+    return {f"sb3_combrel/zoo/configs/{path.name}": path for path in (ROOT / "zoo_configs").iterdir() if path.is_file()}
+
+
 def run(*command, **options):
     done = subprocess.run([sys.executable, *map(str, command)], capture_output=True, text=True, timeout=300, **options)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -42,7 +47,8 @@ def normal(name):
 
 def test_every_folder_with_modules_is_a_package_that_is_listed():
     folders = {Path(name).parent for package in WHERE for name in files_on_disk(package) if name.endswith(".py")}
-    assert set(PROJECT["tool"]["setuptools"]["packages"]) == {".".join(folder.parts) for folder in folders}
+    listed = {*PROJECT["tool"]["setuptools"]["packages"]} - {"sb3_combrel.zoo.configs"}
+    assert listed == {".".join(folder.parts) for folder in folders}
     assert all((WHERE[folder.parts[0]].parent / folder / "__init__.py").exists() for folder in folders)
 
 
@@ -85,7 +91,11 @@ def test_a_wheel_is_complete_and_works_where_it_is_installed(tmp_path):
     """With the requirements of this environment; `make smoke` does the same in an empty one."""
     # Built from a copy: setuptools would leave its build folder in the repository.
     listed, copy = set().union(*map(files_on_disk, WHERE)), tmp_path / "copy"
-    for original in [*(ROOT / name for name in BESIDE), *(WHERE[name.split("/")[0]].parent / name for name in listed)]:
+    for original in [
+        *(ROOT / name for name in BESIDE),
+        *configurations().values(),
+        *(WHERE[name.split("/")[0]].parent / name for name in listed),
+    ]:
         target = copy / original.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(original.read_bytes())
@@ -94,7 +104,7 @@ def test_a_wheel_is_complete_and_works_where_it_is_installed(tmp_path):
     (wheel,), (source,) = (copy / "dist").glob("*.whl"), (copy / "dist").glob("*.tar.gz")
 
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    assert names == listed and f"-{sb3_combrel.__version__}-" in wheel.name
+    assert names == {*listed, *configurations()} and f"-{sb3_combrel.__version__}-" in wheel.name
     assert {"sb3_combrel/py.typed", "sb3_combrel/version.txt", "combrel_envs/assets/icub_upper.LICENSE.md"} <= names
     with tarfile.open(source) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}

@@ -150,12 +150,14 @@ def _count_variables(space: spaces.Space[Any]) -> int:
     if isinstance(space, gym_spaces.Dict | gym_spaces.Tuple):
         raise ValueError(f"{wanted}, got {space}; flatten it first, for example with gymnasium.wrappers.FlattenObservation")
     if not isinstance(space, gym_spaces.Box):
-        raise ValueError(f"{wanted}, got {space}")
+        remedy = "numbers of states say nothing of which are alike: give the variables that they stand for"
+        raise ValueError(f"{wanted}, got {space}; {remedy}, with gymnasium.wrappers.TransformObservation or a wrapper")
     if len(space.shape) != 1 or space.shape[0] == 0:
-        images = "; images are not supported: pass a vector of state variables" if len(space.shape) == 3 else ""
+        flat = "; flatten it first, for example with gymnasium.wrappers.FlattenObservation"
+        images = "; images are not supported: pass a vector of state variables" if len(space.shape) == 3 else flat
         raise ValueError(f"{wanted}, got shape {space.shape}{images}")
     if not np.issubdtype(space.dtype, np.floating):
-        raise ValueError(f"{wanted}, got dtype {space.dtype}")
+        raise ValueError(f"{wanted}, got dtype {space.dtype}; convert it, as by gymnasium.wrappers.DtypeObservation")
     return int(space.shape[0])
 
 

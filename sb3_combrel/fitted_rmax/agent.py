@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -23,6 +24,9 @@ from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.planner import Planner
 from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
 from sb3_combrel.transfer.base import TargetTask, Transfer
+
+# State, action, reward, next state, terminated.
+Transition = tuple[np.ndarray, int, float, np.ndarray, bool]
 
 
 class FittedRMaxAgent:
@@ -219,6 +223,27 @@ class FittedRMaxAgent:
             self._take_in(state, action, reward, next_state, terminated)
             self._plan(SWEEPS_A_STEP)
 
+    def take_in(self, transitions: Sequence[Transition]) -> None:
+        """Learn from past transitions of the task, in their order, and plan until little changes.
+
+        :param transitions: state, action, reward, next state and terminated of each, as :meth:`update` takes them
+        """
+        with self._lock:
+            for _, _, reward, _, terminated in transitions:
+                self.rewards.note(reward, terminated)
+                self._widen(reward)
+            self._follow_rewards()
+            self._take_in_all(transitions)
+            self._plan(SWEEPS_AT_EPISODE_END)
+
+    def _take_in_all(self, transitions: Sequence[Transition]) -> None:
+        """Give transitions that came before to model and transfer method; all pairs that they change are outdated."""
+        for state, action, reward, next_state, terminated in transitions:
+            self._take_in(state, action, reward, next_state, terminated)
+            if terminated and self.transfer is not None:
+                self.transfer.end_episode(truncated=False)
+        self._outdated = [self.model.outdated()]
+
     def _take_in(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         """Give a transition to the model and to the transfer method."""
         if self.transfer is not None and self.transfer.use == "prior":
@@ -252,10 +277,18 @@ class FittedRMaxAgent:
             self._bind()
             self._build()
             self._widen(min(0.0, lowest) / LONGEST_PLAN)
-            for state, action, reward, next_state, terminated in transitions:
-                state, next_state = (scaling.to_unit(before.to_raw(each)) for each in (state, next_state))
-                self._take_in(state, action, reward, next_state, terminated)
-            self._outdated = [self.model.outdated()]
+            self._take_in_all(
+                [
+                    (
+                        scaling.to_unit(before.to_raw(state)),
+                        action,
+                        reward,
+                        scaling.to_unit(before.to_raw(next_state)),
+                        terminated,
+                    )
+                    for state, action, reward, next_state, terminated in transitions
+                ]
+            )
             self._plan(SWEEPS_AT_EPISODE_END)
 
     def prepare(self) -> None:

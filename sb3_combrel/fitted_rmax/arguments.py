@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
 DEFAULT_POLICY = "FittedRMaxPolicy"
@@ -38,6 +41,12 @@ def check_actions(action_space: spaces.Space[Any]) -> None:
         n = action_space.shape[0]
         bins = "5" if n == 1 else f"({', '.join('3' * n)})"
         message += f"; take a few of the continuous ones: env = gymnasium.wrappers.DiscretizeAction(env, bins={bins})"
+    if isinstance(action_space, spaces.MultiDiscrete | spaces.MultiBinary) and len(action_space.shape) == 1:
+        sizes = np.broadcast_to(getattr(action_space, "nvec", 2), action_space.shape).tolist()
+        message += (
+            "; number the combinations: env = gymnasium.wrappers.TransformAction(env, lambda action: "
+            f"numpy.array(numpy.unravel_index(action, {tuple(sizes)})), gymnasium.spaces.Discrete({math.prod(sizes)}))"
+        )
     raise ValueError(message)
 
 
@@ -60,4 +69,5 @@ def check_policy(policy: type[BasePolicy], policy_kwargs: object, taken: Sequenc
         if name in taken:
             raise ValueError(f"policy_kwargs must not have {name!r}: pass {name}=... to FittedRMax itself")
         if name not in known:
-            raise ValueError(f"policy_kwargs must have names out of {', '.join(known)}, got {name!r}")
+            close = did_you_mean(name, known)
+            raise ValueError(f"policy_kwargs must have names out of {', '.join(known)}, got {name!r}{close}")

@@ -21,9 +21,9 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import DEFAULT_POLICY, MAX_SEED, check_actions, check_policy, check_type, policy_and_env
+from sb3_combrel.fitted_rmax.past_data import PastData
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.progress import ProgressWatch
-from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
 from sb3_combrel.transfer.base import Transfer
@@ -38,7 +38,7 @@ DEFAULTS = FittedRMaxSettings()
 PASSED_TO_POLICY = ("observation_space", "action_space", "transfer", "rng")
 
 
-class FittedRMax(SavedAlgorithm):
+class FittedRMax(PastData):
     """Fitted R-Max: model-based exploration in continuous state spaces.
 
     Paper: Jong & Stone, "Model-based exploration in continuous state spaces" (SARA 2007). Transfer: Taylor, Jong &
@@ -102,6 +102,7 @@ class FittedRMax(SavedAlgorithm):
     :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
         Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment
         says in its attribute ``periodic`` (see :class:`~sb3_combrel.wrappers.AngleObservation`), otherwise none is.
+    :param instances: past data of the same task, which count as the agent's own experience: what :meth:`load_instances` takes
     :param stats_window_size: window size for the rollout logging, in episodes
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation; ``dict(model_class=...)`` for another
@@ -142,6 +143,7 @@ class FittedRMax(SavedAlgorithm):
         n_neighbors: int | None = DEFAULTS.n_neighbors,
         outcome_breadth: float = DEFAULTS.outcome_breadth,
         periodic: Sequence[bool] | None = DEFAULTS.periodic,
+        instances: Any = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -179,6 +181,7 @@ class FittedRMax(SavedAlgorithm):
         self.n_neighbors = n_neighbors
         self.outcome_breadth = outcome_breadth
         self.periodic = periodic
+        self.instances = instances
         self._names: dict[str, Any] = {}
         self._generator_state: dict[str, Any] | None = None
         if _init_setup_model:
@@ -210,6 +213,10 @@ class FittedRMax(SavedAlgorithm):
         self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
         self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
+        # They are saved with what was learned from them.
+        given, self.instances = self.instances, None
+        if given is not None:
+            self.load_instances(given)
         if self.verbose >= 1:
             print(self.agent.workload)
 

@@ -79,6 +79,16 @@ class FittedRMaxPolicy(BasePolicy):
         """Unit coordinates of observations of learning, which may ask for other scales (see :meth:`follow_scales`)."""
         return self.to_unit(observations, self.scales.observed)
 
+    def take_in(
+        self, states: np.ndarray, actions: np.ndarray, rewards: np.ndarray, next_states: np.ndarray, terminated: np.ndarray
+    ) -> None:
+        """Learn from n past transitions, in their order; raw units, actions from 0 on. See :meth:`FittedRMaxAgent.take_in`."""
+        for observations in (states, next_states):
+            self.note(observations)
+        self.follow_scales(episode_ended=True)
+        each = self.to_unit(states), actions.tolist(), rewards.tolist(), self.to_unit(next_states), terminated.tolist()
+        self.agent.take_in(list(zip(*each, strict=True)))
+
     def follow_scales(self, episode_ended: bool) -> bool:
         """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
         if self.scales.fixed or not (episode_ended or self.to_unit.went_beyond):

@@ -160,6 +160,8 @@ def _zipped_anew(archive: Any, compression: int) -> io.BytesIO:
 
 def _read(path: str | Path | io.BufferedIOBase) -> io.BytesIO:
     """The archive as Stable-Baselines3 makes it, not compressed: it seeks to and fro in it, and compares no checksums."""
+    if isinstance(path, str | Path) and not any(each.exists() for each in (Path(path), Path(f"{path}.zip"))):
+        raise FileNotFoundError(f"there is no model file {path}, looked for in {Path.cwd()}; write one with: model.save(path)")
     file = open_path(path, "r", suffix="zip")
     try:
         return _zipped_anew(file, zipfile.ZIP_STORED)

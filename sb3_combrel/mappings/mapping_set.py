@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from sb3_combrel.common.checks import count_text
 from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.mappings.action_mappings import (
     ActionMappings,
     AllActionMappings,
@@ -362,7 +363,8 @@ def check_set_name(name: object, known: Sequence[str] = (*_SIZED_SETS, *_PAPER_S
     """Raise ``ValueError`` if there is no set of that name."""
     if name not in known:
         names, factored = ", ".join((*_SIZED_SETS, *_PAPER_SETS)), ", ".join(FACTORED_SETS)
-        raise ValueError(f'mappings must be one of {names}; with use="prior" also {factored}; got {name!r}')
+        close = did_you_mean(name, known)
+        raise ValueError(f'mappings must be one of {names}; with use="prior" also {factored}; got {name!r}{close}')
 
 
 def _write(mappings: MappingSet) -> tuple[str, dict[str, Any]]:

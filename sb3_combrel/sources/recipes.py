@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.sources.transitions import LEARNERS
 
@@ -43,7 +44,8 @@ def find_source(source: Any) -> SourceInstances:
     printed. It is learned again if the environment's class or arguments have changed, and, once in a process, with
     ``renew: true`` in the recipe, or SB3_COMBREL_RENEW=1 among the environment variables.
 
-    :param source: source instances; the path of a file of them; the id of an environment, learnt with
+    :param source: source instances; the path of a file of them, or of a CSV file
+        (:meth:`~sb3_combrel.SourceInstances.from_table`); the id of an environment, learnt with
         :data:`DEFAULT_RECIPE`; or a recipe: a dict with ``env``, the id, and arguments of
         :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
         :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
@@ -53,7 +55,9 @@ def find_source(source: Any) -> SourceInstances:
     if isinstance(source, SourceInstances):
         return source
     found = _file_or_recipe(source)
-    return SourceInstances.load(found) if isinstance(found, Path) else _learn_or_read(found)
+    if not isinstance(found, Path):
+        return _learn_or_read(found)
+    return SourceInstances.from_table(found) if found.suffix.lower() == ".csv" else SourceInstances.load(found)
 
 
 def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
@@ -106,7 +110,10 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     try:
         source = getattr(SourceInstances, f"from_{learner}")(env_id, **arguments)
     except (TypeError, gym.error.Error) as error:
-        raise ValueError(f"the source task cannot be learnt by the recipe {dict(recipe)}: {error}") from error
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        known = (*inspect.signature(getattr(SourceInstances, f"from_{learner}")).parameters, "learner", "renew")
+        close = did_you_mean(unknown[1], known) if unknown else ""
+        raise ValueError(f"the source task cannot be learnt by the recipe {dict(recipe)}: {error}{close}") from error
     source.save(file)
     _SEEN.add(file)
     return source

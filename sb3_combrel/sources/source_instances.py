@@ -6,7 +6,8 @@ import base64
 import io
 import json
 import os
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,13 +22,14 @@ from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.common.serialisation import register_reader, register_writer
-from sb3_combrel.sources import minari_datasets, recording
+from sb3_combrel.sources import minari_datasets, recording, tables
 from sb3_combrel.sources.q_learning import learn_q_learning
 from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
 from sb3_combrel.sources.transitions import LEARNERS, Transitions, as_transition_count, count_actions
 
 if TYPE_CHECKING:
+    import pandas as pd
     from minari import MinariDataset
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -203,6 +205,38 @@ class SourceInstances:
         source = cls(*minari_datasets.read_dataset(dataset, bounds))
         return source if n_instances is None else source.subset(n_instances, seed=seed)
 
+    @classmethod
+    def from_table(
+        cls,
+        table: tables.Table,
+        *,
+        state_names: Sequence[str] | None = None,
+        action_names: Sequence[str] = (),
+        n_actions: int | None = None,
+        bounds: Bounds | None = None,
+    ) -> SourceInstances:
+        """Take the transitions of a table with a row for each step, such as a controller's log.
+
+        Columns: each state variable, by its name; ``action``, numbers from 0 on, or names; ``reward``; ``terminated``, whether
+        the step reached a terminal state (or ``done``, with ``truncated`` for time limits; without either no step did); and
+        where the step led, ``next_`` and the name of each variable. Without these columns a step leads to the state of the
+        next row: of the same ``episode``, if there is such a column, and otherwise up to an end. A last state of an episode
+        is a row with an empty ``action``.
+
+        :param table: path of a CSV file, or a pandas DataFrame
+        :param state_names: columns that are state variables, in their order; None: all that are not one of those above
+        :param action_names: names of the actions, in the order of their numbers
+        :param n_actions: number of actions; None: one for each name, or up to the largest number
+        :param bounds: ``(low, high)`` of the states, raw units; None: their range
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if a column is missing, or holds something else
+        """
+        return cls(*tables.read_table(table, state_names, action_names, n_actions, bounds))
+
+    def to_table(self) -> pd.DataFrame:
+        """The instances as a pandas DataFrame that :meth:`from_table` reads; ``.to_csv(path, index=False)`` writes it."""
+        return tables.as_frame(self)
+
     def to_minari(self, dataset_id: str, **metadata: Any) -> MinariDataset:
         """Store the instances as a local Minari dataset (needs ``pip install "sb3-combrel[minari]"``).
 
@@ -230,7 +264,7 @@ class SourceInstances:
 
     def __repr__(self) -> str:
         return (
-            f"<{len(self)} source instances of {self.origin.get('env', 'an unnamed task')}: states "
+            f"<{len(self)} source instances of {self.origin.get('env') or 'an unnamed task'}: states "
             f"({', '.join(self.state_names)}), actions ({', '.join(self.action_names)}), "
             f"{int(self.terminated.sum())} of them terminal>"
         )
@@ -313,6 +347,8 @@ class SourceInstances:
     @classmethod
     def from_bytes(cls, content: bytes) -> SourceInstances:
         """What :meth:`to_bytes` wrote; ``ValueError`` if it is something else, or is cut short."""
+        if not zipfile.is_zipfile(io.BytesIO(content)):
+            raise ValueError("these are not source instances, or they are cut short (it is no npz archive)")
         try:
             # No pickle: a source file may come from anyone.
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_combrel.common.periodic import differences
+from sb3_combrel.common.suggestions import did_you_mean
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -14,8 +15,9 @@ Flags = NDArray[np.bool_]
 
 def check_method(method: str) -> None:
     """Raise ``ValueError`` if there is no such method of choosing instances."""
-    if method not in ("random", "covering"):
-        raise ValueError(f"method must be 'random' or 'covering', got {method!r}")
+    known = "random", "covering"
+    if method not in known:
+        raise ValueError(f"method must be 'random' or 'covering', got {method!r}{did_you_mean(method, known)}")
 
 
 def random_rows(terminated: Flags, n_rows: int, rng: np.random.Generator) -> Ints:

@@ -6,9 +6,11 @@ import copy
 import importlib
 import inspect
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.transfer.base import Transfer
 
 SAVED = "transfer"
@@ -36,7 +38,24 @@ def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | N
     method = _method(transfer) if isinstance(transfer, str) else transfer
     if not (isinstance(method, type) and issubclass(method, Transfer)):
         raise ValueError(f"transfer must be a transfer method such as COMBREL(source), or a dict, got {transfer!r}")
-    return method(**arguments)
+    check_argument_names(method, arguments)
+    try:
+        return method(**arguments)
+    except TypeError as error:
+        # Of a class, or of a dict.
+        example = f"{method.__name__}(source)"
+        raise ValueError(f"transfer must have all its arguments, such as {example}, got {transfer!r}: {error}") from error
+
+
+def check_argument_names(method: type, arguments: Iterable[str]) -> None:
+    """:raises ValueError: if a method, or an algorithm, has no argument of such a name"""
+    parameters = inspect.signature(method).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+        return
+    for name in arguments:
+        if name not in parameters:
+            known = ", ".join(parameters)
+            raise ValueError(f"{method.__name__} has the arguments {known}, got {name!r}{did_you_mean(name, parameters)}")
 
 
 def _method(name: str) -> Any:
@@ -48,7 +67,9 @@ def _method(name: str) -> Any:
     try:
         return getattr(importlib.import_module(module_name or PACKAGE), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"transfer names {name!r}, which does not exist; known are {', '.join(sorted(own))}") from error
+        close = did_you_mean(attribute, [each.rpartition(".")[2] for each in own])
+        known = ", ".join(sorted(own))
+        raise ValueError(f"transfer names {name!r}, which does not exist; known are {known}{close}") from error
 
 
 def _own_methods() -> dict[str, type[Transfer]]:

@@ -12,6 +12,7 @@ from sb3_combrel.fitted_rmax.arguments import check_actions
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.transfer.by_name import check_argument_names
 
 MAX_PAIRS = 2_000_000
 """State-action pairs of the grid beyond which "finer" is not applied: about 1.5 GB."""
@@ -39,10 +40,8 @@ class ZooFittedRMax(FittedRMax):
         if policy is None:
             raise ValueError('the configuration has no "policy"; add "policy: FittedRMaxPolicy" to its entry')
         self.transfer_kwargs = transfer_kwargs
-        try:
-            super().__init__(policy, env, **kwargs)
-        except TypeError as error:
-            raise ValueError(f"the configuration does not fit: {error}") from error
+        check_argument_names(FittedRMax, kwargs)
+        super().__init__(policy, env, **kwargs)
 
     def _setup_model(self) -> None:
         # Not in the constructor: when RL-Zoo resumes, load() sets the arguments after it.

@@ -13,6 +13,8 @@ from unittest import mock
 
 import gymnasium
 
+from sb3_combrel.common.suggestions import did_you_mean
+from sb3_combrel.zoo.configurations import with_configuration
 from sb3_combrel.zoo.plot_checks import check_window, with_evaluations
 
 PROGRAM = "python -m sb3_combrel.zoo"
@@ -36,8 +38,8 @@ SCRIPTS = {
     "load_from_hub": "rl_zoo3.load_from_hub",
 }
 """Commands that are scripts and do their work as ``__main__`` only; they know no ``--gym-packages``."""
-CHECKS = {"all_plots": with_evaluations, "plot_train": check_window}
-"""What is checked before a command, which would draw nothing, or zeros, and say nothing."""
+CHECKS = {"train": with_configuration, "all_plots": with_evaluations, "plot_train": check_window}
+"""What completes the arguments of a command, or refuses those by which it would draw nothing, or zeros, and say nothing."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -47,7 +49,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     command, *rest = list(sys.argv[1:] if args is None else args) or ["--help"]
     if command not in FUNCTIONS | SCRIPTS:
-        print(f"usage: {PROGRAM} {{{','.join(FUNCTIONS | SCRIPTS)}}} ...   (each has --help)")
+        close = did_you_mean(command, FUNCTIONS | SCRIPTS)
+        print(f"usage: {PROGRAM} {{{','.join(FUNCTIONS | SCRIPTS)}}} ...   (each has --help){close}")
         return 0 if command in ("-h", "--help") else 2
     try:
         if command in CHECKS:

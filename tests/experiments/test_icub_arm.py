@@ -5,24 +5,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB
+from sb3_combrel import COMBREL
+from sb3_combrel.experiments.paper.domains import DOMAINS, PAPER
 from sb3_combrel.experiments.tasks import icub_arm
 from sb3_combrel.runs.job import make_env
 
-CONFIGURATION = Path(__file__).resolve().parents[2] / "zoo_configs" / "combrel.yml"
+CONFIGURATION = Path(__file__).resolve().parents[2] / "zoo_configs" / "combrel_paper.yml"
 
 
-def test_explore_is_the_setting_of_the_zoo():
-    learner = dict(pytest.importorskip("yaml").safe_load(CONFIGURATION.read_text())[icub_arm.TARGET_ID])
+@pytest.mark.parametrize("domain", DOMAINS.values(), ids=lambda domain: domain.name)
+def test_the_papers_setting_is_that_of_the_zoo(domain):
+    learner = dict(pytest.importorskip("yaml").safe_load(CONFIGURATION.read_text())[domain.target_id])
     ((method, arguments),) = learner.pop("transfer").items()
     assert method == "sb3_combrel.COMBREL"
     source = arguments.pop("source")
-    assert (source["env"], source["n_instances"]) == (icub_arm.SOURCE_ID, icub_arm.N_INSTANCES)
+    assert source["n_instances"] == 1000
     assert learner.pop("policy") == "FittedRMaxPolicy" and learner.pop("n_timesteps") > 0
     # Nothing of the file is left out, and nothing is added.
-    explore = ICUB.settings[EXPLORE]
-    assert explore.learner == learner and {"mappings": explore.mappings, **explore.combrel} == arguments
-    assert explore.timbrel == {key: explore.combrel[key] for key in explore.timbrel}
+    setting = domain.settings[PAPER]
+    assert dict(setting.learner) == learner
+    wanted = COMBREL.paper("MountainCar-v0", setting.mappings, **setting.combrel).arguments()
+    assert COMBREL("MountainCar-v0", **arguments).arguments() == wanted
 
 
 @pytest.mark.parametrize("env_id", [icub_arm.SOURCE_ID, icub_arm.TARGET_ID])

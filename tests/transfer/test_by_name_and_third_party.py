@@ -42,10 +42,11 @@ def test_a_method_of_ones_own_is_imported_from_where_the_name_says():
 def test_a_name_that_is_wrong_is_refused_with_those_that_are_known():
     public = [each for each in sb3_combrel.__all__ if isinstance(getattr(sb3_combrel, each), type)]
     methods = [each for each in public if issubclass(getattr(sb3_combrel, each), Transfer)]
-    for wrong in ("MASTERR", "nowhere.COMBREL", "sb3_combrel.COMBRELL", ""):
+    for wrong, close in {"MASTERR": "MASTER", "nowhere.COMBREL": "COMBREL", "sb3_combrel.COMBRELL": "COMBREL", "": ""}.items():
         with pytest.raises(ValueError, match=f"{wrong!r}, which does not exist; known are") as error:
             make_transfer({wrong: {}})
-        assert str(error.value).endswith(", ".join(f"sb3_combrel.{each}" for each in sorted(methods)))
+        known = ", ".join(f"sb3_combrel.{each}" for each in sorted(methods))
+        assert str(error.value).endswith(known + (f"; did you mean {close!r}?" if close else ""))
 
 
 @pytest.mark.parametrize(

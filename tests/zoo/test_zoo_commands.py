@@ -13,6 +13,7 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_combrel import FittedRMax, SourceInstances
 from sb3_combrel.zoo import commands
+from sb3_combrel.zoo.configurations import with_configuration
 from sb3_combrel.zoo.plot_checks import check_window, with_evaluations
 
 CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
@@ -62,6 +63,11 @@ def test_a_model_is_trained_and_watched_without_the_file_of_its_source(tmp_path)
         ({"normalize": True}, {}, "VecNormalize"),
         ({}, {"env": "combrel/MountainCar3D-v0"}, "MountainCar3D"),
         ({}, {"conf": "nowhere.yml"}, "nowhere.yml"),
+        ({"model_bredth": 0.1}, {}, "got 'model_bredth'; did you mean 'model_breadth'?"),
+        ({"transfer": {"sb3_combrel.COMBREL": {"sorce": "car.npz"}}}, {}, "got 'sorce'; did you mean 'source'?"),
+        ({"transfer": {"sb3_combrel.COMBRELL": {}}}, {}, "did you mean 'COMBREL'?"),
+        ({"transfer": {"sb3_combrel.COMBREL": {"source": {"env": CAR, "n_instance": 5}}}}, {}, "did you mean 'n_instances'?"),
+        ({"transfer": {"sb3_combrel.COMBREL": {"source": CAR, "mappings": "injectiv"}}}, {}, "did you mean 'injective'?"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_sentence(tmp_path, capsys, entry, change, message):
@@ -69,6 +75,26 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, capsys, entry, change, 
     assert call("train", *train_args(tmp_path, **{"conf": conf, **change})) == 1
     written = capsys.readouterr().err
     assert written.startswith("sb3_combrel.zoo: ") and message in written and "Traceback" not in written
+
+
+def test_a_configuration_of_this_package_is_found_where_none_is_named():
+    ours = [str(CONFIGS / f"{algo}.yml") for algo in ("combrel", "dqn")]
+    assert with_configuration(["--algo", "combrel", "--env", "CartPole-v1"])[-2:] == ["--conf-file", ours[0]]
+    assert with_configuration(["--algo", "dqn", "--env", CAR])[-2:] == ["--conf-file", ours[1]]
+    others = ["--algo=dqn", "--env=CartPole-v1"], ["--algo", "combrel", "-conf", "own.yml"], ["--algo", "a2c", "--env", CAR]
+    for args in others:
+        assert with_configuration(args) == args, "RL-Zoo's own, or the user's"
+
+
+def test_past_data_come_from_a_configuration_or_the_command_line(tmp_path):
+    SourceInstances.record(None, CAR, n_instances=50, seed=0).to_table().to_csv(tmp_path / "log.csv", index=False)
+    conf = write_config(tmp_path / "past.yml", instances=str(tmp_path / "log.csv"))
+    assert call("train", *train_args(tmp_path / "yaml", "--eval-freq", -1, conf=conf, n=60)) == 0
+    given = ("--eval-freq", -1, "-params", f"instances:'{tmp_path / 'log.csv'}'")
+    assert call("train", *train_args(tmp_path / "line", *given, n=60)) == 0
+    for folder in ("yaml", "line"):
+        model = FittedRMax.load(tmp_path / folder / "fitted_rmax" / f"{IN_LOGS}_1" / f"{IN_LOGS}.zip")
+        assert model.agent.model.n_instances == 110
 
 
 def test_an_unknown_command_or_algorithm_is_refused(tmp_path, capsys):

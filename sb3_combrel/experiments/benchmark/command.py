@@ -12,6 +12,7 @@ from rich.console import Console
 
 from sb3_combrel import SourceInstances
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.common.version import __version__
 from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of
 from sb3_combrel.experiments.benchmark.pair import Pair
@@ -90,7 +91,7 @@ def pairs_of(names: Sequence[str]) -> list[Pair]:
             found.append(replace(pair, digest=digest))
         else:
             own = "a pair of your own is the path of a file that ends in .py and defines PAIR"
-            raise ValueError(f"pairs must be of {', '.join(PAIRS)}, or all; {own}; got {name!r}")
+            raise ValueError(f"pairs must be of {', '.join(PAIRS)}, or all; {own}; got {name!r}{did_you_mean(name, PAIRS)}")
     return found
 
 

@@ -58,8 +58,8 @@ FEWEST_TIMESTEPS = 5000
 
 _ARM = ICUB.settings[EXPLORE]
 _CAR_LEARNER = {"degree": 0, "model_breadth": 0.1, "resolution": 3}
-#: How COMBREL learns before the replay buffer is filled, as in zoo_configs/combrel.yml: arguments of FittedRMax and COMBREL,
-#: and the number of episodes; instances are translated for the states visited in them.
+#: How COMBREL learns before the replay buffer is filled: arguments of FittedRMax and COMBREL, and the number of episodes;
+#: instances are translated for the states visited in them.
 PREFILLINGS: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], int]] = {
     mountain_car.TARGET_ID: (_CAR_LEARNER, {"mappings": "injective", "use": "instances"}, 2),
     icub_arm.TARGET_ID: (_ARM.learner, {"mappings": _ARM.mappings, **_ARM.combrel, "use": "instances"}, 5),

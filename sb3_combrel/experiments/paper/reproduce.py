@@ -10,6 +10,7 @@ from rich.console import Console
 
 from sb3_combrel import InterTaskMapping, __version__
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baselines import baseline_jobs
 from sb3_combrel.experiments.paper.domains import DOMAINS, SETTINGS, Domain
@@ -57,7 +58,7 @@ def reproduce(
     :raises JobError: if a run raises an exception, or its workers died too often
     """
     if setting not in SETTINGS:
-        raise ValueError(f"setting must be one of {', '.join(SETTINGS)}, got {setting!r}")
+        raise ValueError(f"setting must be one of {', '.join(SETTINGS)}, got {setting!r}{did_you_mean(setting, SETTINGS)}")
     for name, number in (("runs", runs), ("episodes", episodes)):
         check_count(name, number, none_allowed=True)
     targets = targets_of(target, setting)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import BEST, EXPLORE, ICUB, MOUNTAIN_CAR, Domain
 
@@ -59,7 +60,8 @@ def targets_of(name: str, setting: str) -> list[Target]:
     if name == ALL:
         return [target for target in TARGETS.values() if exists_in(target.name, setting)]
     if name not in TARGETS:
-        raise ValueError(f"target must be one of {', '.join(TARGETS)} or {ALL}, got {name!r}")
+        close = did_you_mean(name, (*TARGETS, ALL))
+        raise ValueError(f"target must be one of {', '.join(TARGETS)} or {ALL}, got {name!r}{close}")
     if not exists_in(name, setting):
         raise ValueError(f"{name} does not exist in setting {setting!r}: {_WHY_NOT[name]}; use another --setting")
     return [TARGETS[name]]

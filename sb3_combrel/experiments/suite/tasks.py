@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.experiments.suite.measures import (
     Measure,
     mean_return_in,
@@ -193,5 +194,6 @@ def tasks_of(names: list[str]) -> list[Task]:
         return list(TASKS.values())
     unknown = [name for name in names if name not in TASKS]
     if unknown or not names:
-        raise ValueError(f"tasks must be 'all' or some of {', '.join(TASKS)}, got {names!r}")
+        close = did_you_mean(unknown[0], TASKS) if unknown else ""
+        raise ValueError(f"tasks must be 'all' or some of {', '.join(TASKS)}, got {names!r}{close}")
     return [TASKS[name] for name in dict.fromkeys(names)]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, RegionErrors, warn_of_error
@@ -19,6 +20,10 @@ from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.value_bound import ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
+#: States, rewards and effects.
+Episode = list[tuple[np.ndarray, float, np.ndarray]]
+# Rounding, in unit coordinates: a transition begins where the one before it led.
+SAME_STATE = 1e-9
 # So many transitions are compared with what all copies predict; of later ones one in so many.
 ALL_MEASURED, MEASURED_LATER = 500, 5
 
@@ -71,10 +76,8 @@ class SourcePrior:
         self._own: OwnPrediction | None = None
         #: Number of the environment that the transitions observed now come from.
         self.environment = 0
-        # By environment: states and rewards of the present episode.
-        self._episodes: defaultdict[int, list[tuple[np.ndarray, float]]] = defaultdict(list)
-        # Environments whose last transition was to a terminal state.
-        self._over: set[int] = set()
+        # By environment: states, rewards and effects of the present episode.
+        self._episodes: defaultdict[int, Episode] = defaultdict(list)
         #: Whether the mapping in use explains all target actions, as last renewed; a given one does until it is shown not to.
         self.explains = isinstance(choose, Choice)
         #: By how much a return that was seen exceeds what the source bounds it by.
@@ -139,13 +142,15 @@ class SourcePrior:
             if not self._warned and self.n_observed >= TRANSITIONS_BEFORE_WARNING and self.error() > 1.0:
                 self._warned = True
                 warn_of_error(self.sources, self.n_observed, self.error())
-        if self.environment in self._over:
-            # Nobody has said that the episode before ended: transitions are taken in once more, in other unit coordinates.
-            self._over.remove(self.environment)
-            self._episodes[self.environment].clear()
-        self._episodes[self.environment].append((state, reward))
-        if terminated:
-            self._over.add(self.environment)
+        episode = self._episodes[self.environment]
+        if episode and not self._leads_to(episode[-1], state):
+            # Past data, or transitions that are taken in once more in other unit coordinates: episodes may be cut anywhere.
+            episode.clear()
+        episode.append((state, reward, effect))
+
+    def _leads_to(self, last: tuple[np.ndarray, float, np.ndarray], state: np.ndarray) -> bool:
+        apart = differences(last[0] + last[2], state, np.array(self.task.periodic))
+        return float(np.abs(apart).max()) < SAME_STATE
 
     def _is_measured(self, number: Any) -> Any:
         """Whether recorded transitions with these numbers, from 1 on, are compared with what all copies predict."""
@@ -196,9 +201,8 @@ class SourcePrior:
         if truncated and self.n_observed <= self.max_transitions:
             self.transitions.note_time_limit()
         episode = self._episodes.pop(self.environment, [])
-        self._over.discard(self.environment)
         # What follows a time limit may cost more than was gained until then.
-        complete = not truncated or all(reward >= 0.0 for _, reward in episode)
+        complete = not truncated or all(reward >= 0.0 for _, reward, _ in episode)
         if episode and complete and self.choice is not None and self._bound() is not None:
             excess = self._value_bound.excess(self.choice, episode)
             if excess > self.excess:
@@ -308,9 +312,9 @@ class SourcePrior:
         }
 
     def _episode_rows(self) -> np.ndarray:
-        """Environment, state and reward of the present episodes, float64, shape (n, n_variables + 2)."""
-        rows = [[e, *state, reward] for e, episode in self._episodes.items() for state, reward in episode]
-        return np.array(rows, dtype=np.float64).reshape(-1, self.task.n_variables + 2)
+        """Environment, state, reward and effect of the present episodes, float64, shape (n, 2 * n_variables + 2)."""
+        rows = [[e, *state, reward, *effect] for e, episode in self._episodes.items() for state, reward, effect in episode]
+        return np.array(rows, dtype=np.float64).reshape(-1, 2 * self.task.n_variables + 2)
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         d, n_actions = self.task.n_variables, self.task.n_actions
@@ -329,6 +333,6 @@ class SourcePrior:
         self.excess = float(state["prior_evidence"][-1])
         self._episodes.clear()
         for row in state["prior_episodes"]:
-            self._episodes[int(row[0])].append((row[1:-1].copy(), float(row[-1])))
+            self._episodes[int(row[0])].append((row[1 : d + 1].copy(), float(row[d + 1]), row[d + 2 :].copy()))
         self.errors.sums.ravel()[:] = state["prior_errors"]
         self.candidates.set_state(state["prior_uses"])

@@ -56,15 +56,15 @@ class ValueBound:
         bounds = [self._bound(copy) for copy in used if self._is_whole(copy)]
         return np.minimum.reduce(bounds) if bounds else None
 
-    def excess(self, choice: Choice, episode: Sequence[tuple[np.ndarray, float]]) -> float:
+    def excess(self, choice: Choice, episode: Sequence[tuple[np.ndarray, float, np.ndarray]]) -> float:
         """Return by how much the returns to go of an episode exceed what the source's values bound them by, at least 0.
 
         Within a cell of the source's grid a value is no more than the largest at its corners.
 
         :param choice: that bounds values, see :meth:`through`
-        :param episode: states, unit coordinates, and rewards
+        :param episode: states, unit coordinates, rewards and effects
         """
-        states, returns, to_go = np.array([state for state, _ in episode]), np.zeros(len(episode)), 0.0
+        states, returns, to_go = np.array([state for state, *_ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
             returns[i] = to_go = episode[i][1] + self._gamma * to_go
         bounds = np.full(len(episode), np.inf)

@@ -1,0 +1,206 @@
+"""Past data of the same task, which count as the learner's own experience, whatever has kept them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.task import Task
+from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
+from sb3_combrel.sources.source_instances import SourceInstances
+from sb3_combrel.sources.transitions import describe_origin
+
+SelfPastData = TypeVar("SelfPastData", bound="PastData")
+
+KINDS = (
+    "SourceInstances, a file (.npz, .csv or a saved model's .zip), a pandas DataFrame, a Minari dataset or its id, a replay "
+    "buffer, a model, or a controller: a function of the state that returns an action"
+)
+
+
+class PastData(SavedAlgorithm):
+    """What :class:`~sb3_combrel.FittedRMax` does with experience that it has not made itself."""
+
+    env: VecEnv | None
+
+    def load_instances(self: SelfPastData, instances: Any, n_instances: int = 1000) -> SelfPastData:
+        """Take in past transitions of the same task, as if the agent had made them: known at once, and planned with.
+
+        They do not count as time steps. Scales that are found from observations, ``gamma`` and ``max_value`` follow them.
+        For experience of a task with other states or actions there is ``transfer=COMBREL(source)``.
+
+        :param instances: :class:`~sb3_combrel.SourceInstances`; the path of a file of them, of a CSV file, or of a saved
+            model; a pandas DataFrame (columns: :meth:`SourceInstances.from_table`); a Minari dataset or its id; a replay
+            buffer of Stable-Baselines3; a model of this class or with a replay buffer, of which its experience; or any other
+            model, or a function from one state, raw units, to an action, which then acts in the model's environment
+        :param n_instances: steps that such a model or function makes in the environment
+        :return: this model
+        :raises FileNotFoundError: if there is no such file
+        :raises ValueError: if they are of another task, by names or numbers of variables and actions, or are damaged; nothing
+            is taken in then
+        """
+        found = self._of_this_task(self._read_instances(instances, n_instances))
+        self.policy.take_in(found.states, found.actions, found.rewards, found.next_states, found.terminated)
+        return self
+
+    def source_instances(self) -> SourceInstances:
+        """The experience so far, raw units, in its order; a ValueError if there is none.
+
+        With ``max_instances`` it is what has been kept.
+        """
+        agent = self.policy.agent
+        transitions = agent.model.transitions()
+        if not transitions:
+            raise ValueError("the model has no experience yet: call learn(total_timesteps) or load_instances(...) first")
+        states, actions, rewards, next_states, terminated = map(np.array, zip(*transitions, strict=True))
+        scaling, task = agent.task.scaling, agent.task
+        origin = {} if self.env is None else describe_origin(self.env, type(self).__name__, self.seed)
+        return SourceInstances(
+            *(scaling.to_raw(states), actions, rewards, scaling.to_raw(next_states), terminated, scaling.low, scaling.high),
+            *(task.n_actions, tuple(task.state_names), tuple(task.action_names), origin, tuple(map(bool, agent.periodic))),
+        )
+
+    def save_replay_buffer(self, path: str | Path) -> None:
+        """Write the experience to a file, as :class:`~sb3_combrel.SourceInstances`: data alone, no pickled objects.
+
+        A saved model has its experience already. This file is for another model, or a source for another task.
+
+        :param path: of the file; .npz is added if it has no suffix
+        :raises ValueError: if there is no experience
+        """
+        self.source_instances().save(path)
+
+    def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
+        """Take in what :meth:`save_replay_buffer` has written, which is :meth:`load_instances` of a file.
+
+        :param path: of the file
+        :param truncate_last_traj: not used; every transition stands for itself
+        :raises FileNotFoundError: if there is no such file; ValueError: as :meth:`load_instances`
+        """
+        self.load_instances(path)
+
+    def _read_instances(self, given: Any, n_instances: int) -> SourceInstances:
+        task = self.policy.agent.task
+        named = not _are_numbered(task.state_names), not _are_numbered(task.action_names)
+        names: dict[str, Any] = {
+            "state_names": tuple(task.state_names) if named[0] else None,
+            "action_names": tuple(task.action_names) if named[1] else (),
+        }
+        if isinstance(given, SourceInstances):
+            return given
+        if hasattr(given, "columns") and hasattr(given, "iloc"):
+            return SourceInstances.from_table(given, **names)
+        if isinstance(given, str | os.PathLike):
+            return self._read_file(Path(given), names)
+        if hasattr(given, "iterate_episodes"):
+            return SourceInstances.from_minari(given)
+        if isinstance(given, PastData):
+            return given.source_instances()
+        buffer = given if isinstance(given, ReplayBuffer) else getattr(given, "replay_buffer", None)
+        if isinstance(buffer, ReplayBuffer) and buffer.size() > 0:
+            return _of_buffer(buffer, task)
+        if isinstance(given, type) or not (hasattr(given, "predict") or callable(given)):
+            raise ValueError(f"instances must be {KINDS}, got {given!r}")
+        return self._act(given, n_instances)
+
+    def _act(self, controller: Callable[[np.ndarray], int] | Any, n_instances: int) -> SourceInstances:
+        if self.env is None:
+            raise ValueError("instances must be data where the model has no environment to act in: call set_env(env) first")
+        found = SourceInstances.record(controller, self.env, n_instances, self.seed)
+        # The environment is in the middle of an episode of the controller's: the next ``learn`` begins one of its own.
+        self._last_obs = None
+        return found
+
+    def _read_file(self, path: Path, names: dict[str, Any]) -> SourceInstances:
+        if path.suffix.lower() in (".pkl", ".pickle"):
+            raise ValueError(
+                f"{path} is a pickle, which may run any program when it is read: if you trust it, read it with "
+                "stable_baselines3.common.save_util.load_from_pkl, and pass the replay buffer"
+            )
+        if path.suffix.lower() in (".csv", ".txt") or path.name.lower().endswith((".csv.gz", ".csv.zip")):
+            return SourceInstances.from_table(path, **names)
+        if path.suffix.lower() == ".zip":
+            return type(self).load(path).source_instances()
+        if path.is_file() or path.suffix == ".npz" or path.with_name(f"{path.name}.npz").is_file():
+            return SourceInstances.load(path)
+        try:
+            return SourceInstances.from_minari(str(path))
+        except (FileNotFoundError, ImportError) as error:
+            raise FileNotFoundError(
+                f"there is no file {path}, looked for in {Path.cwd()}, and no Minari dataset of that name is here ({error})"
+            ) from error
+
+    def _of_this_task(self, found: SourceInstances) -> SourceInstances:
+        """The instances with the variables and actions in the task's own order; a ValueError if they are of another task."""
+        task = self.policy.agent.task
+        other = "; for experience of another task there is transfer=COMBREL(source)"
+        if found.n_variables != task.scaling.n_variables or found.n_actions > task.n_actions:
+            raise ValueError(
+                f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
+                f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
+            )
+        columns = _order(found.state_names, tuple(task.state_names), "state variables", other)
+        numbers = _order(tuple(task.action_names), found.action_names, "actions", other)
+        return replace(
+            found,
+            states=found.states[:, columns],
+            next_states=found.next_states[:, columns],
+            actions=numbers[found.actions],
+            low=found.low[columns],
+            high=found.high[columns],
+            n_actions=task.n_actions,
+            state_names=tuple(task.state_names),
+            action_names=tuple(task.action_names),
+            periodic=tuple(np.array(found.periodic)[columns].tolist()),
+        )
+
+
+def _are_numbered(names: Sequence[str]) -> bool:
+    """Whether names are those that are given where a task has none: s0, s1, ... or a0, a1, ..."""
+    return all(name[1:] == str(k) for k, name in enumerate(names))
+
+
+def _order(given: tuple[str, ...], wanted: tuple[str, ...], what: str, other: str) -> np.ndarray:
+    """Where each wanted name is among those given; in their own order where one side has no names of its own."""
+    if _are_numbered(given) or _are_numbered(wanted) or given[: len(wanted)] == wanted:
+        return np.arange(len(wanted))
+    missing = [name for name in wanted if name not in given]
+    if missing:
+        raise ValueError(f"instances must have the {what} {wanted if what[0] == 's' else given}, got others: {missing}{other}")
+    return np.array([given.index(name) for name in wanted])
+
+
+def _of_buffer(buffer: ReplayBuffer, task: Task) -> SourceInstances:
+    """The transitions of a replay buffer, environment by environment, in the order in which they came."""
+    if buffer.optimize_memory_usage:
+        raise ValueError("a replay buffer with optimize_memory_usage=True does not keep in which states episodes ended")
+    if not isinstance(buffer.observations, np.ndarray) or not isinstance(buffer.action_space, spaces.Discrete):
+        raise ValueError(
+            f"a replay buffer must have Box observations and Discrete actions, got {buffer.observation_space} and "
+            f"{buffer.action_space}"
+        )
+    oldest = buffer.pos if buffer.full else 0
+    rows = (oldest + np.arange(buffer.size())) % buffer.buffer_size
+
+    def column(array: np.ndarray) -> np.ndarray:
+        return np.concatenate([array[rows, e].reshape(len(rows), -1) for e in range(buffer.n_envs)]).astype(np.float64)
+
+    states, next_states = column(buffer.observations), column(buffer.next_observations)
+    limits = np.full(states.shape[1], -np.inf), np.full(states.shape[1], np.inf)
+    scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
+    ended, truncated = column(buffer.dones)[:, 0] > 0.5, column(buffer.timeouts)[:, 0] > 0.5
+    actions = column(buffer.actions)[:, 0].astype(np.int64) - int(buffer.action_space.start)
+    return SourceInstances(
+        *(states, actions, column(buffer.rewards)[:, 0], next_states, ended & ~truncated, scaling.low, scaling.high),
+        int(buffer.action_space.n),
+        origin={"env": None, "recorder": "replay buffer"},
+    )

@@ -1,0 +1,178 @@
+"""Transitions from a table with named columns: a CSV file, or a pandas DataFrame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.common.suggestions import did_you_mean
+from sb3_combrel.sources.transitions import Floats, Transitions
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Importing pandas takes a while, and only who has a table needs it.
+Table: TypeAlias = "str | os.PathLike[str] | pd.DataFrame"
+ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE = "action", "reward", "terminated", "done", "truncated", "episode"
+NEXT = "next_"
+_NO_STATES = {ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE}
+
+
+def read_table(
+    table: Table,
+    state_names: Sequence[str] | None,
+    action_names: Sequence[str],
+    n_actions: int | None,
+    bounds: Bounds | None,
+) -> Transitions:
+    """Read the transitions of a table; for the parameters see :meth:`SourceInstances.from_table`."""
+    frame = _read(table)
+    names = _state_names(frame) if state_names is None else tuple(state_names)
+    for name in (*names, ACTION, REWARD):
+        _require(frame, name)
+    frame = frame.reset_index(drop=True)
+    steps, next_states = _with_next_states(frame, names)
+    states = _numbers(steps, names)
+    actions = _actions(steps, action_names)
+    n_actions = _n_actions(actions, action_names, n_actions)
+    every = (-np.inf, np.inf) if bounds is None else bounds
+    limits = tuple(np.broadcast_to(np.asarray(side, dtype=np.float64), (len(names),)) for side in every)
+    scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))  # type: ignore[arg-type]
+    origin = {"env": None, "recorder": os.path.basename(table) if isinstance(table, str | os.PathLike) else "table"}
+    return Transitions(
+        *(states, actions, _numbers(steps, [REWARD])[:, 0], next_states, _terminated(steps)),
+        *(scaling.low, scaling.high, n_actions, names, tuple(action_names)),
+        origin=origin,
+    )
+
+
+def _read(table: Table) -> pd.DataFrame:
+    import pandas as pd
+
+    if isinstance(table, pd.DataFrame):
+        return table
+    try:
+        return pd.read_csv(table, skipinitialspace=True)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise ValueError(f"{os.fspath(table)} is no table with named columns: {' '.join(str(error).split())}") from error
+
+
+def _state_names(frame: pd.DataFrame) -> tuple[str, ...]:
+    """All columns that are nothing else."""
+    return tuple(str(name) for name in frame.columns if str(name) not in _NO_STATES and not str(name).startswith(NEXT))
+
+
+def _require(frame: pd.DataFrame, name: str) -> None:
+    if name not in frame.columns:
+        columns = [str(each) for each in frame.columns]
+        raise ValueError(f"the table has no column {name!r}, its columns are {columns}{did_you_mean(name, columns)}")
+
+
+def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.DataFrame, Floats]:
+    """The rows that are transitions, and where each leads: by columns of its own, or by the next row of its episode."""
+    following = [f"{NEXT}{name}" for name in names]
+    if any(name in frame.columns for name in following):
+        for name in following:
+            _require(frame, name)
+        return frame, _numbers(frame, following)
+    ends = _flags(frame, TERMINATED) | _flags(frame, DONE) | _flags(frame, TRUNCATED)
+    acts = frame[ACTION].notna().to_numpy()
+    if EPISODE in frame.columns:
+        episode = frame[EPISODE].to_numpy()
+        goes_on = np.append(episode[1:] == episode[:-1], False)
+    else:
+        # Without numbers of episodes the row after an end is its last state only if nothing was done there.
+        goes_on = np.append(~ends[:-1] | ~acts[1:], False) & acts
+    # The last step before a time limit may be left out; where an end was reached must be known.
+    lost = np.flatnonzero(_terminated(frame) & acts & ~goes_on)
+    if len(lost):
+        raise ValueError(
+            f"the table does not say in which state the episode that terminates in row {lost[0]} arrived: add columns "
+            f"{following}, or, after that row, one with this state and an empty action"
+        )
+    chosen = np.flatnonzero(acts & goes_on)
+    if len(chosen) == 0:
+        raise ValueError(f"the table has no transition: it needs columns {following}, or two rows of one episode")
+    return frame.iloc[chosen], _numbers(frame.iloc[chosen + 1], names)
+
+
+def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> Floats:
+    """Columns as finite numbers, float64, shape (n, n_names)."""
+    import pandas as pd
+
+    for name in names:
+        column = pd.to_numeric(frame[name], errors="coerce").to_numpy(dtype=np.float64)
+        wrong = np.flatnonzero(~np.isfinite(column))
+        if len(wrong):
+            row = wrong[0]
+            raise ValueError(
+                f"column {name!r} must be finite numbers, got {frame[name].tolist()[row]!r} in row {frame.index[row]}"
+            )
+    return frame[list(names)].to_numpy(dtype=np.float64)
+
+
+def _flags(frame: pd.DataFrame, name: str) -> np.ndarray:
+    """A column of true and false, or 1 and 0; all false if there is none, and where nothing is written."""
+    if name not in frame.columns:
+        return np.zeros(len(frame), dtype=np.bool_)
+    meaning = {
+        "true": True,
+        "false": False,
+        "1": True,
+        "0": False,
+        "1.0": True,
+        "0.0": False,
+        "nan": False,
+        "": False,
+        "none": False,
+    }
+    flags = frame[name].astype(str).str.strip().str.lower().map(meaning)
+    wrong = np.flatnonzero(flags.isna())
+    if len(wrong):
+        row = wrong[0]
+        raise ValueError(f"column {name!r} must be true or false, got {frame[name].tolist()[row]!r} in row {frame.index[row]}")
+    return flags.to_numpy(dtype=np.bool_)
+
+
+def _terminated(frame: pd.DataFrame) -> np.ndarray:
+    """Whether each transition reached a terminal state: "done" counts where there is no "terminated", but for time limits."""
+    return _flags(frame, TERMINATED) if TERMINATED in frame.columns else _flags(frame, DONE) & ~_flags(frame, TRUNCATED)
+
+
+def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:
+    """Actions by number, from 0 on, or by name; int64."""
+    import pandas as pd
+
+    column = frame[ACTION]
+    as_numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64)
+    by_name = {str(name): float(number) for number, name in enumerate(action_names)}
+    numbers = np.where(np.isnan(as_numbers), column.astype(str).map(by_name).to_numpy(dtype=np.float64), as_numbers)
+    wrong = np.flatnonzero(~(numbers == np.floor(numbers)) | (numbers < 0.0))
+    if len(wrong):
+        got = column.tolist()[wrong[0]]
+        names = f", or one of {list(action_names)}" if len(action_names) else ""
+        raise ValueError(
+            f"column {ACTION!r} must be whole numbers from 0 on{names}, got {got!r} in row {frame.index[wrong[0]]}"
+            f"{did_you_mean(got, by_name)}; continuous actions: write the number of the nearest of those that the agent has"
+        )
+    return numbers.astype(np.int64)
+
+
+def _n_actions(actions: np.ndarray, action_names: Sequence[str], n_actions: int | None) -> int:
+    if n_actions is not None:
+        return n_actions
+    return len(action_names) if len(action_names) else int(actions.max(initial=0)) + 1
+
+
+def as_frame(source: Any) -> pd.DataFrame:
+    """The table of source instances, see :meth:`SourceInstances.to_table`."""
+    import pandas as pd
+
+    data: dict[str, Any] = {name: source.states[:, k] for k, name in enumerate(source.state_names)}
+    data |= {ACTION: source.actions, REWARD: source.rewards}
+    data |= {f"{NEXT}{name}": source.next_states[:, k] for k, name in enumerate(source.state_names)}
+    return pd.DataFrame({**data, TERMINATED: source.terminated})

@@ -1,0 +1,226 @@
+"""Past data of the same task count as the agent's own experience, whatever has kept them."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.agents import assert_same_state, make_agent
+from helpers.dashboard import NamedWalk
+from helpers.walk import GOAL, STRIDE, Walk, walk_source
+from stable_baselines3 import DQN
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+
+BOUNDS = ([-1.0, 0.0], [1.0, 2.0])
+
+
+def model(env=None, **arguments):
+    return FittedRMax(Walk() if env is None else env, seed=0, **arguments)
+
+
+def rightwards(state):
+    return 1
+
+
+def test_what_is_loaded_is_known_at_once_and_planned_with():
+    loaded = model().load_instances(walk_source())
+    assert loaded.agent.model.n_instances == 60 and loaded.num_timesteps == 0
+    mean, _ = evaluate_policy(loaded, Monitor(Walk()), n_eval_episodes=5)
+    fewest = np.ceil((GOAL + 0.6) / STRIDE)
+    assert mean >= -fewest, "without a step in the environment"
+    assert loaded.agent.act(loaded.policy.to_unit(np.array([0.0, 1.0]))) == 1, "learning goes on from there"
+
+
+def test_it_is_what_the_agent_would_know_had_it_made_the_transitions_itself():
+    """But for planning, which is done once; with fixed scales, as these are followed at once too."""
+    source = walk_source()
+    one, other = (model(bounds=BOUNDS, planning_tolerance=1e-9) for _ in range(2))
+    one.load_instances(source)
+    unit = other.policy.to_unit
+    for k in range(len(source)):
+        state, after = unit(source.states[k]), unit(source.next_states[k])
+        other.agent.update(state, int(source.actions[k]), float(source.rewards[k]), after, bool(source.terminated[k]))
+    one_state, other_state = one.agent.get_state(), other.agent.get_state()
+    np.testing.assert_array_equal(one_state["instances"], other_state["instances"])
+    np.testing.assert_array_equal(one_state["rewards"], other_state["rewards"])
+    np.testing.assert_array_equal(one.agent.model.known, other.agent.model.known)
+
+
+def forms(tmp_path, source):
+    """The same instances in all ways in which they may be kept."""
+    source.save(tmp_path / "log.npz")
+    source.to_table().to_csv(tmp_path / "log.csv", index=False)
+    other = model().load_instances(source)
+    other.save(tmp_path / "walk.zip")
+    yield from (source, source.to_table(), tmp_path / "log.npz", str(tmp_path / "log"), tmp_path / "log.csv", other)
+    yield tmp_path / "walk.zip"
+
+
+def test_however_it_was_kept_it_is_the_same(tmp_path):
+    wanted = model().load_instances(walk_source()).agent
+    for kept in forms(tmp_path, walk_source()):
+        found = model().load_instances(kept).agent
+        assert found.model.n_instances == 60, kept
+        np.testing.assert_allclose(found.planner.values, wanted.planner.values, atol=1e-6, err_msg=str(kept))
+        given = model(instances=kept)
+        assert given.instances is None
+        assert_same_state(given.agent, found)
+
+
+def test_columns_and_actions_are_found_by_their_names(tmp_path):
+    source = model(NamedWalk()).load_instances(walk_source()).source_instances()
+    assert source.state_names == NamedWalk.state_names and source.action_names == NamedWalk.action_names
+    turned = source.to_table()[::-1][sorted(source.to_table().columns)]
+    turned["action"] = [source.action_names[a] for a in turned["action"]]
+    loaded = model(NamedWalk()).load_instances(turned)
+    np.testing.assert_allclose(loaded.source_instances().states, source.states[::-1], atol=1e-12)
+    np.testing.assert_array_equal(loaded.source_instances().actions, source.actions[::-1])
+    swapped = replace(
+        source,
+        **{name: getattr(source, name)[:, ::-1] for name in ("states", "next_states")},
+        **{name: getattr(source, name)[::-1] for name in ("low", "high", "state_names", "action_names")},
+        actions=1 - source.actions,
+    )
+    found = model(NamedWalk()).load_instances(swapped).source_instances()
+    np.testing.assert_allclose(found.states, source.states, atol=1e-12)
+    np.testing.assert_array_equal(found.actions, source.actions)
+
+
+def test_a_controller_acts_in_the_models_environment():
+    loaded = model(Walk(first=1)).load_instances(lambda state: 2, n_instances=40)
+    assert loaded.agent.model.n_instances == 40 and loaded.num_timesteps == 0
+    assert set(loaded.source_instances().actions) == {1}, "numbered from 0 on"
+    loaded.learn(100)
+    assert loaded.agent.model.n_instances == 140
+    by_model = model().load_instances(loaded_dqn(Walk(), 0), n_instances=20)
+    assert by_model.agent.model.n_instances == 20
+
+
+def loaded_dqn(env, steps):
+    dqn = DQN("MlpPolicy", env, seed=0, learning_starts=10, buffer_size=500)
+    return dqn.learn(steps) if steps else dqn
+
+
+def test_a_replay_buffer_is_read_transition_by_transition():
+    dqn = loaded_dqn(Walk(limit=4), 90)
+    for given in (dqn, dqn.replay_buffer):
+        found = model().load_instances(given).source_instances()
+        size = dqn.replay_buffer.size()
+        np.testing.assert_allclose(found.states, dqn.replay_buffer.observations[:size, 0], atol=1e-6)
+        np.testing.assert_allclose(found.next_states, dqn.replay_buffer.next_observations[:size, 0], atol=1e-6)
+        limits = dqn.replay_buffer.timeouts[:size, 0] > 0.5
+        assert limits.any() and not found.terminated[limits].any(), "a time limit is no end"
+
+
+def test_an_own_replay_buffer_is_written_and_read(tmp_path):
+    first = model().learn(60)
+    first.save_replay_buffer(tmp_path / "buffer")
+    second = model()
+    second.load_replay_buffer(tmp_path / "buffer.npz")
+    np.testing.assert_allclose(second.source_instances().states, first.source_instances().states, atol=1e-12)
+    np.testing.assert_array_equal(second.source_instances().terminated, first.source_instances().terminated)
+
+
+def test_found_scales_discount_and_optimism_follow():
+    source = walk_source()
+    positive = replace(source, rewards=source.rewards + 3.0)
+    loaded = model().load_instances(positive)
+    assert (loaded.agent.mdp.gamma, loaded.agent.planner.bounds[1]) == pytest.approx((0.99, 200.0))
+    assert loaded.policy.scales.observed[1, 0] == pytest.approx(source.next_states[:, 0].max())
+    narrow = replace(source, states=0.1 * source.states, next_states=0.1 * source.next_states)
+    assert model().load_instances(narrow).policy.scaling.high[0] < 0.2
+
+
+def test_a_transfer_method_observes_it_as_well():
+    with_transfer = model(transfer=COMBREL(walk_source())).load_instances(walk_source(100))
+    assert with_transfer.transfer.source_prior.n_observed == 100
+    assert with_transfer.transfer.report()
+    with_transfer.learn(50)
+
+
+def test_returns_are_of_one_episode_where_past_data_are_cut(tmp_path):
+    """Two halves of different episodes: no return may be counted over both."""
+    agent = make_agent(1, 2, COMBREL(walk_line()))
+    steps = [(np.array([x]), 1, 0.0, np.array([x + 0.05]), False) for x in (0.1, 0.15, 0.6, 0.65)]
+    agent.take_in(steps)
+    [episode] = agent.transfer.source_prior._episodes.values()
+    assert [float(state[0]) for state, *_ in episode] == [0.6, 0.65]
+
+
+def walk_line(n=60):
+    at = np.linspace(0.0, 0.9, n)[:, None]
+    return SourceInstances(at, np.arange(n) % 2, np.zeros(n), at + 0.05, np.zeros(n, dtype=bool), [0.0], [1.0], 2)
+
+
+def test_a_loaded_model_keeps_what_it_was_given(tmp_path):
+    given = model(instances=walk_source()).learn(40)
+    given.save(tmp_path / "walk.zip")
+    again = FittedRMax.load(tmp_path / "walk.zip", env=Walk())
+    assert_same_state(again.agent, given.agent)
+    assert again.instances is None and again.agent.model.n_instances == 100
+
+
+def other_task():
+    source = walk_source()
+    return SourceInstances(
+        np.hstack([source.states] * 2),
+        source.actions,
+        source.rewards,
+        np.hstack([source.next_states] * 2),
+        source.terminated,
+        np.full(4, -1.0),
+        np.full(4, 2.0),
+        2,
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        (other_task(), ValueError, "2 state variables.*got 4.*COMBREL"),
+        (walk_source().to_table().drop(columns="reward"), ValueError, "no column 'reward'"),
+        ("nothere.npz", FileNotFoundError, "nothere.npz"),
+        ("nothere", FileNotFoundError, "nothere"),
+        (7, ValueError, "instances must be .* got 7"),
+        (COMBREL, ValueError, "instances must be"),
+    ],
+)
+def test_what_cannot_be_loaded_is_named_and_nothing_changes(given, error, message):
+    learner = model()
+    with pytest.raises(error, match=message):
+        learner.load_instances(given)
+    assert learner.agent.model.n_instances == 0
+
+
+def test_other_names_are_another_task():
+    source = model(NamedWalk()).load_instances(walk_source()).source_instances()
+    renamed = replace(source, state_names=("height", "mass"))
+    with pytest.raises(ValueError, match=r"others: .'place'.*COMBREL"):
+        model(NamedWalk()).load_instances(renamed)
+
+
+def test_a_pickle_is_never_read(tmp_path):
+    """Nor run: reading one may do anything."""
+    (tmp_path / "buffer.pkl").write_bytes(pickle.dumps({"a": 1}))
+    with pytest.raises(ValueError, match=r"pickle.*load_from_pkl"):
+        model().load_instances(tmp_path / "buffer.pkl")
+
+
+def test_without_experience_there_is_nothing_to_write(tmp_path):
+    with pytest.raises(ValueError, match="no experience yet"):
+        model().save_replay_buffer(tmp_path / "buffer")
+
+
+def test_a_buffer_that_forgets_where_episodes_ended_is_refused():
+    walk = Walk()
+    buffer = ReplayBuffer(
+        10, walk.observation_space, walk.action_space, optimize_memory_usage=True, handle_timeout_termination=False
+    )
+    at = np.array([[0.0, 1.0]])
+    buffer.add(at, at, np.array([[1]]), np.array([-1.0]), np.array([False]), [{}])
+    with pytest.raises(ValueError, match="optimize_memory_usage"):
+        model().load_instances(buffer)

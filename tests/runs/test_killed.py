@@ -1,0 +1,84 @@
+"""Processes that are killed at any moment: what was finished is kept, and the same command goes on from there."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_combrel import FittedRMax
+from sb3_combrel.runs.runner import FOLDER
+
+pytestmark = pytest.mark.long
+
+N_KILLS = 50
+LEARN = """
+import sys
+from stable_baselines3.common.callbacks import CheckpointCallback
+from sb3_combrel import FittedRMax
+path, folder = sys.argv[1:]
+model = FittedRMax("MountainCar-v0", seed=0, resolution=4)
+keeps = CheckpointCallback(20, folder, "car")
+print("begun", flush=True)
+while True:
+    model.learn(200, callback=keeps, reset_num_timesteps=False)
+    model.save(path)
+"""
+DEMO = ("demo", "--seeds", "3", "--episodes", "1", "--max-episode-steps", "60", "--workers", "2", "--output")
+BENCHMARK = ("benchmark", "--pairs", "mirrored-car", "--methods", "none", "COMBREL", "--seeds", "2", "--jobs", "2", "--output")
+
+
+def start(*arguments, **options):
+    return subprocess.Popen(
+        [sys.executable, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        **options,
+    )
+
+
+def kill(process):
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def test_a_checkpoint_or_a_saved_model_is_whole_whenever_learning_is_killed(tmp_path):
+    rng, path = np.random.default_rng(0), tmp_path / "car.zip"
+    loaded = 0
+    for _ in range(N_KILLS):
+        process = start("-c", LEARN, path, tmp_path)
+        assert process.stdout.readline() == b"begun\n"
+        time.sleep(rng.uniform(0.0, 1.5))
+        kill(process)
+        for file in sorted(tmp_path.glob("*.zip")):
+            model = FittedRMax.load(file, env="MountainCar-v0")
+            assert model.agent.model.n_instances == model.num_timesteps > 0
+            loaded += 1
+            file.unlink()
+    assert loaded >= N_KILLS, "hardly anything was ever saved: this test would find nothing"
+
+
+@pytest.mark.parametrize("command", [DEMO, BENCHMARK], ids=lambda command: command[0])
+def test_the_same_command_goes_on_however_often_it_is_killed(command, tmp_path):
+    rng, output, finished = np.random.default_rng(1), tmp_path / "output", {}
+    for _ in range(N_KILLS):
+        process = start("-m", "sb3_combrel.cli", *command, output)
+        try:
+            process.wait(timeout=rng.uniform(1.0, 14.0))
+        except subprocess.TimeoutExpired:
+            kill(process)
+        for file in (output / FOLDER).glob("*.json"):
+            content = json.loads(file.read_text())
+            assert finished.setdefault(file.name, content) == content, "a finished run was carried out again"
+        if process.returncode == 0:
+            break
+    assert process.returncode == 0 and finished
+    before = {file: file.read_bytes() for file in Path(output).rglob("*.csv")}
+    assert before and start("-m", "sb3_combrel.cli", *command, output).wait() == 0
+    assert {file: file.read_bytes() for file in before} == before

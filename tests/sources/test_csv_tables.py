@@ -1,0 +1,118 @@
+"""Tables of past transitions: CSV files and data frames, with and without columns of next states."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_combrel import SourceInstances
+
+STEPS = {
+    "x": [0.0, 0.1, 0.2, 5.0, 5.1],
+    "v": [1.0, 1.0, 1.0, -1.0, -1.0],
+    "action": [0, 1, 0, 1, 1],
+    "reward": [-1.0, -1.0, 0.0, -1.0, -1.0],
+    "next_x": [0.1, 0.2, 0.3, 5.1, 5.2],
+    "next_v": [1.0, 1.0, 1.0, -1.0, -1.0],
+    "terminated": [False, False, True, False, False],
+}
+
+
+def assert_same(one, other):
+    for name in ("states", "actions", "rewards", "next_states", "terminated"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    assert (one.state_names, one.n_actions) == (other.state_names, other.n_actions)
+
+
+def test_a_file_with_next_states_is_read_column_by_column(tmp_path):
+    frame = pd.DataFrame(STEPS)
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    source = SourceInstances.from_table(tmp_path / "log.csv")
+    assert source.state_names == ("x", "v") and source.n_actions == 2 and len(source) == 5
+    np.testing.assert_array_equal(source.states, frame[["x", "v"]].to_numpy())
+    np.testing.assert_array_equal(source.next_states, frame[["next_x", "next_v"]].to_numpy())
+    np.testing.assert_array_equal(source.terminated, STEPS["terminated"])
+    assert source.low[0] <= 0.0 and source.high[0] >= 5.2
+    assert source.origin["recorder"] == "log.csv"
+
+
+def test_columns_may_come_in_any_order_and_actions_by_name():
+    frame = pd.DataFrame({**STEPS, "action": ["left", "right", "left", "right", "right"]})
+    source = SourceInstances.from_table(
+        frame[sorted(frame.columns)], state_names=("v", "x"), action_names=("left", "stay", "right")
+    )
+    np.testing.assert_array_equal(source.actions, [0, 2, 0, 2, 2])
+    np.testing.assert_array_equal(source.states[:, 1], STEPS["x"])
+    assert source.n_actions == 3
+
+
+def test_without_next_states_a_step_leads_to_the_next_row_of_its_episode():
+    rows = {
+        "x": [0.0, 0.1, 0.2, 5.0, 5.1, 7.0, 7.1],
+        "action": [0, 1, np.nan, 1, 0, 1, 1],
+        "reward": [-1.0, 0.0, np.nan, -1.0, -1.0, -1.0, -1.0],
+        "terminated": [0, 1, 0, 0, 0, 0, 0],
+        "truncated": [0, 0, 0, 0, 1, 0, 0],
+    }
+    found = SourceInstances.from_table(pd.DataFrame(rows))
+    # Where the episode that a time limit cut arrived, and where the log breaks off, is not known.
+    np.testing.assert_array_equal(found.states[:, 0], [0.0, 0.1, 5.0, 7.0])
+    np.testing.assert_array_equal(found.next_states[:, 0], [0.1, 0.2, 5.1, 7.1])
+    np.testing.assert_array_equal(found.terminated, [False, True, False, False])
+    by_number = pd.DataFrame({**rows, "episode": [1, 1, 1, 2, 2, 3, 3]})
+    assert_same(SourceInstances.from_table(by_number), found)
+
+
+def test_done_is_an_end_but_for_time_limits():
+    frame = pd.DataFrame(STEPS).drop(columns="terminated").assign(done=[0, 0, 1, 0, 1], truncated=[0, 0, 0, 0, 1])
+    np.testing.assert_array_equal(SourceInstances.from_table(frame).terminated, [False, False, True, False, False])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 20), st.integers(1, 4), st.integers(1, 5), st.integers(0, 2**31))
+def test_what_is_written_as_a_table_is_read_again(n, d, n_actions, seed):
+    rng = np.random.default_rng(seed)
+    states, after = rng.normal(size=(2, n, d))
+    names = [f"q{k}" for k in range(d)]
+    ends = rng.random(n) < 0.3
+    low, high = np.full(d, -9.0), np.full(d, 9.0)
+    source = SourceInstances(
+        states, rng.integers(n_actions, size=n), rng.normal(size=n), after, ends, low, high, n_actions, names
+    )
+    again = SourceInstances.from_table(source.to_table(), n_actions=n_actions, bounds=(low, high))
+    assert_same(again, source)
+    np.testing.assert_array_equal((again.low, again.high), (low, high))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"reward": None, "rewards": STEPS["reward"]}, "no column 'reward'.*did you mean 'rewards'"),
+        ({"next_v": None}, "no column 'next_v'"),
+        ({"x": [0.0, np.nan, 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got nan in row 1"),
+        ({"x": [0.0, "wall", 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got 'wall' in row 1"),
+        ({"action": [0, 1, 0.5, 1, 1]}, "'action' must be whole numbers from 0 on, got 0.5 in row 2"),
+        ({"action": [0, -1, 0, 1, 1]}, "got -1 in row 1"),
+        ({"terminated": ["no", "no", "yes", "no", "no"]}, "'terminated' must be true or false, got 'no' in row 0"),
+        ({"next_x": None, "next_v": None}, "terminates in row 2 arrived"),
+        ({"next_x": None, "next_v": None, "terminated": None, "episode": [1, 2, 3, 4, 5]}, "no transition"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_named(change, message):
+    columns = {name: column for name, column in {**STEPS, **change}.items() if column is not None}
+    with pytest.raises(ValueError, match=message):
+        SourceInstances.from_table(pd.DataFrame(columns))
+
+
+def test_a_misspelt_action_name_is_named():
+    frame = pd.DataFrame({**STEPS, "action": ["left", "rigth", "left", "left", "left"]})
+    with pytest.raises(ValueError, match="got 'rigth' in row 1; did you mean 'right'"):
+        SourceInstances.from_table(frame, action_names=("left", "right"))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\xff\xfe\x80abc", b'a,b\n"1,2\n3'])
+def test_a_file_that_is_no_table_is_refused(tmp_path, content):
+    (tmp_path / "log.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"log\.csv is no table|no column"):
+        SourceInstances.from_table(tmp_path / "log.csv")
