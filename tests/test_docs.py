@@ -10,9 +10,8 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
-from PIL import Image
-
 from helpers.pages import DOCS, ROOT, anchors, blocks, commands, links, name_of, pages, prose
+from PIL import Image
 
 import combrel_envs  # noqa: F401 - registers the environments
 import sb3_combrel
@@ -172,7 +171,9 @@ def numbers_of(cells):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_a_code_host_shows_no_directives(page):
-    assert not re.search(r"^```\{|^\.\. auto", re.sub(r"^<!--.*?-->", "", page.read_text(), flags=re.DOTALL | re.MULTILINE), re.M)
+    assert not re.search(
+        r"^```\{|^\.\. auto", re.sub(r"^<!--.*?-->", "", page.read_text(), flags=re.DOTALL | re.MULTILINE), re.M
+    )
 
 
 def test_every_page_is_in_the_contents_and_figures_are_small():

@@ -3,8 +3,8 @@
 ``<!-- table: results/paper/table6.md, 1 -->``: a table that ``make results`` has filled in; cells are those of the CSV file.
 
 ``<!-- numbers: FILE | ROWS``, lines ``ROWS | FIGURE; FIGURE ...``, ``-->``: each FIGURE, of the rows of FILE (relative to the
-page) that both ROWS, queries of pandas, select, is a number of the paragraph or table that follows. Where a mark before a table
-has ``{heading}``, this is a cell of the table's row, and all figures are the last cells of each row. A FIGURE is one of
+page) that both ROWS, queries of pandas, select, is a number of the paragraph or table that follows. Where a mark has
+``{heading}``, this is a cell of the table's row, and all figures are the last cells of each row. A FIGURE is one of
 
 - ``count``; ``value COLUMN``, the cell as it is written
 - ``mean COLUMN``, ``median``, ``min``, ``max``, ``sum``: COLUMN may be an expression of columns; ``mean:.1f`` for other digits

@@ -91,7 +91,9 @@ def draw_mapping(axes: Any) -> None:
         draw_box(axes, (0.17, middle), 0.31, source, colour, filling)
         for y, target in (first, second):
             draw_box(axes, (0.80, y), 0.37, target, colour, filling)
-            arrow = FancyArrowPatch((0.33, middle), (0.61, y), arrowstyle="-|>", mutation_scale=20, color=colour, linewidth=2.2)
+            arrow = FancyArrowPatch(
+                (0.33, middle), (0.61, y), arrowstyle="-|>", mutation_scale=20, color=colour, linewidth=2.2
+            )
             axes.add_patch(arrow)
     axes.set(xlim=(0, 1), ylim=(0, 0.9))
     axes.axis("off")
@@ -101,7 +103,9 @@ def concept() -> Figure:
     """Return the picture."""
     figure = Figure(figsize=SIZE, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    panels = [figure.add_axes(place) for place in ((0.015, 0.17, 0.25, 0.64), (0.283, 0.16, 0.43, 0.66), (0.735, 0.165, 0.255, 0.65))]
+    panels = [
+        figure.add_axes(place) for place in ((0.015, 0.17, 0.25, 0.64), (0.283, 0.16, 0.43, 0.66), (0.735, 0.165, 0.255, 0.65))
+    ]
     for draw, panel in zip((draw_source, draw_mapping, draw_target), panels, strict=True):
         draw(panel)
     for x, title, below in (
