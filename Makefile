@@ -48,6 +48,7 @@ demo: $(VENV)/.installed-demo
 figures: demo
 	mkdir -p docs/figures
 	cp demo_output/learning_curves.png docs/figures/
+	$(BIN)/python -m sb3_combrel.experiments.concept
 
 # Needs Chromium (Debian: chromium).
 dashboard: $(VENV)/.installed-demo

@@ -53,6 +53,11 @@ html_copy_source = False
 highlight_language = "none"
 
 
+def read_directives(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Directives stand in comments, which a code host does not show: ``<!-- sphinx: eval-rst``, lines, ``-->``."""
+    source[0] = re.sub(r"^<!-- sphinx: (\S+)(.*?)^-->$", r"```{\1}\2```", source[0], flags=re.DOTALL | re.MULTILINE)
+
+
 class Environment(SphinxDirective):
     """
     The docstring of an environment's class, which is written in Markdown as Gymnasium's are.
@@ -82,5 +87,6 @@ def show_links_to_folders_as_text(app: Sphinx, document: nodes.document) -> None
 
 def setup(app: Sphinx) -> dict[str, bool]:
     app.add_directive("environment", Environment)
+    app.connect("source-read", read_directives)
     app.connect("doctree-read", show_links_to_folders_as_text)
     return {"parallel_read_safe": True}

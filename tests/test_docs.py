@@ -8,12 +8,15 @@ import subprocess
 import sys
 
 import gymnasium
+import numpy as np
 import pytest
 from helpers.pages import DOCS, ROOT, anchors, blocks, commands, links, name_of, pages, prose
+from PIL import Image
 
 import combrel_envs  # noqa: F401 - registers the environments
 import sb3_combrel
 from sb3_combrel import cli
+from sb3_combrel.experiments import concept
 
 PAGES = pages()
 README = ROOT / "README.md"
@@ -166,10 +169,18 @@ def numbers_of(cells):
     return [n for first, _, last in parts for n in range(int(first), int(last or first) + 1)]
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_code_host_shows_no_directives(page):
+    assert not re.search(
+        r"^```\{|^\.\. auto", re.sub(r"^<!--.*?-->", "", page.read_text(), flags=re.DOTALL | re.MULTILINE), re.M
+    )
+
+
 def test_every_page_is_in_the_contents_and_figures_are_small():
     assert [figure for figure in DOCS.rglob("*.png") if figure.stat().st_size > 300_000] == []
     index = (DOCS / "index.md").read_text()
-    listed = {name for block in re.findall(r"```\{toctree\}\n(.*?)```", index, flags=re.DOTALL) for name in block.split()}
+    blocks_of_contents = re.findall(r"^<!-- sphinx: toctree\n(.*?)^-->$", index, flags=re.DOTALL | re.MULTILINE)
+    listed = {name for block in blocks_of_contents for name in block.split()}
     names = {path.relative_to(DOCS).with_suffix("").as_posix() for path in [*DOCS.glob("*.md"), *DOCS.glob("results/*.md")]}
     assert names - {"index"} <= listed
     # A code host does not show the table of contents.
@@ -180,6 +191,16 @@ def test_every_page_is_in_the_contents_and_figures_are_small():
 def test_pages_of_algorithms_have_the_order_of_sb3_contrib(name):
     headings = re.findall(r"^## (.*)$", (DOCS / f"{name}.md").read_text(), flags=re.MULTILINE)
     assert headings == ["Notes", "Can I use?", "Example", "Results", "How to replicate the results", "Parameters"]
+
+
+def test_the_picture_of_the_idea_is_the_one_that_its_code_draws(tmp_path):
+    concept.main(tmp_path / "concept.png")
+    pictures = [Image.open(folder / "concept.png").convert("RGB") for folder in (tmp_path, DOCS / "figures")]
+    drawn, kept = (np.asarray(picture, dtype=float) for picture in pictures)
+    # Versions of matplotlib and FreeType differ in single pixels.
+    assert drawn.shape == kept.shape and np.abs(drawn - kept).mean() < 2.0
+    assert (DOCS / "figures/concept.png").stat().st_size <= 150_000
+    assert all("figures/concept.png)" in page.read_text() for page in (README, DOCS / "index.md"))
 
 
 @pytest.mark.long

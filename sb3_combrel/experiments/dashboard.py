@@ -1,4 +1,4 @@
-"""Screenshots of TensorBoard with runs of several methods, by a headless Chromium: the pictures of docs/usage.md."""
+"""Screenshots of TensorBoard with runs of several methods, by a headless Chromium: the pictures of docs/gallery.md."""
 
 from __future__ import annotations
 
