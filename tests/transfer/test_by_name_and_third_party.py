@@ -97,7 +97,7 @@ def test_a_target_without_names_is_named_in_the_error(source):
     assert given.transfer.mapping == BY_NUMBER
 
 
-DECIDED = {0: ("instances", "injective"), 1: ("prior", "factored")}
+DECIDED = {0: ("instances", "injective"), 1: ("prior", "signed_factored")}
 
 
 def decision(transfer):

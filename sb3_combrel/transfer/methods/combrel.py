@@ -19,6 +19,8 @@ from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.prior.report_of_prior import compliance_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
+#: Variables of the target may be mirrored ones of the source.
+DEFAULT_OF_PRIOR = "signed_factored"
 # Arguments of COMBREL that have a meaning for a prior as well.
 _OF_PRIOR = ("source", "mappings", "max_transitions", "transfer_terminals", "use", "source_breadth")
 
@@ -49,11 +51,11 @@ class COMBREL(MappingTransfer):
         print(model.transfer.report())
 
     :param source: as there; of several sources is selected as well
-    :param mappings: a set as there, by default "injective" with ``use="instances"``; with ``use="prior"`` also "factored", the
-        default, or "signed_factored": the target's variables are divided among copies of the source, or of some of its
-        variables, each moved by a source action of its own, and variables that stay; or a ``FactoredMapping``. Where every
-        target variable is mapped, as in "surjective", translated instances lie on diagonals of the target's space and help
-        much less
+    :param mappings: a set as there, by default "injective" with ``use="instances"``; with ``use="prior"`` also
+        "signed_factored", the default, or "factored": the target's variables are divided among copies of the source, or of
+        some of its variables, mirrored or as they are, each moved by a source action of its own, and variables that stay; or a
+        ``FactoredMapping``. Where every target variable is mapped, as in "surjective", translated instances lie on diagonals
+        of the target's space and help much less
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
     :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the nearest
         whatever their action, each judged by the source action that the mapping has for *its* action; at most 20,000 mappings
@@ -110,7 +112,7 @@ class COMBREL(MappingTransfer):
         if self.use is None:
             self.use = "prior" if self.mappings is not None and is_factored(self.mappings) else "instances"
         if self.mappings is None:
-            self.mappings = "factored" if self.use == "prior" else "injective"
+            self.mappings = DEFAULT_OF_PRIOR if self.use == "prior" else "injective"
         super().__post_init__()
 
     @classmethod
@@ -126,7 +128,7 @@ class COMBREL(MappingTransfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         if self._left_open:
-            self.mappings = "factored" if task.takes_prior else "injective"
+            self.mappings = DEFAULT_OF_PRIOR if task.takes_prior else "injective"
         super().bind(task, rng)
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
