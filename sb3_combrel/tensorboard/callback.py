@@ -16,10 +16,10 @@ from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.pages.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
 from sb3_combrel.tensorboard import readings
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.mapping_table import mapping_table
-from sb3_combrel.tensorboard.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 if TYPE_CHECKING:
@@ -160,7 +160,8 @@ class DashboardCallback(BaseCallback):
         if self.agent.task.scaling is self._scaling:
             return
         self._scaling = self.agent.task.scaling
-        self._planes = planes_of(self.agent, self.variables, self.at)
+        task = self.agent.task
+        self._planes = planes_of(self.agent.grid, task.scaling, task.state_names, self.variables, self.at)
         self._history = ChoiceHistory() if self._transfer is not None and self._transfer.makes_choices else None
 
     def _write_scalars(self, writer: SummaryWriter) -> None:
