@@ -51,7 +51,7 @@ def value_figure(snapshot: Snapshot, plane: Plane, width: float) -> Figure:
     title = f"at {plane.held}" if plane.held else ""
     row_height = min(0.85 * width / n_columns, 2.6)
     figure, panels = panels_with_legend(
-        width, (n_panels // n_columns, n_columns), row_height, title, (names, AN_OPTIMISTIC_ACTION, "greedy action"), ACTION_COLOURS
+        width, (n_panels // n_columns, n_columns), row_height, title, (names, AN_OPTIMISTIC_ACTION, ""), ACTION_COLOURS
     )
     lowest, highest = (limit([values for _, values in maps]) for limit in (np.min, np.max))
     for panel, (words, values) in zip(panels, maps, strict=False):
@@ -77,7 +77,7 @@ def evidence_figure(
     steps = [point.step for point in history]
     heights = (0.24 * len(action_names) + 0.3, 1.6, 1.3)
     names = [name for name in dict.fromkeys(name for point in history for name in point.mappings) if name in colours]
-    legend_lines = sum(len(textwrap.wrap(name, int(width * CHARACTERS) - 6)) or 1 for name in names)
+    legend_lines = sum(len(textwrap.wrap(name, int(width * CHARACTERS) - 6)) for name in names)
     figure = figure_of(width, sum(heights) + 0.9 + LINE * (legend_lines + 1))
     strips, strengths, errors = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
     _draw_strips(strips, history, action_names, colours)
@@ -89,7 +89,9 @@ def evidence_figure(
     strengths.set_ylim(bottom=0.0)
     _label(strengths, "as how many of the target's own instances the source counts", "instances")
     strengths.legend(fontsize=FONT_SIZE - 1, frameon=False, ncols=2 if width < NARROW else 5, loc="upper left")
-    strengths.set_ylim(top=max(1e-9, 1.35 * max(max(point.strengths) for point in history)))
+    # Room for the legend above the curves.
+    room = 1.0 + 0.3 * -(-len(action_names) // (2 if width < NARROW else 5))
+    strengths.set_ylim(top=max(1e-9, room * max(max(point.strengths) for point in history)))
     errors.step(steps, [point.error for point in history], where="post", color="#333333", linewidth=1.5)
     errors.axhline(1.0, color="#999999", linewidth=1.0, linestyle=":")
     highest = np.nanmax([1.0, *(point.error for point in history)])
@@ -109,9 +111,12 @@ def _draw_strips(
     """Draw a strip a target action, coloured by the mapping in use."""
     steps = [point.step for point in history]
     for action in range(len(action_names)):
-        for k, point in enumerate(history[:-1]):
-            shown = colours.get(point.mappings[action], NONE_COLOUR)
-            axes.barh(action, steps[k + 1] - steps[k], left=steps[k], height=0.8, color=shown, linewidth=0)
+        used = [point.mappings[action] for point in history]
+        # Where it changes, and the end: a seam between bars of one colour would be seen.
+        ends = [k for k in range(1, len(used)) if k == len(used) - 1 or used[k] != used[k - 1]]
+        for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+            shown = colours.get(used[begin], NONE_COLOUR)
+            axes.barh(action, steps[end] - steps[begin], left=steps[begin], height=0.8, color=shown, linewidth=0)
     axes.set_yticks(range(len(action_names)), action_names, fontsize=FONT_SIZE)
     axes.set_ylim(len(action_names) - 0.5, -0.5)
     _label(axes, "what each target action is taken for", "")
@@ -177,7 +182,7 @@ def returns_figure(steps: np.ndarray, returns: np.ndarray, width: float) -> Figu
     figure = figure_of(width, 2.8)
     axes = figure.subplots()
     axes.plot(steps, returns, ".", color=MAPPING_COLOURS[0], alpha=0.45, label="an episode", markersize=5)
-    window = min(10, len(returns))
+    window = min(10, len(returns) // 2)
     if window > 1:
         mean = np.convolve(returns, np.ones(window) / window, mode="valid")
         axes.plot(steps[window - 1 :], mean, color=MAPPING_COLOURS[0], linewidth=1.8, label=f"mean of {window}")
@@ -245,7 +250,7 @@ def panels_with_legend(
         ncols=n_columns_of_legend,
         frameon=False,
         fontsize=FONT_SIZE,
-        title=names_of,
+        title=names_of or None,
         title_fontsize=FONT_SIZE,
         borderpad=0.1,
         labelspacing=0.25,
@@ -282,7 +287,8 @@ def _visible(shown: str) -> str:
 
 
 def _label(axes: Axes, title: str, y_label: str) -> None:
-    axes.set_title(title, fontsize=FONT_SIZE, loc="left", pad=4)
+    room = int((axes.figure.get_figwidth() - 0.8) * CHARACTERS)  # type: ignore[union-attr]
+    axes.set_title(textwrap.fill(title, room), fontsize=FONT_SIZE, loc="left", pad=4)
     axes.set_ylabel(y_label, fontsize=FONT_SIZE)
     axes.tick_params(labelsize=FONT_SIZE - 1)
     axes.grid(alpha=0.25)

@@ -30,8 +30,7 @@ def model_page(model: FittedRMax, report: TransferReport, planes: Sequence[Plane
     """
     task, n_steps = model.agent.task, model.agent.model.n_instances
     facts = [
-        f"{report.method}",
-        *(f"from {source}" for source in report.sources),
+        *_of_transfer(model.transfer, report),
         f"{model.num_timesteps:,} environment steps, {model._episode_num:,} episodes, {n_steps:,} instances kept",
         f"state variables: {', '.join(task.state_names)}; actions: {', '.join(task.action_names)}",
     ]
@@ -48,6 +47,13 @@ def model_page(model: FittedRMax, report: TransferReport, planes: Sequence[Plane
     return Page(f"What a model learned {what}", [report.sentence], facts, sections)
 
 
+def _of_transfer(transfer: Transfer | None, report: TransferReport) -> list[str]:
+    """The method and its sources, each on a line."""
+    if not report.sources:
+        return [] if transfer is None else [report.method]
+    return [f"{type(transfer).__name__} with use={report.use!r}, from {'; '.join(report.sources)}"]
+
+
 def _returns(model: FittedRMax) -> Section:
     from sb3_combrel.pages.drawings import returns_figure
 
@@ -61,8 +67,8 @@ def _returns(model: FittedRMax) -> Section:
     # What came before, if the buffer does not hold all episodes; steps after the last end are not counted.
     before = 0.0 if is_all else max(0.0, model.num_timesteps - lengths.sum())
     steps = before + np.cumsum(lengths)
-    text = f"{'All' if is_all else 'The last'} {len(episodes)} episodes; the model keeps no more. The mean return of the last "
-    text += f"{min(10, len(returns))} is {returns[-10:].mean():.4g}."
+    shown = f"All {len(episodes)} episodes." if is_all else f"The last {len(episodes)} episodes: the model keeps no more."
+    text = f"{shown} The mean return of the last {min(10, len(returns))} is {returns[-10:].mean():.4g}."
     return Section(title, [text], [picture(partial(returns_figure, steps, returns), "Return of each episode over steps")])
 
 
@@ -109,6 +115,8 @@ def _contradictions(transfer: Transfer, report: TransferReport) -> Section:
     errors = errors_of(transfer)
     if errors is None or not report.n_compared:
         return Section(title, text)
+    if np.isnan(errors.by_part()).all():
+        return Section(title, [*text, "In no part of the state space are there enough of them to say where."])
     task = errors.task
     draw = partial(contradictions_figure, errors.by_part(), task.action_names, errors.edges())
     text = [*text, 'Prediction error over that of "no change", by target action and part of each variable\'s range.']
