@@ -192,7 +192,9 @@ def check_learner(learner: Mapping[str, Any]) -> None:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             meant = f"did you mean {near[0]!r}?" if near else f"FittedRMax has {', '.join(known)}"
-            raise TypeError(f"compare takes its own arguments and those of FittedRMax, such as gamma=0.99, got {name!r}; {meant}")
+            raise TypeError(
+                f"compare takes its own arguments and those of FittedRMax, such as gamma=0.99, got {name!r}; {meant}"
+            )
 
 
 def task_of(env: Any) -> Task:

@@ -9,9 +9,9 @@ from sb3_combrel.comparison.result import CompareResult
 from sb3_combrel.pages.page import Cell, Page, PageTable, Section, picture
 from sb3_combrel.pages.palette import mapping_colours, method_colours
 from sb3_combrel.pages.plane import VariablePair, planes_of
-from sb3_combrel.pages.report_sections import contradictions_text, mapping_section
+from sb3_combrel.pages.report_sections import contradictions_table, contradictions_text, mapping_section
 
-NO_HISTORY = "No method keeps a history of its evidence: those with use=\"prior\" do."
+NO_HISTORY = 'No method keeps a history of its evidence: those with use="prior" do.'
 
 
 def compare_page(result: CompareResult, variables: Sequence[VariablePair] | None = None) -> Page:
@@ -21,11 +21,15 @@ def compare_page(result: CompareResult, variables: Sequence[VariablePair] | None
     :raises ValueError: if they do not fit the task
     """
     n_runs = len(next(iter(result.curves.values())).returns)
-    facts = [f"{n_runs} runs of each method, {result.n_steps:,} environment steps that all of them have; without: {result.baseline}"]
+    facts = [
+        f"{n_runs} runs of each method, {result.n_steps:,} environment steps that all of them have; without: {result.baseline}"
+    ]
     sections = [_curves(result), _measures(result)]
     if result.reports:
-        names = [each.mapping for runs in result.reports.values() for report in runs for each in report.mappings]
-        names += [name for runs in result.reports.values() for run in runs for at in run.history for name in at.mappings]
+        reports = [report for runs in result.reports.values() for report in runs]
+        # In the order in which they came up, as in the pictures of a single run.
+        names = [name for report in reports for point in report.history for name in point.mappings]
+        names += [each.mapping for report in reports for each in report.mappings]
         sections += [mapping_section(result.reports, mapping_colours(names)), _evidence(result)]
     sections += _values(result, variables)
     if result.reports:
@@ -43,8 +47,8 @@ def _measures(result: CompareResult) -> Section:
     colours = method_colours(result.curves, result.baseline)
     cells = [[Cell(name), Cell(method, colours[method]), *map(Cell, others)] for name, method, *others in rows]
     text = (
-        "The measures of Taylor and Stone, with transfer minus without. p: of each comparison by itself; p (Holm): corrected for "
-        "the number of methods, as in the sentence above. —: there is no such number."
+        "The measures of Taylor and Stone, with transfer minus without. p: of each comparison by itself; p (Holm): corrected "
+        "for the number of methods, as in the sentence above. —: there is no such number."
     )
     return Section("Measures", [text], table=PageTable(header, cells, n_names=2))
 
@@ -75,7 +79,6 @@ def _values(result: CompareResult, variables: Sequence[VariablePair] | None) -> 
 
 
 def _contradictions(result: CompareResult) -> Section:
-    text = [
-        f"{method}, first run: {' '.join(contradictions_text(runs[0]))}" for method, runs in result.reports.items()
-    ]
-    return Section("Where the source was contradicted", text)
+    first = {method: runs[0] for method, runs in result.reports.items()}
+    text = [f"{method}, first run: {contradictions_text(report)}" for method, report in first.items()]
+    return Section("Where the source was contradicted", text, table=contradictions_table(first))

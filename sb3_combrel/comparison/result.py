@@ -148,10 +148,16 @@ class CompareResult:
 
     def _of_control(self, method: str, with_it: float) -> str:
         """Say if a mapping drawn at random did as well."""
-        if method == CONTROL or CONTROL not in self.measures or not any(each.mappings for each in self.reports.get(method, ())):
+        if (
+            method == CONTROL
+            or CONTROL not in self.measures
+            or not any(each.mappings for each in self.reports.get(method, ()))
+        ):
             return ""
         control = float(self.measures[CONTROL].total_reward_by_steps.with_transfer.mean()) / self.n_steps
-        return f" But {CONTROL} did as well ({control:.4g}): it may not be the mapping that helps." if control >= with_it else ""
+        return (
+            f" But {CONTROL} did as well ({control:.4g}): it may not be the mapping that helps." if control >= with_it else ""
+        )
 
 
 def evaluate(
@@ -190,7 +196,8 @@ def few_data(n_seeds: int, n_episodes: int) -> tuple[str, ...]:
     """Warn of few runs, and of few episodes in the shortest of them."""
     found = []
     if n_seeds < FEWEST_SEEDS:
-        found.append(f"Only {n_seeds} seeds: runs differ more than methods. Take at least {FEWEST_SEEDS}, better 10.")
+        number = f"{n_seeds} seed{'s' if n_seeds > 1 else ''}"
+        found.append(f"Only {number}: runs differ more than methods. Take at least {FEWEST_SEEDS}, better 10.")
     if n_episodes < FEWEST_EPISODES:
         number = f"{n_episodes} episode{'s' if n_episodes > 1 else ''}"
         found.append(f"The shortest run has only {number}: start and end of learning overlap. Take more steps.")

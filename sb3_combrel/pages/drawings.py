@@ -6,6 +6,7 @@ display is needed, and pyplot is left alone. Importing this imports matplotlib.
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 
@@ -101,7 +102,9 @@ def evidence_figure(
     errors.set_xlabel("environment steps", fontsize=FONT_SIZE)
     errors.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     patches = [Patch(color=_visible(colours[name]), label=textwrap.fill(name, int(width * CHARACTERS) - 6)) for name in names]
-    figure.legend(handles=patches, loc="outside lower left", frameon=False, fontsize=FONT_SIZE, ncols=1, title="mapping")
+    figure.legend(
+        handles=patches, loc="outside lower left", frameon=False, fontsize=FONT_SIZE, title="mapping", alignment="left"
+    )
     return figure
 
 
@@ -124,12 +127,14 @@ def _draw_strips(
 
 
 def _shade_bounds(axes: Axes, history: Sequence[EvidencePoint]) -> None:
-    for point, after in zip(history[:-1], history[1:], strict=True):
+    for point, after in itertools.pairwise(history):
         if point.bounds_values:
             axes.axvspan(point.step, after.step, color="#009E73", alpha=0.12, linewidth=0)
 
 
-def mean_evidence_figure(histories: Mapping[str, Sequence[Sequence[EvidencePoint]]], colours: Mapping[str, str], width: float) -> Figure:
+def mean_evidence_figure(
+    histories: Mapping[str, Sequence[Sequence[EvidencePoint]]], colours: Mapping[str, str], width: float
+) -> Figure:
     """Draw strength and error over time, averaged over target actions and runs, with each run as a thin line.
 
     :param histories: by method, of each run; points are few and early, so the steps are on a logarithmic axis
@@ -138,7 +143,6 @@ def mean_evidence_figure(histories: Mapping[str, Sequence[Sequence[EvidencePoint
     figure = figure_of(width, 4.4)
     strengths, errors = figure.subplots(2, 1, sharex=True)
     for method, runs in histories.items():
-        last = max(run[-1].step for run in runs)
         at = np.unique([point.step for run in runs for point in run if point.step > 0])
         for axes, values_of in ((strengths, _mean_strength), (errors, _error)):
             rows = [_held([point.step for point in run], [values_of(point) for point in run], at) for run in runs]
@@ -148,11 +152,11 @@ def mean_evidence_figure(histories: Mapping[str, Sequence[Sequence[EvidencePoint
                 n = np.isfinite(rows).sum(axis=0)
                 mean = np.where(n > 0, np.nansum(rows, axis=0) / np.maximum(n, 1), np.nan)
             axes.step(at, mean, where="post", color=colours[method], linewidth=2.0, label=f"{method} ({len(runs)} runs)")
-        strengths.set_xlim(right=last)
     errors.axhline(1.0, color="#999999", linewidth=1.0, linestyle=":")
     errors.set_ylim(0.0, 1.15 * HIGHEST_ERROR)
     strengths.set_ylim(bottom=0.0)
     strengths.set_xscale("log")
+    strengths.xaxis.set_major_formatter("{x:,.0f}")
     _label(strengths, "as how many own instances the source counts", "instances")
     _label(errors, 'prediction error ("no change": 1)', "error")
     errors.set_xlabel("environment steps", fontsize=FONT_SIZE)
@@ -208,14 +212,15 @@ def contradictions_figure(
     panels = figure.subplots(n_rows, n_columns, squeeze=False, sharey=True)
     colours = colormaps["RdBu_r"].copy()
     colours.set_bad(NONE_COLOUR)
-    image = None
     for panel, (k, (name, edge)) in zip(panels.flat, enumerate(edges.items()), strict=True):
         shown = np.ma.masked_invalid(np.minimum(errors[:, k], HIGHEST_ERROR))
         image = panel.imshow(shown, cmap=colours, norm=TwoSlopeNorm(1.0, 0.0, HIGHEST_ERROR), aspect="auto")
         panel.set_xticks(np.arange(n_parts + 1) - 0.5, [f"{value:.3g}" for value in edge], fontsize=FONT_SIZE - 1)
         panel.set_yticks(range(n_actions), action_names, fontsize=FONT_SIZE)
         panel.set_xlabel(name, fontsize=FONT_SIZE)
-    bar = figure.colorbar(image, ax=list(panels.flat), location="bottom", shrink=0.8, aspect=40, ticks=[0.0, 1.0, HIGHEST_ERROR])
+    bar = figure.colorbar(
+        image, ax=list(panels.flat), location="bottom", shrink=0.8, aspect=40, ticks=[0.0, 1.0, HIGHEST_ERROR]
+    )
     bar.ax.set_xticklabels(["0: exact", "1: as no change", "2 or more"], fontsize=FONT_SIZE - 1)
     return figure
 

@@ -69,7 +69,9 @@ class Page:
 
     def html(self) -> str:
         """Return the page."""
-        environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+        environment = jinja2.Environment(
+            autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+        )
         template = environment.from_string((Path(__file__).parent / "page.html").read_text(encoding="utf-8"))
         return template.render(page=self, version=__version__) + "\n"
 

@@ -6,8 +6,11 @@ from collections.abc import Iterable
 
 #: Of methods: Okabe and Ito's colours, which the colour-blind can distinguish too; grey comes first, for the baseline.
 METHOD_COLOURS = ("#555555", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-#: Of mappings and of what they map to: the same colours in an order in which neighbours differ most.
-MAPPING_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#555555")
+#: Of mappings and of what they map to: the same colours in an order in which neighbours differ most, then Tol's muted ones.
+MAPPING_COLOURS = (
+    *("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#555555"),
+    *("#332288", "#882255", "#999933", "#AA4499", "#661100", "#44AA99", "#DDCC77", "#6699CC"),
+)
 #: Of the target's own actions: Tol's light colours, so that they are not taken for mappings.
 ACTION_COLOURS = ("#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#44BB99", "#99DDFF", "#AAAA00", "#DDDDDD")
 #: Where there is nothing.

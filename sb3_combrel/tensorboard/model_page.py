@@ -10,7 +10,7 @@ import numpy as np
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.pages.page import Page, Section, picture
 from sb3_combrel.pages.plane import Plane
-from sb3_combrel.pages.report_sections import contradictions_text, mapping_section
+from sb3_combrel.pages.report_sections import contradictions_table, contradictions_text, mapping_section
 from sb3_combrel.pages.snapshot import snapshot_of
 from sb3_combrel.tensorboard.pictures import colours_of_mappings, is_prior, source_action_figure, varies_by_state
 from sb3_combrel.transfer.base import Transfer
@@ -88,7 +88,9 @@ def _values(model: FittedRMax, planes: Sequence[Plane]) -> Section:
 
     snapshot = snapshot_of(model.agent)
     if snapshot.bound is not None:
-        title, text = "Values, bound and policy", ["No state is worth more than the source's values allow, beside which V is drawn."]
+        title, text = "Values, bound and policy", [
+            "No state is worth more than the source's values allow, beside which V is drawn."
+        ]
     elif is_prior(model.transfer):
         title, text = "Values and policy", ["The source bounds no values, as it does not explain all actions and rewards."]
     else:
@@ -111,7 +113,7 @@ def _source_actions(model: FittedRMax, planes: Sequence[Plane]) -> Section:
 def _contradictions(transfer: Transfer, report: TransferReport) -> Section:
     from sb3_combrel.pages.drawings import contradictions_figure
 
-    title, text = "Where the source was contradicted", contradictions_text(report)
+    title, text, table = "Where the source was contradicted", [contradictions_text(report)], contradictions_table({"": report})
     errors = errors_of(transfer)
     if errors is None or not report.n_compared:
         return Section(title, text)
@@ -119,8 +121,11 @@ def _contradictions(transfer: Transfer, report: TransferReport) -> Section:
         return Section(title, [*text, "In no part of the state space are there enough of them to say where."])
     task = errors.task
     draw = partial(contradictions_figure, errors.by_part(), task.action_names, errors.edges())
-    text = [*text, 'Prediction error over that of "no change", by target action and part of each variable\'s range.']
-    return Section(title, text, [picture(draw, "Prediction error by target action and part of each variable's range")])
+    text.append(
+        'Prediction error over that of "no change", by target action and part of each variable\'s range; grey: unknown.'
+    )
+    words = "Prediction error by target action and part of each variable's range"
+    return Section(title, text, [picture(draw, words)], table)
 
 
 def errors_of(transfer: Transfer) -> RegionErrors | None:

@@ -63,7 +63,7 @@ def varies_by_state(transfer: Transfer | None) -> bool:
 
 
 def colours_of_mappings(transfer: Transfer | None) -> dict[str, str]:
-    """Give each mapping that was ever in use, or each source action, its colour by name: the same in every picture of a run."""
+    """Give each mapping that was ever in use, or each source action, its colour by name, the same in all pictures of a run."""
     if not isinstance(transfer, MappingTransfer):
         return mapping_colours(())
     return mapping_colours(transfer.source_prior.candidates.names() if is_prior(transfer) else transfer.source_action_names())

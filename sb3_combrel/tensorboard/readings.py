@@ -8,6 +8,7 @@ from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.pages.snapshot import action_values
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.methods.combrel import COMBREL
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 MAX_POINTS = 500
 """Grid points from which a figure is computed, at most: enough for a curve, and cheap on any grid."""
@@ -39,3 +40,15 @@ def mean_compliance(transfer: Transfer) -> float | None:
     if len(pairs) == 0:
         return None
     return float(transfer.chosen_compliance(pairs[spread(len(pairs), MAX_PAIRS)]).mean())
+
+
+def evidence(agent: FittedRMaxAgent) -> dict[str, float]:
+    """Read of a source as prior as how many instances it counts for each target action, and the mean of its bound."""
+    transfer = agent.transfer
+    if not isinstance(transfer, MappingTransfer) or transfer.use != "prior":
+        return {}
+    prior = transfer.source_prior
+    strengths = prior.evidence.strength_of_actions().tolist()
+    found = {f"evidence/{name}": strength for name, strength in zip(agent.task.action_names, strengths, strict=True)}
+    bound = prior.value_bound()
+    return found if bound is None else {**found, "transfer/value_bound": float(bound.mean())}

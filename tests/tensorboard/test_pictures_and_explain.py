@@ -9,13 +9,13 @@ from matplotlib.image import imread
 
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances, explain
 from sb3_combrel.callbacks import DashboardCallback
+from sb3_combrel.pages.plane import numbered, plane_through
+from sb3_combrel.pages.snapshot import action_values, greedy_actions
 from sb3_combrel.tensorboard import pictures
 from sb3_combrel.tensorboard.explain import FILE_DPI
 from sb3_combrel.tensorboard.history import MAX_COLUMNS, ChoiceHistory
 from sb3_combrel.tensorboard.mapping_table import mapping_table
-from sb3_combrel.tensorboard.pictures import chosen_source_actions, greedy_actions, state_mapping_shares
-from sb3_combrel.tensorboard.plane import numbered, plane_through
-from sb3_combrel.tensorboard.readings import action_values
+from sb3_combrel.tensorboard.pictures import chosen_source_actions, state_mapping_shares
 
 
 def test_pictures_that_nobody_asked_for_stay_within_their_share_of_the_time(tmp_path, monkeypatch, clock):
