@@ -190,7 +190,7 @@ def check_learner(learner: Mapping[str, Any]) -> None:
     known = [name for name in inspect.signature(FittedRMax).parameters if name not in _TAKEN]
     for name in learner:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
+            near = difflib.get_close_matches(name, [*inspect.signature(compare).parameters, *known], n=1, cutoff=0.7)
             meant = f"did you mean {near[0]!r}?" if near else f"FittedRMax has {', '.join(known)}"
             raise TypeError(
                 f"compare takes its own arguments and those of FittedRMax, such as gamma=0.99, got {name!r}; {meant}"

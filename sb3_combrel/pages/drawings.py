@@ -117,7 +117,7 @@ def _draw_strips(
         used = [point.mappings[action] for point in history]
         # Where it changes, and the end: a seam between bars of one colour would be seen.
         ends = [k for k in range(1, len(used)) if k == len(used) - 1 or used[k] != used[k - 1]]
-        for begin, end in zip([0, *ends[:-1]], ends, strict=True):
+        for begin, end in itertools.pairwise([0, *ends]):
             shown = colours.get(used[begin], NONE_COLOUR)
             axes.barh(action, steps[end] - steps[begin], left=steps[begin], height=0.8, color=shown, linewidth=0)
     axes.set_yticks(range(len(action_names)), action_names, fontsize=FONT_SIZE)
@@ -210,8 +210,7 @@ def contradictions_figure(
     n_rows = n_variables if n_columns == 1 else 1
     figure = figure_of(width, n_rows * (0.24 * n_actions + 0.75) + 0.8)
     panels = figure.subplots(n_rows, n_columns, squeeze=False, sharey=True)
-    colours = colormaps["RdBu_r"].copy()
-    colours.set_bad(NONE_COLOUR)
+    colours = colormaps["RdBu_r"].with_extremes(bad=NONE_COLOUR)
     for panel, (k, (name, edge)) in zip(panels.flat, enumerate(edges.items()), strict=True):
         shown = np.ma.masked_invalid(np.minimum(errors[:, k], HIGHEST_ERROR))
         image = panel.imshow(shown, cmap=colours, norm=TwoSlopeNorm(1.0, 0.0, HIGHEST_ERROR), aspect="auto")

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 
 
 @pytest.fixture(scope="module")
 def result():
-    return compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER)
+    with pytest.warns(UserWarning, match="Only 2 seeds"):
+        return compare(Walk, METHODS, seeds=[3, 1], steps=150, controls=False, **LEARNER)
 
 
 def test_each_run_is_that_of_the_learner_with_its_seed(result):
@@ -60,6 +62,7 @@ def test_the_table_has_a_row_for_each_measure_and_the_figure_a_curve_for_each_me
         f"steps to a return of {result.threshold:.4g}",
     ]
     assert len({line.count("|") for line in lines}) == 1
+    assert lines[0] == "| measure | method | none | with | difference | 95% interval | p | p (Holm) |"
     measure = result.measures["TIMBREL"].total_reward_by_steps
     assert lines[4].split(" | ")[2:5] == [
         f"{measure.without.mean() / result.n_steps:.4g}",
@@ -71,7 +74,7 @@ def test_the_table_has_a_row_for_each_measure_and_the_figure_a_curve_for_each_me
     curve = axes.get_lines()[1]
     expected = returns_over_steps(result.curves["TIMBREL"], curve.get_xdata()).mean(axis=0)
     np.testing.assert_allclose(curve.get_ydata(), expected)
-    assert str(result) == f"{result.sentence}\n\n{result.table}"
+    assert str(result) == "\n\n".join([result.sentence, *result.warnings, result.table])
 
 
 def test_returns_over_steps_are_those_of_the_episode_under_way():
@@ -84,14 +87,19 @@ def made_up(monkeypatch, returns, **arguments):
     """Compare methods whose episodes have these returns, of 10 steps each; one row a seed."""
 
     def run_missing(jobs, **_):
+        episodes = {job.name: returns[job.method][job.seed].tolist() for job in jobs}
         return [
-            job.result([10] * 12, returns[job.method][job.seed].tolist(), [True] * 12, 120, {"report": None}) for job in jobs
+            job.result([10] * len(of), of, [True] * len(of), 120, {"report": None})
+            for job in jobs
+            if (of := episodes[job.name])
         ]
 
     monkeypatch.setattr(module, "run_missing", run_missing)
     n = len(next(iter(returns.values())))
     # The learner itself is not asked.
-    return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
 
 
 def around(mean, n_runs, spread=1.0):
@@ -129,15 +137,19 @@ def test_with_several_methods_more_seeds_are_asked_for(monkeypatch):
 def test_several_methods_are_corrected_for_their_number(monkeypatch):
     runs = {"none": around(-60.0, 5), "one": around(-50.0, 5), "two": around(-40.0, 5)}
     found = made_up(monkeypatch, runs, threshold=-10)
-    assert "steps to a return of -10 | one | inf | inf |" in found.table
+    assert "steps to a return of -10 | one | not reached | not reached | — |" in found.table
+    assert "inf" not in str(found) and "nan" not in str(found)
     smallest = 2 / 252
     assert found.p_values == pytest.approx({"one": 2 * smallest, "two": 2 * smallest})
     assert found.sentence.count("transfer helped") == 2
+    assert found.sentence.count("(p = 0.016, by Holm's correction for 2 comparisons)") == 2
+    [mean_of_one, _] = [line for line in found.table.splitlines() if line.startswith("| mean return over steps")]
+    assert mean_of_one.endswith("| 0.0079 | 0.016 |")
     assert [line.split(" | ")[1] for line in found.table.splitlines()[2:]] == ["one"] * 5 + ["two"] * 5
 
 
 SHORT = InterTaskMapping((0,), (0, 1))
-GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
+GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, **LEARNER)
 
 
 @pytest.mark.parametrize(
@@ -163,10 +175,8 @@ GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
         (dict(steps=0), "steps must be a whole number"),
         (dict(n_jobs=0), "n_jobs must be a whole number"),
         (dict(threshold=np.inf), "threshold must be a finite number"),
-        (dict(learner=3), "learner must be a dict of arguments of FittedRMax"),
-        (dict(learner={"breadth": 1}), "learner must have arguments out of .*model_breadth.*, got 'breadth'"),
-        (dict(learner={"seed": 1}), "learner must have arguments out of .*, got 'seed'"),
-        (dict(learner={"model_breadth": -1}), "none: model_breadth must be"),
+        (dict(controls="no"), "controls must be"),
+        (dict(model_breadth=-1), "none: model_breadth must be"),
     ],
 )
 def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
@@ -176,6 +186,22 @@ def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
     monkeypatch.setattr(module, "run_missing", refuse)
     with pytest.raises(ValueError, match=message):
         compare(**{**GOOD, **change})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (dict(model_bread=1), "got 'model_bread'; did you mean 'model_breadth'"),
+        (dict(seed=1), "got 'seed'; did you mean 'seeds'"),
+        (
+            dict(learner={"gamma": 0.9}),
+            "those of FittedRMax, such as gamma=0.99, got 'learner'; FittedRMax has .*model_breadth",
+        ),
+    ],
+)
+def test_arguments_that_the_learner_does_not_have_are_refused_with_one_that_it_has(wrong, message):
+    with pytest.raises(TypeError, match=message):
+        compare(**GOOD, **wrong)
 
 
 def test_runs_that_cannot_begin_or_end_are_named():
@@ -188,7 +214,7 @@ def test_runs_that_cannot_begin_or_end_are_named():
 
 @pytest.mark.long
 def test_in_processes_the_results_are_the_same(result):
-    here = compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER, n_jobs=2)
+    here = compare(Walk, METHODS, seeds=[3, 1], steps=150, controls=False, n_jobs=2, **LEARNER)
     assert str(here) == str(result)
     assert list(map(str, here.reports["TIMBREL"])) == list(map(str, result.reports["TIMBREL"]))
 
@@ -201,12 +227,13 @@ class Breaking(Walk):
 
 
 def test_an_error_within_a_run_is_named_with_its_run_and_traceback():
-    with pytest.raises(JobError, match=r"(?s)^none, seed 0: OSError: broken \(3 other runs failed, too\)\nTraceback.*step"):
+    with pytest.raises(JobError, match=r"(?s)^none, seed 0: OSError: broken \(5 other runs failed, too\)\nTraceback.*step"):
         compare(**{**GOOD, "env": Breaking})
 
 
 def test_methods_may_differ_in_case_and_punctuation_alone():
-    found = compare(Walk, dict.fromkeys(["none", "None"]), seeds=1, steps=30, baseline="none")
+    with pytest.warns(UserWarning, match="Only 1 seed:"):
+        found = compare(Walk, dict.fromkeys(["none", "None"]), seeds=1, steps=30, baseline="none")
     assert list(found.curves) == ["none", "None"]
 
 
