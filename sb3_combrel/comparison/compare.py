@@ -188,13 +188,12 @@ def check_seeds(seeds: Any) -> list[int]:
 def check_learner(learner: Mapping[str, Any]) -> None:
     """Raise a TypeError unless the learner has all of these arguments."""
     known = [name for name in inspect.signature(FittedRMax).parameters if name not in _TAKEN]
+    own = [each.name for each in inspect.signature(compare).parameters.values() if each.kind != each.VAR_KEYWORD]
     for name in learner:
         if name not in known:
-            near = difflib.get_close_matches(name, [*inspect.signature(compare).parameters, *known], n=1, cutoff=0.7)
+            near = difflib.get_close_matches(name, [*own, *known], n=1, cutoff=0.7)
             meant = f"did you mean {near[0]!r}?" if near else f"FittedRMax has {', '.join(known)}"
-            raise TypeError(
-                f"compare takes its own arguments and those of FittedRMax, such as gamma=0.99, got {name!r}; {meant}"
-            )
+            raise TypeError(f"compare takes its own arguments and those of FittedRMax, such as gamma=0.99, got {name!r}; {meant}")
 
 
 def task_of(env: Any) -> Task:

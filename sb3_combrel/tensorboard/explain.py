@@ -39,8 +39,8 @@ def explain(
 
     :param model: the model, or the path of its file
     :param output: a folder for the page ``report.html``, which holds all in one file to look at: returns, mappings, evidence
-        over time, values, bound and policy, and where the source was contradicted; for the report, ``report.txt``; the pictures
-        of the dashboard as PNG; and its table of the mappings used most, ``mappings.md``. None: nothing is written
+        over time, values, bound and policy, and where the source was contradicted; for the report, ``report.txt``; the
+        pictures of the dashboard as PNG; and its table of the mappings used most, ``mappings.md``. None: nothing is written
     :param variables: pairs of state variables, by number or name, over which is drawn; None for a variable beside its own
         velocity, told by their names, or else the first two
     :param at: state (raw units) through which the pictures' plane goes; None for the middle of the state space

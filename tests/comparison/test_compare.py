@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ import sb3_combrel
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import compare
+from sb3_combrel.comparison.controls import random_control
 from sb3_combrel.comparison.curves import LearningCurves, returns_over_steps
 from sb3_combrel.comparison.measures import compare_learning
 from sb3_combrel.runs.episodes import EpisodeRecorder
 from sb3_combrel.runs.runner import JobError
+from sb3_combrel.transfer.report import MappingReport, TransferReport
 
 LEARNER = dict(model_breadth=0.15, resolution=3, degree=0)
 METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1)))}
@@ -146,6 +149,91 @@ def test_several_methods_are_corrected_for_their_number(monkeypatch):
     [mean_of_one, _] = [line for line in found.table.splitlines() if line.startswith("| mean return over steps")]
     assert mean_of_one.endswith("| 0.0079 | 0.016 |")
     assert [line.split(" | ")[1] for line in found.table.splitlines()[2:]] == ["one"] * 5 + ["two"] * 5
+
+
+def test_few_seeds_and_few_episodes_are_warned_of(monkeypatch):
+    few = made_up(monkeypatch, {"none": around(-60.0, 4)[:, :9], "COMBREL": around(-5.0, 4)[:, :9]})
+    assert [warning[:30] for warning in few.warnings] == ["Only 4 seeds: runs differ more", "The shortest run has only 9 ep"]
+    assert all(warning in str(few) for warning in few.warnings)
+    assert not made_up(monkeypatch, {"none": around(-60.0, 5), "COMBREL": around(-5.0, 5)}).warnings
+
+
+def test_rows_that_say_the_same_are_one(monkeypatch):
+    """With so few episodes the first are the last, and these all there are."""
+    found = made_up(monkeypatch, {"none": around(-60.0, 5)[:, :3], "COMBREL": around(-5.0, 5)[:, :3]})
+    _, rows = found.rows
+    assert rows[0][0] == "jumpstart, asymptotic performance, mean return over steps"
+    assert len({row[1:] for row in rows}) == len(rows) == 3
+
+
+def test_a_random_mapping_that_does_as_well_is_mentioned(monkeypatch):
+    runs = {"none": around(-60.0, 5), "COMBREL": around(-50.0, 5), "random mapping": around(-40.0, 5)}
+    reports = (TransferReport("COMBREL()", "prior", mappings=(MappingReport("go", "went"),)),)
+    found = replace(made_up(monkeypatch, runs), reports={"COMBREL": reports})
+    assert "transfer helped" in found.sentences["COMBREL"] and "But random mapping did as well" in found.sentences["COMBREL"]
+    assert "But" not in found.sentences["random mapping"]
+    better = replace(made_up(monkeypatch, {**runs, "COMBREL": around(-30.0, 5)}), reports={"COMBREL": reports})
+    assert "But" not in better.sentence
+
+
+def controls_of(methods, **learner):
+    """The control that is added to some methods, each bound as ``compare`` finds it."""
+    bound = {name: FittedRMax(Walk(), transfer=each, seed=0, **LEARNER | learner).transfer for name, each in methods.items()}
+    return random_control(bound)
+
+
+def test_a_random_mapping_of_the_same_set_is_the_control():
+    prior, instances = COMBREL(walk_source(), "signed_factored"), COMBREL(walk_source(), "surjective", breadth=0.2)
+    control = controls_of({"none": None, "COMBREL": prior}, degree=1)
+    assert (control.mapping, control.mappings, control.use) == ("random", "signed_factored", "prior")
+    control = controls_of({"none": None, "given": METHODS["TIMBREL"], "COMBREL": instances})
+    assert (control.mapping, control.mappings, control.use, control.breadth) == ("random", "surjective", "instances", 0.2)
+    # Of a mapping that is given, the default set.
+    control = controls_of(METHODS)
+    assert (control.mapping, control.mappings, control.use) == ("random", "injective", "instances")
+
+
+@pytest.mark.parametrize(
+    "methods",
+    [
+        {"none": None, "mine": Mine()},
+        {"none": None, "COMBREL": COMBREL(walk_source()), "any": TIMBREL(walk_source(), "random")},
+        {"random mapping": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1))), "COMBREL": COMBREL(walk_source())},
+    ],
+)
+def test_there_is_no_control_where_nothing_is_mapped_or_there_is_one(methods):
+    assert controls_of(methods) is None
+
+
+def test_the_control_is_run_unless_it_is_left_out(monkeypatch):
+    carried_out = []
+
+    def run_missing(jobs, **_):
+        carried_out.extend(jobs)
+        return [job.result([10] * 12, [-1.0] * 12, [True] * 12, 120, {"report": None}) for job in jobs]
+
+    monkeypatch.setattr(module, "run_missing", run_missing)
+    for controls, names in ((True, ["none", "TIMBREL", "random mapping"]), (False, ["none", "TIMBREL"])):
+        carried_out.clear()
+        found = compare(Walk, METHODS, seeds=[7, 8, 9, 10, 11], steps=120, controls=controls, **LEARNER)
+        assert list(found.curves) == names
+        assert [job.seed for job in carried_out] == [7, 8, 9, 10, 11] * len(names)
+        assert [job.seed for job in carried_out if job.is_shown] == [7] * len(names)
+
+
+def test_a_control_that_cannot_be_made_is_warned_of(monkeypatch):
+    def refuse(self, *_):
+        if self.mapping == "random":
+            raise ValueError("too many variables")
+
+    monkeypatch.setattr(TIMBREL, "_replace_names", refuse)
+    monkeypatch.setattr(
+        module,
+        "run_missing",
+        lambda jobs, **_: [job.result([10] * 12, [-1.0] * 12, [True] * 12, 120, {"report": None}) for job in jobs],
+    )
+    with pytest.warns(UserWarning, match=r"there is no control \(random mapping: too many variables\): controls=False"):
+        compare(Walk, {"none": None, "COMBREL": COMBREL(walk_source())}, seeds=5, steps=120, **LEARNER)
 
 
 SHORT = InterTaskMapping((0,), (0, 1))
