@@ -141,7 +141,8 @@ def compare(
 
 def _name_of(env: Task) -> str:
     """What the page calls the task."""
-    return env if isinstance(env, str) else str(getattr(env, "__name__", type(env).__name__))
+    name = env if isinstance(env, str) else str(getattr(env, "__name__", type(env).__name__))
+    return "the task" if name == "<lambda>" else name
 
 
 def _try_out(run: ComparedRun) -> Transfer | None:
@@ -193,7 +194,8 @@ def check_learner(learner: Mapping[str, Any]) -> None:
         if name not in known:
             near = difflib.get_close_matches(name, [*own, *known], n=1, cutoff=0.7)
             meant = f"did you mean {near[0]!r}?" if near else f"FittedRMax has {', '.join(known)}"
-            raise TypeError(f"compare takes its own arguments and those of FittedRMax, such as gamma=0.99, got {name!r}; {meant}")
+            wanted = "compare takes its own arguments and those of FittedRMax, such as gamma=0.99"
+            raise TypeError(f"{wanted}, got {name!r}; {meant}")
 
 
 def task_of(env: Any) -> Task:

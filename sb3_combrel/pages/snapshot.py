@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
+from sb3_combrel.pages.plane import Plane
 from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
+
+#: Grid points whose actions are compared at a time.
+MAX_POINTS = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,13 +26,22 @@ class Snapshot:
     state_names: tuple[str, ...]
     action_names: tuple[str, ...]
     values: np.ndarray  #: V, shape (n_points,)
-    greedy: np.ndarray  #: number of the action with the highest Q, -1 where one has no model; int64, shape (n_points,)
+    #: Number of the action with the highest Q, -1 where one has no model, or it was not asked for; int64, shape (n_points,).
+    greedy: np.ndarray
     bound: np.ndarray | None  #: what the source's values allow, shape (n_points,); None if they bound nothing
 
 
-def snapshot_of(agent: FittedRMaxAgent) -> Snapshot:
-    """Take what an agent has learned."""
-    transfer = agent.transfer
+def snapshot_of(agent: FittedRMaxAgent, planes: Sequence[Plane] | None = None) -> Snapshot:
+    """Take what an agent has learned.
+
+    :param planes: over which the policy is to be drawn; None: any
+    """
+    transfer, n_points = agent.transfer, agent.grid.n_points
+    points = np.arange(n_points) if planes is None else np.concatenate([plane.points.ravel() for plane in planes])
+    greedy = np.full(n_points, -1, dtype=np.int64)
+    # In parts: what is computed on the way is many times as large as the result.
+    for part in np.array_split(points, len(points) // MAX_POINTS + 1):
+        greedy[part] = greedy_actions(agent, part)
     bounds = isinstance(transfer, MappingTransfer) and transfer.use == "prior"
     return Snapshot(
         grid=agent.grid,
@@ -35,7 +49,7 @@ def snapshot_of(agent: FittedRMaxAgent) -> Snapshot:
         state_names=tuple(agent.task.state_names),
         action_names=tuple(agent.task.action_names),
         values=agent.planner.values.copy(),
-        greedy=greedy_actions(agent, np.arange(agent.grid.n_points)),
+        greedy=greedy,
         bound=transfer.source_prior.value_bound() if bounds else None,  # type: ignore[union-attr]
     )
 

@@ -53,7 +53,6 @@ def explain(
     """
     if output is not None:
         check_matplotlib("leave output out")
-        check_folder("output", Path(output))
     if not isinstance(model, FittedRMax):
         model = _load(Path(model))
     agent = model.agent
@@ -63,6 +62,7 @@ def explain(
     if output is not None:
         folder = Path(output)
         planes = planes_of(agent.grid, agent.task.scaling, agent.task.state_names, variables, at)
+        check_folder("output", folder)
         _save_pictures(agent, planes, folder)
         (folder / "report.txt").write_text(f"{report}\n", encoding="utf-8")
         if isinstance(agent.transfer, MappingTransfer):

@@ -86,15 +86,13 @@ def _evidence(model: FittedRMax, report: TransferReport) -> Section:
 def _values(model: FittedRMax, planes: Sequence[Plane]) -> Section:
     from sb3_combrel.pages.drawings import value_figure
 
-    snapshot = snapshot_of(model.agent)
+    snapshot = snapshot_of(model.agent, planes)
+    title, text = "Values and policy", []
     if snapshot.bound is not None:
-        title, text = "Values, bound and policy", [
-            "No state is worth more than the source's values allow, beside which V is drawn."
-        ]
+        title = "Values, bound and policy"
+        text = ["No state is worth more than the source's values allow, beside which V is drawn."]
     elif is_prior(model.transfer):
-        title, text = "Values and policy", ["The source bounds no values, as it does not explain all actions and rewards."]
-    else:
-        title, text = "Values and policy", []
+        text = ["The source bounds no values, as it does not explain all actions and rewards."]
     words = [" and ".join(name for name in plane.names if name) for plane in planes]
     shown = [
         picture(partial(value_figure, snapshot, plane), f"Value function and greedy action over {over}")

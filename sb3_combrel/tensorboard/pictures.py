@@ -41,7 +41,7 @@ DPI = 100
 
 def over_planes(agent: FittedRMaxAgent, planes: Sequence[Plane], dpi: int = DPI) -> dict[str, np.ndarray]:
     """Draw what there is to show over each plane, and the evidence over time, by TensorBoard's tag."""
-    drawn, snapshot = {}, snapshot_of(agent)
+    drawn, snapshot = {}, snapshot_of(agent, planes)
     for plane in planes:
         over = "_".join(name for name in plane.names if name)
         drawn[f"value_and_policy/{over}"] = _pixels(value_figure(snapshot, plane, WIDTH), dpi)
