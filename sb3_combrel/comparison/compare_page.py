@@ -59,7 +59,7 @@ def _evidence(result: CompareResult) -> Section:
     histories = {method: runs for method, runs in histories.items() if runs}
     if not histories:
         return Section(title, [NO_HISTORY])
-    from sb3_combrel.pages.drawings import mean_evidence_figure
+    from sb3_combrel.pages.evidence_drawings import mean_evidence_figure
 
     draw = partial(mean_evidence_figure, histories, method_colours(result.curves, result.baseline))
     text = "Averaged over target actions; thin lines are runs. A source that is borne out counts for more."

@@ -1,4 +1,4 @@
-"""What dashboard and pages draw alike: values, bound and policy in a plane, evidence over time, returns, contradictions.
+"""What dashboard and pages draw alike: values, bound and policy in a plane, returns, contradictions.
 
 Each is a figure of matplotlib of a given width in inches, in which text keeps its size: narrow ones stack their panels. No
 display is needed, and pyplot is left alone. Importing this imports matplotlib.
@@ -6,7 +6,6 @@ display is needed, and pyplot is left alone. Importing this imports matplotlib.
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 
@@ -22,7 +21,6 @@ from matplotlib.ticker import MaxNLocator
 from sb3_combrel.pages.palette import ACTION_COLOURS, MAPPING_COLOURS, NONE_COLOUR, colour
 from sb3_combrel.pages.plane import Plane
 from sb3_combrel.pages.snapshot import Snapshot
-from sb3_combrel.transfer.report import EvidencePoint
 
 FONT_SIZE = 9
 LINE = 0.18  # inches, of a line of text of that size
@@ -67,117 +65,6 @@ def value_figure(snapshot: Snapshot, plane: Plane, width: float) -> Figure:
     return figure
 
 
-def evidence_figure(
-    history: Sequence[EvidencePoint], action_names: Sequence[str], colours: Mapping[str, str], width: float
-) -> Figure:
-    """Draw what each target action was taken for over time, as how much the source counted, and its prediction error.
-
-    :param history: of one run, at least one point
-    :param colours: of each mapping, see :func:`~sb3_combrel.pages.palette.mapping_colours`
-    """
-    steps = [point.step for point in history]
-    heights = (0.24 * len(action_names) + 0.3, 1.6, 1.3)
-    names = [name for name in dict.fromkeys(name for point in history for name in point.mappings) if name in colours]
-    legend_lines = sum(len(textwrap.wrap(name, int(width * CHARACTERS) - 6)) for name in names)
-    figure = figure_of(width, sum(heights) + 0.9 + LINE * (legend_lines + 1))
-    strips, strengths, errors = figure.subplots(3, 1, sharex=True, gridspec_kw={"height_ratios": heights})
-    _draw_strips(strips, history, action_names, colours)
-    for action, name in enumerate(action_names):
-        # The colour is that of what the action is taken for in the end; dashes tell actions of one mapping apart.
-        style = dict(color=_visible(colours.get(history[-1].mappings[action], "")), linestyle=_DASHES[action % len(_DASHES)])
-        values = [point.strengths[action] for point in history]
-        strengths.step(steps, values, where="post", label=name, linewidth=1.5, **style)
-    strengths.set_ylim(bottom=0.0)
-    _label(strengths, "as how many of the target's own instances the source counts", "instances")
-    strengths.legend(fontsize=FONT_SIZE - 1, frameon=False, ncols=2 if width < NARROW else 5, loc="upper left")
-    # Room for the legend above the curves.
-    room = 1.0 + 0.3 * -(-len(action_names) // (2 if width < NARROW else 5))
-    strengths.set_ylim(top=max(1e-9, room * max(max(point.strengths) for point in history)))
-    errors.step(steps, [point.error for point in history], where="post", color="#333333", linewidth=1.5)
-    errors.axhline(1.0, color="#999999", linewidth=1.0, linestyle=":")
-    highest = np.nanmax([1.0, *(point.error for point in history)])
-    errors.set_ylim(0.0, 1.15 * min(highest, HIGHEST_ERROR))
-    _shade_bounds(errors, history)
-    _label(errors, 'prediction error ("no change": 1); shaded: the source bounds values', "error")
-    errors.set_xlabel("environment steps", fontsize=FONT_SIZE)
-    errors.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    patches = [Patch(color=_visible(colours[name]), label=textwrap.fill(name, int(width * CHARACTERS) - 6)) for name in names]
-    figure.legend(
-        handles=patches, loc="outside lower left", frameon=False, fontsize=FONT_SIZE, title="mapping", alignment="left"
-    )
-    return figure
-
-
-def _draw_strips(
-    axes: Axes, history: Sequence[EvidencePoint], action_names: Sequence[str], colours: Mapping[str, str]
-) -> None:
-    """Draw a strip a target action, coloured by the mapping in use."""
-    steps = [point.step for point in history]
-    for action in range(len(action_names)):
-        used = [point.mappings[action] for point in history]
-        # Where it changes, and the end: a seam between bars of one colour would be seen.
-        ends = [k for k in range(1, len(used)) if k == len(used) - 1 or used[k] != used[k - 1]]
-        for begin, end in itertools.pairwise([0, *ends]):
-            shown = colours.get(used[begin], NONE_COLOUR)
-            axes.barh(action, steps[end] - steps[begin], left=steps[begin], height=0.8, color=shown, linewidth=0)
-    axes.set_yticks(range(len(action_names)), action_names, fontsize=FONT_SIZE)
-    axes.set_ylim(len(action_names) - 0.5, -0.5)
-    _label(axes, "what each target action is taken for", "")
-    axes.grid(visible=False)
-
-
-def _shade_bounds(axes: Axes, history: Sequence[EvidencePoint]) -> None:
-    for point, after in itertools.pairwise(history):
-        if point.bounds_values:
-            axes.axvspan(point.step, after.step, color="#009E73", alpha=0.12, linewidth=0)
-
-
-def mean_evidence_figure(
-    histories: Mapping[str, Sequence[Sequence[EvidencePoint]]], colours: Mapping[str, str], width: float
-) -> Figure:
-    """Draw strength and error over time, averaged over target actions and runs, with each run as a thin line.
-
-    :param histories: by method, of each run; points are few and early, so the steps are on a logarithmic axis
-    :param colours: of each method
-    """
-    figure = figure_of(width, 4.4)
-    strengths, errors = figure.subplots(2, 1, sharex=True)
-    for method, runs in histories.items():
-        at = np.unique([point.step for run in runs for point in run if point.step > 0])
-        for axes, values_of in ((strengths, _mean_strength), (errors, _error)):
-            rows = [_held([point.step for point in run], [values_of(point) for point in run], at) for run in runs]
-            for row in rows:
-                axes.step(at, row, where="post", color=colours[method], alpha=0.25, linewidth=0.8)
-            with np.errstate(invalid="ignore"):
-                n = np.isfinite(rows).sum(axis=0)
-                mean = np.where(n > 0, np.nansum(rows, axis=0) / np.maximum(n, 1), np.nan)
-            axes.step(at, mean, where="post", color=colours[method], linewidth=2.0, label=f"{method} ({len(runs)} runs)")
-    errors.axhline(1.0, color="#999999", linewidth=1.0, linestyle=":")
-    errors.set_ylim(0.0, 1.15 * HIGHEST_ERROR)
-    strengths.set_ylim(bottom=0.0)
-    strengths.set_xscale("log")
-    strengths.xaxis.set_major_formatter("{x:,.0f}")
-    _label(strengths, "as how many own instances the source counts", "instances")
-    _label(errors, 'prediction error ("no change": 1)', "error")
-    errors.set_xlabel("environment steps", fontsize=FONT_SIZE)
-    strengths.legend(fontsize=FONT_SIZE - 1, frameon=False, loc="upper left")
-    return figure
-
-
-def _mean_strength(point: EvidencePoint) -> float:
-    return float(np.mean(point.strengths))
-
-
-def _error(point: EvidencePoint) -> float:
-    return point.error
-
-
-def _held(steps: Sequence[int], values: Sequence[float], at: np.ndarray) -> np.ndarray:
-    """Values that hold from one step to the next, at other steps; NaN before the first."""
-    number = np.searchsorted(steps, at, side="right") - 1
-    return np.where(number < 0, np.nan, np.asarray(values)[np.maximum(number, 0)])
-
-
 def returns_figure(steps: np.ndarray, returns: np.ndarray, width: float) -> Figure:
     """Draw the returns of the episodes of one run, and their running mean over ten.
 
@@ -190,7 +77,7 @@ def returns_figure(steps: np.ndarray, returns: np.ndarray, width: float) -> Figu
     if window > 1:
         mean = np.convolve(returns, np.ones(window) / window, mode="valid")
         axes.plot(steps[window - 1 :], mean, color=MAPPING_COLOURS[0], linewidth=1.8, label=f"mean of {window}")
-    _label(axes, "return of the episodes", "return")
+    label_axes(axes, "return of the episodes", "return")
     axes.set_xlabel("environment steps", fontsize=FONT_SIZE)
     axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     axes.legend(fontsize=FONT_SIZE - 1, frameon=False)
@@ -282,15 +169,8 @@ def label_plane(axes: Axes, plane: Plane, title: str) -> None:
     axes.label_outer()
 
 
-_DASHES = ("-", "--", ":", "-.")
-
-
-def _visible(shown: str) -> str:
-    """A colour in which a line can be seen: that of nothing is darkened."""
-    return "#BBBBBB" if shown in ("", NONE_COLOUR) else shown
-
-
-def _label(axes: Axes, title: str, y_label: str) -> None:
+def label_axes(axes: Axes, title: str, y_label: str) -> None:
+    """Put a title above an axes at the left, as wide as there is room, and name what goes up."""
     room = int((axes.figure.get_figwidth() - 0.8) * CHARACTERS)  # type: ignore[union-attr]
     axes.set_title(textwrap.fill(title, room), fontsize=FONT_SIZE, loc="left", pad=4)
     axes.set_ylabel(y_label, fontsize=FONT_SIZE)

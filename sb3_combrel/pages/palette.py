@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Iterable
 
 #: Of methods: Okabe and Ito's colours, which the colour-blind can distinguish too; grey comes first, for the baseline.
@@ -15,13 +16,18 @@ MAPPING_COLOURS = (
 ACTION_COLOURS = ("#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#44BB99", "#99DDFF", "#AAAA00", "#DDDDDD")
 #: Where there is nothing.
 NONE_COLOUR = "#EEEEEE"
+#: The golden ratio: hues at its multiples never come close to each other.
+GOLDEN = 0.618034
 #: Names of no mapping.
 NO_MAPPING = ("nothing", "nothing was transferred", "")
 
 
 def colour(number: int, colours: tuple[str, ...] = MAPPING_COLOURS) -> str:
-    """Return the colour with this number; they are repeated where there are more."""
-    return colours[number % len(colours)]
+    """Return the colour with this number; where there are more than are listed, hues that lie far apart."""
+    if number < len(colours):
+        return colours[number]
+    rgb = colorsys.hsv_to_rgb(number * GOLDEN % 1.0, 0.45, 0.8)
+    return "#" + "".join(f"{round(255 * part):02X}" for part in rgb)
 
 
 def mapping_colours(names: Iterable[str]) -> dict[str, str]:

@@ -73,7 +73,7 @@ def _returns(model: FittedRMax) -> Section:
 
 
 def _evidence(model: FittedRMax, report: TransferReport) -> Section:
-    from sb3_combrel.pages.drawings import evidence_figure
+    from sb3_combrel.pages.evidence_drawings import evidence_figure
 
     title = "Evidence over time"
     if not report.history:

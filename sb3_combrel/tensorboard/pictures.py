@@ -20,13 +20,13 @@ from sb3_combrel.pages.drawings import (
     CHARACTERS,
     FONT_SIZE,
     LINE,
-    evidence_figure,
     figure_of,
     label_plane,
     panels_with_legend,
     show_numbers,
     value_figure,
 )
+from sb3_combrel.pages.evidence_drawings import evidence_figure
 from sb3_combrel.pages.palette import MAPPING_COLOURS, mapping_colours
 from sb3_combrel.pages.plane import Plane
 from sb3_combrel.pages.snapshot import snapshot_of

@@ -2,14 +2,17 @@
 
 import base64
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.command_line import call_for_all_output
+from matplotlib.colors import to_hex
 
 from sb3_combrel import explain
 from sb3_combrel.comparison.compare_page import compare_page
-from sb3_combrel.pages.drawings import contradictions_figure, evidence_figure, mean_evidence_figure
+from sb3_combrel.pages.drawings import contradictions_figure
+from sb3_combrel.pages.evidence_drawings import MAX_NAMED, OTHERS_COLOUR, evidence_figure, mean_evidence_figure, shortened
 from sb3_combrel.pages.page import Cell, Page, PageTable, Section, check_folder, data_address
 from sb3_combrel.pages.palette import METHOD_COLOURS, NONE_COLOUR, mapping_colours, method_colours
 from sb3_combrel.pages.plane import default_pair, numbered
@@ -131,8 +134,10 @@ def test_a_mapping_has_one_colour_everywhere(prior_model, comparison, undrawn):
 
 
 def test_colours_of_mappings_differ_and_nothing_is_grey():
-    found = mapping_colours(["nothing", *"abcdefghij", "a"])
-    assert found["nothing"] == NONE_COLOUR and len({found[name] for name in "abcdefghij"}) == 10
+    names = [f"m{k}" for k in range(60)]
+    found = mapping_colours(["nothing", *names, "m0"])
+    assert found["nothing"] == NONE_COLOUR and len({found[name] for name in names}) == 60
+    assert all(re.fullmatch("#[0-9A-F]{6}", each) for each in found.values())
     assert method_colours(["COMBREL", "none", "TIMBREL"], "none") == dict(
         zip(["none", "COMBREL", "TIMBREL"], METHOD_COLOURS[:3], strict=True)
     )
@@ -169,6 +174,28 @@ def test_evidence_is_drawn_as_it_was_noted():
     assert [line.get_ydata().tolist() for line in strengths.get_lines()] == [[0.5, 2.0, 3.0], [0.5, 1.0, 1.0]]
     np.testing.assert_array_equal(errors.get_lines()[0].get_ydata(), [np.nan, 0.4, 0.3])
     assert len(evidence_figure(POINTS[:1], ("a", "b"), colours, 6.0).axes) == 3
+
+
+def test_of_many_mappings_those_in_use_for_long_have_their_colours_and_the_others_are_grey():
+    names = [f"m{k}" for k in range(MAX_NAMED + 3)]
+    # The k-th is in use for k + 1 steps, the last at the end.
+    steps = np.cumsum([10, *range(1, len(names) + 1)])
+    points = [
+        EvidencePoint(int(at), 0.5, 0.0, False, (1.0,), (name,)) for at, name in zip(steps, [*names, names[-1]], strict=True)
+    ]
+    figure = evidence_figure(points, ("a",), mapping_colours(names), 6.0)
+    colours = [to_hex(bar.get_facecolor()).upper() for bar in figure.axes[0].patches]
+    assert colours == [OTHERS_COLOUR] * 3 + list(mapping_colours(names).values())[6:]
+    assert len(figure.legends[0].get_texts()) == MAX_NAMED + 1
+
+
+def test_long_names_are_shortened_and_leave_room_for_the_curves(recwarn):
+    assert shortened("abcdefghij", 10) == "abcdefghij" and shortened("abcdefghijk", 6) == "ab…ijk"
+    names = [f"a_very_long_name_of_an_action_with_number_{k}" for k in range(9)]
+    point = EvidencePoint(10, 0.5, 0.0, False, (1.0,) * 9, tuple(f"mapping {k} " + "of much " * 20 for k in range(9)))
+    figure = evidence_figure([point, replace(point, step=20)], names, mapping_colours(point.mappings), 4.2)
+    data_address(figure)
+    assert all(axes.get_position().width > 0.4 for axes in figure.axes) and not recwarn.list
 
 
 def test_evidence_of_runs_is_averaged_where_they_have_some():
