@@ -7,9 +7,9 @@ from functools import partial
 
 from sb3_combrel.comparison.result import CompareResult
 from sb3_combrel.pages.page import Cell, Page, PageTable, Section, picture
-from sb3_combrel.pages.palette import mapping_colours, method_colours
+from sb3_combrel.pages.palette import method_colours
 from sb3_combrel.pages.plane import VariablePair, planes_of
-from sb3_combrel.pages.report_sections import contradictions_table, contradictions_text, mapping_section
+from sb3_combrel.pages.report_sections import colours_of_reports, contradictions_table, contradictions_text, mapping_section
 
 NO_HISTORY = 'No method keeps a history of its evidence: those with use="prior" do.'
 
@@ -27,10 +27,7 @@ def compare_page(result: CompareResult, variables: Sequence[VariablePair] | None
     sections = [_curves(result), _measures(result)]
     if result.reports:
         reports = [report for runs in result.reports.values() for report in runs]
-        # In the order in which they came up, as in the pictures of a single run.
-        names = [name for report in reports for point in report.history for name in point.mappings]
-        names += [each.mapping for report in reports for each in report.mappings]
-        sections += [mapping_section(result.reports, mapping_colours(names)), _evidence(result)]
+        sections += [mapping_section(result.reports, colours_of_reports(reports)), _evidence(result)]
     sections += _values(result, variables)
     if result.reports:
         sections.append(_contradictions(result))

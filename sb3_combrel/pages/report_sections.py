@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sb3_combrel.pages.page import Cell, PageTable, Section
+from sb3_combrel.pages.palette import mapping_colours
 from sb3_combrel.transfer.report import Contradiction, MappingReport, TransferReport
 
 NONE, ANOTHER = "—", "another in each run"
@@ -58,6 +59,17 @@ def _row(
     names = [*((Cell(method),) if method is not None else ()), Cell(action), Cell(mapping, colour_of(mapping, colours))]
     runs = [] if n_runs is None else [Cell(NONE if mapping == ANOTHER else f"{n} of {n_runs}")]
     return [*names, *runs, *map(Cell, figures)]
+
+
+def colours_of_reports(reports: Sequence[TransferReport]) -> dict[str, str]:
+    """Give the mappings of several runs their colours: those that they have in the pictures of the first run.
+
+    With ``use="instances"`` the colour is that of the source action, with ``use="prior"`` that of the mapping.
+    """
+    of_actions = [name for report in reports for name in report.source_actions]
+    # In the order in which they came up.
+    of_priors = [name for report in reports for point in report.history for name in point.mappings]
+    return {**mapping_colours(of_actions), **mapping_colours(of_priors)}
 
 
 def colour_of(mapping: str, colours: Mapping[str, str]) -> str:

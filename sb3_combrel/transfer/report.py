@@ -92,6 +92,7 @@ class TransferReport:
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
+    source_actions: tuple[str, ...] = ()  #: with ``use="instances"``, the names of the source actions of all sources
     history: tuple[EvidencePoint, ...] = ()  #: the evidence over time; empty where none is kept
 
     @classmethod

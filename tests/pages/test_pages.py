@@ -9,14 +9,14 @@ import pytest
 from helpers.command_line import call_for_all_output
 from matplotlib.colors import to_hex
 
-from sb3_combrel import explain
+from sb3_combrel import FittedRMax, explain
 from sb3_combrel.comparison.compare_page import compare_page
 from sb3_combrel.pages.drawings import contradictions_figure
 from sb3_combrel.pages.evidence_drawings import MAX_NAMED, OTHERS_COLOUR, evidence_figure, mean_evidence_figure, shortened
 from sb3_combrel.pages.page import Cell, Page, PageTable, Section, check_folder, data_address
 from sb3_combrel.pages.palette import METHOD_COLOURS, NONE_COLOUR, mapping_colours, method_colours
 from sb3_combrel.pages.plane import default_pair, numbered
-from sb3_combrel.pages.report_sections import ANOTHER, contradictions_table, mapping_section
+from sb3_combrel.pages.report_sections import ANOTHER, colour_of, colours_of_reports, contradictions_table, mapping_section
 from sb3_combrel.tensorboard.pictures import colours_of_mappings
 from sb3_combrel.transfer.report import Contradiction, EvidencePoint, MappingReport, TransferReport
 
@@ -131,6 +131,14 @@ def test_a_mapping_has_one_colour_everywhere(prior_model, comparison, undrawn):
     of_page = {cell.text: cell.colour for row in of_mappings.table.rows for cell in row if cell.colour}
     own = mapping_colours([name for point in first.history for name in point.mappings])
     assert of_page and all(own[name] == shown for name, shown in of_page.items() if name in own)
+
+
+@pytest.mark.parametrize("kind", ["prior", "instances"])
+def test_the_colours_of_reports_are_those_of_the_dashboard(kind, models):
+    transfer = FittedRMax.load(models[kind]).transfer
+    report = transfer.report()
+    of_reports, of_pictures = colours_of_reports([report]), colours_of_mappings(transfer)
+    assert of_reports == of_pictures and all(colour_of(each.mapping, of_reports) for each in report.mappings)
 
 
 def test_colours_of_mappings_differ_and_nothing_is_grey():
