@@ -110,19 +110,20 @@ def reproduce(
     print("Written:", *made, sep="\n  ")
 
 
-def explain(model: Path, /, output: Path | None = None) -> None:
+def explain(model: Path, /, output: Path | None = None, variables: tuple[str, str] | None = None) -> None:
     """Say what transfer did in a model: which mappings, how sure, what the target contradicted, how many steps rested on it.
 
     :param model: file of a model that FittedRMax has saved
-    :param output: folder for the report, a table of mappings, and pictures of value, policy and mappings; by default the
+    :param output: folder for a page to look at, report.html, the report, a table of mappings, and pictures; by default the
         report is printed only
+    :param variables: two state variables over which values are drawn; by default one beside its own velocity
     """
     from sb3_combrel.tensorboard.explain import explain as run
 
-    report = run(model, output)
+    report = run(model, output, None if variables is None else [variables])
     print(report)
     if output is not None:
-        names = ("*.png", "mappings.md", "report.txt")
+        names = ("report.html", "*.png", "mappings.md", "report.txt")
         print("\nWritten:", *(file for name in names for file in sorted(output.glob(name))), sep="\n  ")
 
 

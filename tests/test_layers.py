@@ -10,8 +10,8 @@ PACKAGE = "sb3_combrel"
 FOLDER = Path(__file__).resolve().parent.parent / PACKAGE
 #: From top to bottom; the package itself, for `from sb3_combrel import COMBREL`, is a room among the others.
 ROOMS = [
-    *("cli", "experiments", "zoo", PACKAGE, "callbacks", "tensorboard", "comparison", "runs", "fitted_rmax", "transfer"),
-    *("sources", "mappings", "models", "planning", "wrappers", "common"),
+    *("cli", "experiments", "zoo", PACKAGE, "callbacks", "tensorboard", "comparison", "runs", "pages", "fitted_rmax"),
+    *("transfer", "sources", "mappings", "models", "planning", "wrappers", "common"),
 ]
 
 

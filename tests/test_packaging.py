@@ -18,7 +18,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 WHERE = {"sb3_combrel": ROOT / "sb3_combrel", "combrel_envs": ROOT / "envs" / "combrel_envs"}
 BESIDE = ["CHANGELOG.md", "CITATION.cff", "MANIFEST.in", "constraints.txt", "LICENSE", "README.md", "pyproject.toml"]
-DATA = {"py.typed", "version.txt", "*.xml", "*.yml", "*.png", "*.LICENSE.md"}
+DATA = {"py.typed", "version.txt", "*.xml", "*.yml", "*.png", "*.html", "*.LICENSE.md"}
 
 
 def files_on_disk(package):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -11,10 +13,12 @@ from typing import Any
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_combrel.common.checks import as_count, check_count, check_finite
+from sb3_combrel.common.checks import as_count, check_boolean, check_count, check_finite
+from sb3_combrel.comparison.controls import CONTROL, random_control
 from sb3_combrel.comparison.result import CompareResult, evaluate
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.pages.snapshot import snapshot_of
 from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose
 from sb3_combrel.runs.runner import Backend, check_all_succeeded, run_missing
 from sb3_combrel.sources.recipes import task_spec
@@ -26,7 +30,12 @@ _TAKEN = ("env", "transfer", "seed", "_init_setup_model")
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedRun(Job):
-    """A run of a comparison, whose result has the transfer method's report."""
+    """A run of a comparison, whose result has the transfer method's report.
+
+    :param is_shown: whether the result has values and policy too, for the page
+    """
+
+    is_shown: bool = False
 
     @property
     def name(self) -> str:
@@ -34,8 +43,11 @@ class ComparedRun(Job):
         return self.title
 
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
-        """Report what transfer did."""
-        return {"report": None if model.transfer is None else model.transfer.report()}
+        """Report what transfer did, and what was learned."""
+        return {
+            "report": None if model.transfer is None else model.transfer.report(),
+            "snapshot": snapshot_of(model.agent) if self.is_shown else None,
+        }
 
 
 def compare(
@@ -44,11 +56,12 @@ def compare(
     *,
     seeds: int | Sequence[int] = 10,
     steps: int = 20_000,
-    learner: Mapping[str, Any] | None = None,
     baseline: str | None = None,
+    controls: bool = True,
     threshold: float | None = None,
     n_jobs: int | None = 1,
     progress_bar: bool = False,
+    **learner: Any,
 ) -> CompareResult:
     """Learn a task with several methods of transfer and without, and say whether transfer helped.
 
@@ -60,6 +73,10 @@ def compare(
         print(result.sentence)
         print(result.table)
         result.figure().savefig("curves.png")
+        result.save("report.html")
+
+    Where a method transfers through mappings, one that draws a mapping at random from the same set is compared as well, as
+    the control "random mapping": what it gains is not owed to the right mapping.
 
     The question is answered by the return averaged over environment steps, exploration included, with the permutation test of
     the difference of means, corrected by Holm's method if several methods are compared with the baseline. The steps of
@@ -69,14 +86,16 @@ def compare(
     :param methods: for each name a transfer method, as :class:`~sb3_combrel.FittedRMax` takes it, or None for no transfer
     :param seeds: number of runs of each method, with seeds from 0 on; or the seeds themselves
     :param steps: environment steps of each run; episodes that are not complete by then do not count
-    :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods
     :param baseline: the method that the others are compared with; None: the one without transfer
+    :param controls: whether the control is added, unless there is one
     :param threshold: return that the time to threshold is measured to; None: the median, over the baseline's runs, of the mean
         return of their last episodes
     :param n_jobs: runs at a time, each in a process of its own; 1: one after the other in this process; None: one a core.
         Results do not depend on it.
     :param progress_bar: show how many runs are complete
+    :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
+    :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument
     :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short
         for a single episode
     :raises FileNotFoundError: if a source does not exist
@@ -86,17 +105,27 @@ def compare(
     numbers = check_seeds(seeds)
     steps = as_count("steps", steps)
     check_count("n_jobs", n_jobs, none_allowed=True)
+    check_boolean("controls", controls)
     if threshold is not None:
         check_finite("threshold", threshold)
-    learner = check_learner(learner)
+    check_learner(learner)
     task = task_of(env)
-    runs = [
-        ComparedRun(group="", method=method, seed=seed, env=task, n_steps=steps, learner=learner, transfer=transfer)
-        for method, transfer in methods.items()
-        for seed in numbers
-    ]
-    for run in runs[:: len(numbers)]:
-        _try_out(run)
+
+    def run_of(method: str, transfer: TransferLike, seed: int) -> ComparedRun:
+        is_shown = seed == numbers[0]
+        return ComparedRun(
+            group="", method=method, seed=seed, env=task, n_steps=steps, learner=learner, transfer=transfer, is_shown=is_shown
+        )
+
+    in_use = {method: _try_out(run_of(method, transfer, numbers[0])) for method, transfer in methods.items()}
+    control = random_control(in_use) if controls else None
+    if control is not None:
+        try:
+            _try_out(run_of(CONTROL, control, numbers[0]))
+            methods = {**methods, CONTROL: control}
+        except ValueError as error:
+            warnings.warn(f"there is no control ({error}): controls=False leaves it out without a warning", stacklevel=2)
+    runs = [run_of(method, transfer, seed) for method, transfer in methods.items() for seed in numbers]
     results = run_missing(runs, backend=Backend(n_jobs=n_jobs), console=Console(stderr=True) if progress_bar else None)
     check_all_succeeded(results)
     for result in results:
@@ -104,14 +133,23 @@ def compare(
             where = f"the run of {result.method}, seed {result.seed}"
             raise ValueError(f"steps={steps} is too few: no episode ended in {where}; take more, or a time limit")
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(methods)}
-    return evaluate(by_method, baseline, threshold)
+    found = evaluate(by_method, baseline, threshold, _name_of(env))
+    for words in found.warnings:
+        warnings.warn(words, stacklevel=2)
+    return found
 
 
-def _try_out(run: ComparedRun) -> None:
-    """Make the model of a run, so that what does not fit is found before anything is learned."""
+def _name_of(env: Task) -> str:
+    """What the page calls the task."""
+    name = env if isinstance(env, str) else str(getattr(env, "__name__", type(env).__name__))
+    return "the task" if name == "<lambda>" else name
+
+
+def _try_out(run: ComparedRun) -> Transfer | None:
+    """Make the model of a run, so that what does not fit is found before anything is learned; its transfer method, bound."""
     try:
         with closing(run.make_env()) as env, chosen_on_purpose():
-            run.make_model(env)
+            return run.make_model(env).transfer  # type: ignore[return-value]
     except (ValueError, TypeError, OSError) as error:
         # Subclasses may ask for more than a message.
         kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
@@ -148,17 +186,16 @@ def check_seeds(seeds: Any) -> list[int]:
     return list(range(as_count("seeds", seeds)))
 
 
-def check_learner(learner: Any) -> dict[str, Any]:
-    """Return the further arguments of the learner."""
-    if learner is None:
-        return {}
+def check_learner(learner: Mapping[str, Any]) -> None:
+    """Raise a TypeError unless the learner has all of these arguments."""
     known = [name for name in inspect.signature(FittedRMax).parameters if name not in _TAKEN]
-    if not isinstance(learner, Mapping):
-        raise ValueError(f"learner must be a dict of arguments of FittedRMax, got {learner!r}")
+    own = [each.name for each in inspect.signature(compare).parameters.values() if each.kind != each.VAR_KEYWORD]
     for name in learner:
         if name not in known:
-            raise ValueError(f"learner must have arguments out of {', '.join(known)}, got {name!r}")
-    return dict(learner)
+            near = difflib.get_close_matches(name, [*own, *known], n=1, cutoff=0.7)
+            meant = f"did you mean {near[0]!r}?" if near else f"FittedRMax has {', '.join(known)}"
+            wanted = "compare takes its own arguments and those of FittedRMax, such as gamma=0.99"
+            raise TypeError(f"{wanted}, got {name!r}; {meant}")
 
 
 def task_of(env: Any) -> Task:

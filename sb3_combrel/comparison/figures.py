@@ -11,8 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-#: Okabe and Ito's colours, which the colour-blind can distinguish too.
-COLOURS = ("#555555", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+from sb3_combrel.pages.palette import METHOD_COLOURS
+
+COLOURS = METHOD_COLOURS
 MARKERS = ("s", "^", "o", "D", "v")
 
 

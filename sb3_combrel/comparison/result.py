@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_combrel.comparison.controls import CONTROL
 from sb3_combrel.comparison.curves import LearningCurves, curves_of, returns_over_steps
+from sb3_combrel.comparison.measure_table import measure_table, p_value_text
 from sb3_combrel.comparison.measures import (
     WINDOW,
-    Comparison,
     TransferMeasures,
     asymptotic_return,
     compare_learning,
@@ -19,12 +22,18 @@ from sb3_combrel.comparison.measures import (
 )
 from sb3_combrel.comparison.statistics import ALPHA, bootstrap_band, fewest_runs, holm, smallest_p_value
 from sb3_combrel.comparison.tables import markdown_table
+from sb3_combrel.pages.page import check_folder
+from sb3_combrel.pages.palette import method_colours
+from sb3_combrel.pages.plane import VariablePair
+from sb3_combrel.pages.snapshot import Snapshot
 from sb3_combrel.runs.job import Result
 from sb3_combrel.transfer.report import TransferReport
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: With fewer there is a warning.
+FEWEST_SEEDS, FEWEST_EPISODES = 5, 10
 #: A curve of the picture has so many points.
 N_POINTS = 200
 
@@ -36,11 +45,14 @@ class CompareResult:
     :param curves: for each method its runs, by the order of the seeds
     :param baseline: name of the method that all others are compared with
     :param measures: for each other method Taylor & Stone's measures against the baseline
-    :param p_values: for each other method, of the return averaged over environment steps, corrected by Holm's method if there
-        are several
+    :param p_values: for each other method, of the return averaged over environment steps, corrected for their number by Holm's
+        method
     :param threshold: the return of the time to threshold
     :param n_steps: environment steps that returns are averaged over: those of the shortest run, complete episodes only
     :param reports: for each method with transfer what it did in each run
+    :param snapshots: for each method values, policy and bound after the run of the first seed
+    :param task: what the task is called
+    :param warnings: why the figures may say little: few runs, few episodes
     """
 
     curves: Mapping[str, LearningCurves]
@@ -50,32 +62,60 @@ class CompareResult:
     threshold: float
     n_steps: int
     reports: Mapping[str, tuple[TransferReport, ...]]
+    snapshots: Mapping[str, Snapshot]
+    task: str = "the task"
+    warnings: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
         """Whether transfer helped, in one plain sentence for each method."""
-        return " ".join(self._sentence(method) for method in self.measures)
+        return " ".join(self.sentences.values())
 
     @property
     def table(self) -> str:
-        """Taylor & Stone's measures, as Markdown."""
-        header = ("measure", "method", self.baseline, "with", "difference", "95% interval", "p")
-        return markdown_table(header, [row for method in self.measures for row in self._rows(method)], n_names=2)
+        """Taylor & Stone's measures, as Markdown, with raw p-values and those corrected by Holm's method."""
+        return markdown_table(*self.rows, n_names=2)
 
-    def figure(self) -> Figure:
+    @property
+    def rows(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+        """The header and the rows of :attr:`table`."""
+        return measure_table(self.measures, self.baseline, self.n_steps, self.threshold)
+
+    def save(self, path: str | os.PathLike[str], variables: Sequence[VariablePair] | None = None) -> Path:
+        """Write a page to look at: one HTML file with sentence, curves, tables, mappings, evidence, values and contradictions.
+
+        :param path: of the file, which ends in .html
+        :param variables: pairs of state variables, by number or name, over which values are drawn; None for a variable beside
+            its own velocity, told by their names, or else the first two
+        :return: the path
+        :raises ValueError: if the path ends in something else, or variables do not fit the task
+        :raises OSError: if the file cannot be written
+        """
+        from sb3_combrel.comparison.compare_page import compare_page
+
+        file = Path(path)
+        if file.suffix.lower() not in (".html", ".htm"):
+            raise ValueError(f"path must end in .html, got {str(path)!r}")
+        check_folder("path", file.parent)
+        compare_page(self, variables).write(file)
+        return file
+
+    def figure(self, width: float = 7.0) -> Figure:
         """Draw the learning curves: return over environment steps, mean of the runs with 95% bootstrap bands.
 
+        :param width: in inches
         :return: a figure of its own, which pyplot does not know: save it with ``figure.savefig("curves.png")``
         """
         # Matplotlib takes a moment to import.
-        from sb3_combrel.comparison.figures import COLOURS, draw_band, figure_of
+        from sb3_combrel.comparison.figures import draw_band, figure_of
 
-        figure = figure_of(7.0, 4.2)
+        figure = figure_of(width, 4.2)
         axes = figure.add_subplot()
         at = np.linspace(0.0, self.n_steps, N_POINTS, endpoint=False)
-        for k, (method, curves) in enumerate(self.curves.items()):
+        colours = method_colours(self.curves, self.baseline)
+        for method, curves in self.curves.items():
             band = bootstrap_band(returns_over_steps(curves, at), n_resamples=500)
-            draw_band(axes, at, band, COLOURS[k % len(COLOURS)], label=f"{method} ({len(curves.returns)} runs)")
+            draw_band(axes, at, band, colours[method], label=f"{method} ({len(curves.returns)} runs)")
         axes.set_xlabel("environment steps")
         axes.set_ylabel("return of the episode")
         axes.grid(alpha=0.3)
@@ -83,7 +123,12 @@ class CompareResult:
         return figure
 
     def __str__(self) -> str:
-        return f"{self.sentence}\n\n{self.table}"
+        return "\n\n".join([self.sentence, *self.warnings, self.table])
+
+    @property
+    def sentences(self) -> dict[str, str]:
+        """Whether transfer helped, in one sentence for each method but the baseline."""
+        return {method: self._sentence(method) for method in self.measures}
 
     def _sentence(self, method: str) -> str:
         measure, p_value = self.measures[method].total_reward_by_steps, self.p_values[method]
@@ -93,31 +138,31 @@ class CompareResult:
         if not smallest < ALPHA:
             advice = f"take at least {fewest_runs(len(self.measures))} seeds, better 10."
             return f"{method}: too few runs to tell ({figures}); so many runs cannot show a difference, {advice}"
-        tested = f"{figures} (p = {p_value:.2g})"
+        number = f"{len(self.measures)} comparison{'s' if len(self.measures) > 1 else ''}"
+        tested = f"{figures} (p = {p_value_text(p_value)}, by Holm's correction for {number})"
         if p_value >= ALPHA:
             return f"{method}: it is not shown that transfer helps or harms: {tested}."
-        return f"{method}: transfer {'helped' if measure.effect > 0.0 else 'harmed'}: {tested}."
+        if measure.effect <= 0.0:
+            return f"{method}: transfer harmed: {tested}."
+        return f"{method}: transfer helped: {tested}.{self._of_control(method, with_it)}"
 
-    def _rows(self, method: str) -> Iterator[tuple[str, ...]]:
-        measures = self.measures[method]
-        listed: list[tuple[str, Comparison | None, Callable[[np.ndarray], np.floating[Any]], float]] = [
-            ("jumpstart", measures.jumpstart, np.mean, 1.0),
-            ("asymptotic performance", measures.asymptotic_performance, np.mean, 1.0),
-            ("mean return over steps", measures.total_reward_by_steps, np.mean, 1.0 / self.n_steps),
-            ("transfer ratio, over steps", measures.transfer_ratio_by_steps, np.mean, 1.0),
-            (f"steps to a return of {self.threshold:.4g}", measures.time_to_threshold, np.median, 1.0),
-        ]
-        for name, measure, average, scale in listed:
-            if measure is None:
-                continue
-            is_ratio = name.startswith("transfer ratio")
-            sides = ("", "") if is_ratio else tuple(f"{average(runs) * scale:.4g}" for runs in (measure[1], measure[0]))
-            interval = f"{measure.low * scale:.3g} to {measure.high * scale:.3g}" if np.isfinite(measure.low) else ""
-            p_value = f"{measure.p_value:.2g}" if np.isfinite(measure.p_value) else ""
-            yield name, method, *sides, f"{measure.effect * scale:+.3g}", interval, p_value
+    def _of_control(self, method: str, with_it: float) -> str:
+        """Say if a mapping drawn at random did as well."""
+        if (
+            method == CONTROL
+            or CONTROL not in self.measures
+            or not any(each.mappings for each in self.reports.get(method, ()))
+        ):
+            return ""
+        control = float(self.measures[CONTROL].total_reward_by_steps.with_transfer.mean()) / self.n_steps
+        return (
+            f" But {CONTROL} did as well ({control:.4g}): it may not be the mapping that helps." if control >= with_it else ""
+        )
 
 
-def evaluate(results: Mapping[str, Sequence[Result]], baseline: str, threshold: float | None) -> CompareResult:
+def evaluate(
+    results: Mapping[str, Sequence[Result]], baseline: str, threshold: float | None, task: str = "the task"
+) -> CompareResult:
     """Compare methods with one of them, the baseline, given the runs of each by the order of the seeds."""
     curves = {method: curves_of(runs) for method, runs in results.items()}
     shortest = min(int(each.n_episodes.min()) for each in curves.values())
@@ -141,7 +186,22 @@ def evaluate(results: Mapping[str, Sequence[Result]], baseline: str, threshold: 
         threshold=threshold,
         n_steps=n_steps,
         reports={method: reports for method, runs in results.items() if (reports := _reports(runs))},
+        snapshots={method: shown for method, runs in results.items() if (shown := runs[0].more.get("snapshot")) is not None},
+        task=task,
+        warnings=few_data(len(next(iter(results.values()))), shortest),
     )
+
+
+def few_data(n_seeds: int, n_episodes: int) -> tuple[str, ...]:
+    """Warn of few runs, and of few episodes in the shortest of them."""
+    found = []
+    if n_seeds < FEWEST_SEEDS:
+        number = f"{n_seeds} seed{'s' if n_seeds > 1 else ''}"
+        found.append(f"Only {number}: runs differ more than methods. Take at least {FEWEST_SEEDS}, better 10.")
+    if n_episodes < FEWEST_EPISODES:
+        number = f"{n_episodes} episode{'s' if n_episodes > 1 else ''}"
+        found.append(f"The shortest run has only {number}: start and end of learning overlap. Take more steps.")
+    return tuple(found)
 
 
 def _reports(runs: Sequence[Result]) -> tuple[TransferReport, ...]:

@@ -11,25 +11,29 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, EventCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import safe_mean
 
 from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.pages.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
 from sb3_combrel.tensorboard import readings
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.mapping_table import mapping_table
-from sb3_combrel.tensorboard.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 if TYPE_CHECKING:
     # TensorBoard's writer and matplotlib take a second to import: only where there is a log.
     from torch.utils.tensorboard import SummaryWriter
 
-DEFAULT_PICTURE_FREQ = 50_000
+AUTO = "auto"
+DEFAULT_PICTURE_FREQ = AUTO
+# Sets of pictures in a run, where their frequency is left open.
+PICTURES_A_RUN = 8
 # Of the time, for a dashboard that the user did not ask for. Matplotlib is loaded with the first set.
-DEFAULT_PICTURE_SHARE = 0.05
-FIRST_PICTURES_SECONDS = 1.5
+DEFAULT_PICTURE_SHARE = 0.15
+FIRST_PICTURES_SECONDS = 1.0
 DEFAULT_SCALAR_SHARE = 0.03
 # Points between logs, in a run that is not stopped early.
 MAX_POINTS = 500
@@ -41,16 +45,19 @@ class DashboardCallback(BaseCallback):
     ``FittedRMax.learn`` adds one where there is a TensorBoard log and none was given; its pictures come at the end, and before
     where they take less than a twentieth of the time. Without such a log it does nothing.
 
-    - Scalars: ``rollout/`` and ``time/`` with every log of the algorithm (``log_interval``; None: no scalars); ``model/``,
-      ``planner/`` and ``transfer/`` with these and between them, up to 500 times in a run; and a page of custom scalars to
-      compare runs.
-    - Pictures: V and the greedy policy over two state variables; the source action that each target action is mapped to
-      (Figure 4 of the COMBREL paper); which state mappings were chosen when. They need matplotlib.
+    - Scalars: ``rollout/`` at the end of every episode, ``time/`` with every log of the algorithm (``log_interval``; None: no
+      scalars); ``model/``, ``planner/``, ``transfer/`` and, of a source as prior, ``evidence/``, as how many instances it
+      counts for each action, with these and between them, up to 500 times in a run; and a page of custom scalars to compare
+      runs.
+    - Pictures: V, what the source bounds it by, and the greedy policy over two state variables; of a source as prior the
+      evidence over time; else the source action that each target action is mapped to (Figure 4 of the COMBREL paper), and
+      which state mappings were chosen when. They need matplotlib.
     - Text: the mappings used most (Table 2 of that paper). HPARAMS: the settings.
 
     :param picture_freq: environment steps between two sets of pictures and tables; the last comes at the end of ``learn``.
-        None: no pictures, and a table at the end only
-    :param variables: pairs of state variables, by number or name, over which is drawn; None for the first two
+        "auto": an eighth of the run; None: no pictures, and a table at the end only
+    :param variables: pairs of state variables, by number or name, over which is drawn; None for a variable beside its own
+        velocity, told by their names, or else the first two
     :param at: state (raw units) through which the pictures' plane goes; None for the middle of the state space
     :param scalar_share: fraction of the time that scalars may take, half of it between logs; a log that would exceed it has
         ``rollout/`` and ``time/`` only. 1 for all of them in every log
@@ -65,7 +72,7 @@ class DashboardCallback(BaseCallback):
 
     def __init__(
         self,
-        picture_freq: int | None = DEFAULT_PICTURE_FREQ,
+        picture_freq: int | str | None = DEFAULT_PICTURE_FREQ,
         variables: Sequence[VariablePair] | None = None,
         at: ArrayLike | None = None,
         scalar_share: float = DEFAULT_SCALAR_SHARE,
@@ -73,7 +80,8 @@ class DashboardCallback(BaseCallback):
         verbose: int = 0,
     ):
         super().__init__(verbose)
-        check_count("picture_freq", picture_freq, none_allowed=True)
+        if picture_freq != AUTO:
+            check_count("picture_freq", picture_freq, none_allowed=True)
         check_positive("scalar_share", scalar_share, max=1.0)
         check_positive("picture_share", picture_share, max=1.0)
         self.picture_freq = picture_freq
@@ -99,8 +107,9 @@ class DashboardCallback(BaseCallback):
         self._scaling: StateScaling | None = None
         self._follow_scales()
         self._shown_at = self._drawn_at = self._scalars_at = self.model.num_timesteps
-        self._next_pictures = self._following_pictures()
         n_steps = self.model._total_timesteps - self.model.num_timesteps
+        self._picture_freq = self._steps_between_pictures(n_steps)
+        self._next_pictures = self._following_pictures()
         # Nobody wants scalars between logs who wants no logs.
         self._scalar_freq = max(1, n_steps // MAX_POINTS) if self.locals.get("log_interval") is not None else None
         half = 1.0 if self.scalar_share == 1.0 else 0.5 * self.scalar_share
@@ -137,13 +146,32 @@ class DashboardCallback(BaseCallback):
     def _on_step(self) -> bool:
         if self._writer is None:
             return True
+        ended = int(np.sum(self.locals["dones"]))
+        if ended and self._scalar_freq is not None and not self._log_follows(ended):
+            self._write_rollout(self._writer)
         due = self._scalar_freq is not None and self.num_timesteps >= self._scalars_at + self._scalar_freq
         # Where an episode ends there may be a log, which has them too.
-        if due and not np.any(self.locals["dones"]) and self._between_logs.suffices():
+        if due and not ended and self._between_logs.suffices():
             self._write_scalars(self._writer)
         if self.num_timesteps >= self._next_pictures:
             self._show(self._writer, at_end=False)
         return True
+
+    def _log_follows(self, n_ended: int) -> bool:
+        """Return whether the algorithm writes a log once it has taken in that so many episodes have ended."""
+        interval, before = self.locals["log_interval"], self.model._episode_num
+        return any((before + k) % interval == 0 for k in range(1, n_ended + 1))
+
+    def _write_rollout(self, writer: SummaryWriter) -> None:
+        """Write what logs say of episodes at the end of one that has no log."""
+        from sb3_combrel.tensorboard.summaries import scalars_summary
+
+        episodes = self.model.ep_info_buffer or ()
+        names = {"r": "rollout/ep_rew_mean", "l": "rollout/ep_len_mean"}
+        scalars = {tag: safe_mean([info[key] for info in episodes]) for key, tag in names.items() if episodes}
+        if self.model.ep_success_buffer:
+            scalars["rollout/success_rate"] = safe_mean(self.model.ep_success_buffer)
+        writer._get_file_writer().add_summary(scalars_summary(scalars), self.num_timesteps)
 
     def _on_training_end(self) -> None:
         if self._writer is None:
@@ -160,7 +188,8 @@ class DashboardCallback(BaseCallback):
         if self.agent.task.scaling is self._scaling:
             return
         self._scaling = self.agent.task.scaling
-        self._planes = planes_of(self.agent, self.variables, self.at)
+        task = self.agent.task
+        self._planes = planes_of(self.agent.grid, task.scaling, task.state_names, self.variables, self.at)
         self._history = ChoiceHistory() if self._transfer is not None and self._transfer.makes_choices else None
 
     def _write_scalars(self, writer: SummaryWriter) -> None:
@@ -182,6 +211,7 @@ class DashboardCallback(BaseCallback):
         if self.agent.transfer is not None:
             modelled = self.agent.mdp.arrays.modelled & ~self.agent.model.known
             found["transfer/pairs_modelled"] = int(modelled.sum())
+            found |= readings.evidence(self.agent)
         if self._transfer is not None and self._history is not None:
             self._history.note(self.num_timesteps, self._transfer.choices())
             compliance = readings.mean_compliance(self._transfer)
@@ -195,11 +225,16 @@ class DashboardCallback(BaseCallback):
         self._marked = now, planning = time.perf_counter(), self.agent.planning_seconds
         return (planning - planning_before) / max(now - since, 1e-9)
 
+    def _steps_between_pictures(self, n_steps: int) -> int | None:
+        if isinstance(self.picture_freq, str):
+            return max(1, n_steps // PICTURES_A_RUN)
+        return self.picture_freq
+
     def _following_pictures(self) -> float:
         """Return the next multiple of ``picture_freq``."""
-        if self.picture_freq is None:
+        if self._picture_freq is None:
             return float("inf")
-        return (self.model.num_timesteps // self.picture_freq + 1) * self.picture_freq
+        return float((self.model.num_timesteps // self._picture_freq + 1) * self._picture_freq)
 
     def _show(self, writer: SummaryWriter, at_end: bool) -> None:
         """Write table and pictures, unless there are some of this step."""
@@ -220,7 +255,7 @@ class DashboardCallback(BaseCallback):
 
         self._follow_scales()
         drawn = pictures.over_planes(self.agent, self._planes)
-        if self._history is not None and self._transfer is not None:
+        if self._history is not None and self._transfer is not None and pictures.varies_by_state(self._transfer):
             self._history.note(step, self._transfer.choices())
             drawn["state_mappings/chosen"] = pictures.state_mappings(self._history, self._transfer)
         return drawn

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
+from sb3_combrel.pages.snapshot import action_values
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.methods.combrel import COMBREL
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 
 MAX_POINTS = 500
 """Grid points from which a figure is computed, at most: enough for a curve, and cheap on any grid."""
@@ -18,17 +20,6 @@ MAX_PAIRS = 2000
 def spread(n: int, max_count: int = MAX_POINTS) -> np.ndarray:
     """Choose at most ``max_count`` numbers below ``n``, evenly spread, so that grid points do not all lie on one axis."""
     return np.arange(n) if n <= max_count else (np.arange(max_count) * (n / max_count)).astype(np.int64)
-
-
-def action_values(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
-    """Compute Q of every action, the first axis, at grid points of any shape; NaN for an optimistic pair."""
-    arrays = agent.mdp.arrays
-    shape, flat = np.shape(points), np.ravel(points)
-    used = np.arange(arrays.to.shape[2]) < arrays.length[flat][:, :, None]
-    following = np.where(used, arrays.weight[flat] * agent.planner.values[arrays.to[flat]], 0.0)
-    modelled = arrays.modelled.reshape(agent.task.n_actions, -1)[:, flat]
-    q = np.where(modelled, (arrays.reward[flat] + following.sum(axis=2)).T, np.nan)
-    return q.reshape(-1, *shape)
 
 
 def bellman_residual(agent: FittedRMaxAgent) -> float:
@@ -49,3 +40,15 @@ def mean_compliance(transfer: Transfer) -> float | None:
     if len(pairs) == 0:
         return None
     return float(transfer.chosen_compliance(pairs[spread(len(pairs), MAX_PAIRS)]).mean())
+
+
+def evidence(agent: FittedRMaxAgent) -> dict[str, float]:
+    """Read of a source as prior as how many instances it counts for each target action, and the mean of its bound."""
+    transfer = agent.transfer
+    if not isinstance(transfer, MappingTransfer) or transfer.use != "prior":
+        return {}
+    prior = transfer.source_prior
+    strengths = prior.evidence.strength_of_actions().tolist()
+    found = {f"evidence/{name}": strength for name, strength in zip(agent.task.action_names, strengths, strict=True)}
+    bound = prior.value_bound()
+    return found if bound is None else {**found, "transfer/value_bound": float(bound.mean())}

@@ -32,6 +32,14 @@ LAYOUT: dict[str, dict[str, list[object]]] = {
         "pairs still optimistic (share)": _chart("model/optimistic"),
         "steps per second": _chart("time/fps"),
     },
+    "Evidence": {
+        "as how many own instances the source counts": _chart("transfer/prior_strength"),
+        "the same by target action": _chart("evidence/.*"),
+        "prediction error (no change: 1)": _chart("transfer/prediction_error"),
+        "whether the source bounds values": _chart("transfer/values_bounded"),
+        "mean of that bound": _chart("transfer/value_bound"),
+        "by how much returns exceeded it": _chart("transfer/bound_exceeded"),
+    },
     "Transfer": {
         "mean compliance of the chosen mappings": _chart("transfer/compliance"),
         "entropy of the choice (nats)": _chart("transfer/choice_entropy"),

@@ -146,6 +146,21 @@ class RegionErrors:
         order = sorted(map(tuple, np.argwhere(worse).tolist()), key=lambda cell: -excess[cell])
         return tuple(self._contradiction(*cell) for cell in order[:MAX_CONTRADICTIONS])
 
+    def by_part(self) -> np.ndarray:
+        """Return the error over that of "no change" by part, shape (n_actions, n_variables, N_PARTS).
+
+        NaN where too few transitions were compared; infinite where nothing moved and the source says that something does.
+        """
+        n, error, effect, _ = np.moveaxis(self.sums, -1, 0)
+        still = effect <= NO_MOVEMENT
+        ratio = np.where(still, np.where(error > NO_MOVEMENT, np.inf, np.nan), error / np.where(still, 1.0, effect))
+        return np.where(n >= MIN_IN_PART, ratio, np.nan)
+
+    def edges(self) -> dict[str, np.ndarray]:
+        """Return, by state variable, where its parts begin and end, raw units, each of shape (N_PARTS + 1,)."""
+        low, high = self.task.scaling.low, self.task.scaling.high
+        return {name: np.linspace(low[k], high[k], N_PARTS + 1) for k, name in enumerate(self.task.state_names)}
+
     def report_fields(self, evidence: OutcomeEvidence | None = None) -> dict[str, Any]:
         """Return the fields of a report that say how the target's transitions compare with what was predicted of them.
 

@@ -60,11 +60,23 @@ class Contradiction:
 
 
 @dataclass(frozen=True)
+class EvidencePoint:
+    """What a source was worth at one time of learning, with ``use="prior"``; it holds until the next point."""
+
+    step: int  #: steps of the target that were observed by then
+    error: float  #: mean squared error of the mapping in use over that of "no change", on all steps until then
+    exceeded: float  #: by how much returns had exceeded the source's values
+    bounds_values: bool  #: whether the source's values bounded what is unknown
+    strengths: tuple[float, ...]  #: by target action: as how many of the target's own instances the source counted
+    mappings: tuple[str, ...]  #: by target action: what it was taken for, as in :class:`MappingReport`
+
+
+@dataclass(frozen=True)
 class TransferReport:
     """What a transfer method did: print it, or read its fields."""
 
     method: str  #: with its arguments
-    use: str  #: "instances" or "prior"
+    use: str  #: "instances", "prior" or "actions"; "none" of a model without transfer
     sources: tuple[str, ...] = ()
     n_steps: int | None = None  #: steps of the target that were observed; None if the method does not count them
     #: Of these, steps whose action transferred instances predicted; None with ``use="prior"``.
@@ -80,8 +92,30 @@ class TransferReport:
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
+    source_actions: tuple[str, ...] = ()  #: with ``use="instances"``, the names of the source actions of all sources
+    history: tuple[EvidencePoint, ...] = ()  #: the evidence over time; empty where none is kept
+
+    @classmethod
+    def of_no_transfer(cls) -> TransferReport:
+        """Return the report of a model without a transfer method."""
+        return cls(method="no transfer", use="none")
+
+    @property
+    def sentence(self) -> str:
+        """How well the source explained the target, in one sentence."""
+        if self.use == "none":
+            return "The model has no transfer method: what it knows is its own."
+        if not self.n_compared or np.isnan(self.error):
+            return "Nothing can be said of the source: none of its predictions has been compared with what happened."
+        well = "well" if self.error < 0.5 else "in part" if self.error < 1.0 else "no better than that nothing changes"
+        worse = 100 * self.n_worse / self.n_compared
+        judged = f"its prediction error is {_text(self.error)} (no change: 1), worse than no change on {worse:.0f} % of"
+        more = ", and its values bound those of what is unknown" if self.bounds_values else ""
+        return f"The source explains the target {well}: {judged} {self.n_compared:,} steps{more}."
 
     def __str__(self) -> str:
+        if self.use == "none":
+            return self.sentence
         parts = [self._heading(), self._mappings(), self._contradictions()]
         if not self.mappings:
             parts.append(self._statistics())

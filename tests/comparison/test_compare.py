@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +14,12 @@ import sb3_combrel
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import compare
+from sb3_combrel.comparison.controls import random_control
 from sb3_combrel.comparison.curves import LearningCurves, returns_over_steps
 from sb3_combrel.comparison.measures import compare_learning
 from sb3_combrel.runs.episodes import EpisodeRecorder
 from sb3_combrel.runs.runner import JobError
+from sb3_combrel.transfer.report import MappingReport, TransferReport
 
 LEARNER = dict(model_breadth=0.15, resolution=3, degree=0)
 METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1)))}
@@ -23,7 +27,8 @@ METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 
 
 @pytest.fixture(scope="module")
 def result():
-    return compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER)
+    with pytest.warns(UserWarning, match="Only 2 seeds"):
+        return compare(Walk, METHODS, seeds=[3, 1], steps=150, controls=False, **LEARNER)
 
 
 def test_each_run_is_that_of_the_learner_with_its_seed(result):
@@ -60,6 +65,7 @@ def test_the_table_has_a_row_for_each_measure_and_the_figure_a_curve_for_each_me
         f"steps to a return of {result.threshold:.4g}",
     ]
     assert len({line.count("|") for line in lines}) == 1
+    assert lines[0] == "| measure | method | none | with | difference | 95% interval | p | p (Holm) |"
     measure = result.measures["TIMBREL"].total_reward_by_steps
     assert lines[4].split(" | ")[2:5] == [
         f"{measure.without.mean() / result.n_steps:.4g}",
@@ -71,7 +77,7 @@ def test_the_table_has_a_row_for_each_measure_and_the_figure_a_curve_for_each_me
     curve = axes.get_lines()[1]
     expected = returns_over_steps(result.curves["TIMBREL"], curve.get_xdata()).mean(axis=0)
     np.testing.assert_allclose(curve.get_ydata(), expected)
-    assert str(result) == f"{result.sentence}\n\n{result.table}"
+    assert str(result) == "\n\n".join([result.sentence, *result.warnings, result.table])
 
 
 def test_returns_over_steps_are_those_of_the_episode_under_way():
@@ -84,14 +90,19 @@ def made_up(monkeypatch, returns, **arguments):
     """Compare methods whose episodes have these returns, of 10 steps each; one row a seed."""
 
     def run_missing(jobs, **_):
+        episodes = {job.name: returns[job.method][job.seed].tolist() for job in jobs}
         return [
-            job.result([10] * 12, returns[job.method][job.seed].tolist(), [True] * 12, 120, {"report": None}) for job in jobs
+            job.result([10] * len(of), of, [True] * len(of), 120, {"report": None})
+            for job in jobs
+            if (of := episodes[job.name])
         ]
 
     monkeypatch.setattr(module, "run_missing", run_missing)
     n = len(next(iter(returns.values())))
     # The learner itself is not asked.
-    return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
 
 
 def around(mean, n_runs, spread=1.0):
@@ -129,15 +140,104 @@ def test_with_several_methods_more_seeds_are_asked_for(monkeypatch):
 def test_several_methods_are_corrected_for_their_number(monkeypatch):
     runs = {"none": around(-60.0, 5), "one": around(-50.0, 5), "two": around(-40.0, 5)}
     found = made_up(monkeypatch, runs, threshold=-10)
-    assert "steps to a return of -10 | one | inf | inf |" in found.table
+    assert "steps to a return of -10 | one | not reached | not reached | — |" in found.table
+    assert "inf" not in str(found) and "nan" not in str(found)
     smallest = 2 / 252
     assert found.p_values == pytest.approx({"one": 2 * smallest, "two": 2 * smallest})
     assert found.sentence.count("transfer helped") == 2
+    assert found.sentence.count("(p = 0.016, by Holm's correction for 2 comparisons)") == 2
+    [mean_of_one, _] = [line for line in found.table.splitlines() if line.startswith("| mean return over steps")]
+    assert mean_of_one.endswith("| 0.0079 | 0.016 |")
     assert [line.split(" | ")[1] for line in found.table.splitlines()[2:]] == ["one"] * 5 + ["two"] * 5
 
 
+def test_few_seeds_and_few_episodes_are_warned_of(monkeypatch):
+    few = made_up(monkeypatch, {"none": around(-60.0, 4)[:, :9], "COMBREL": around(-5.0, 4)[:, :9]})
+    assert [warning[:30] for warning in few.warnings] == ["Only 4 seeds: runs differ more", "The shortest run has only 9 ep"]
+    assert all(warning in str(few) for warning in few.warnings)
+    assert not made_up(monkeypatch, {"none": around(-60.0, 5), "COMBREL": around(-5.0, 5)}).warnings
+
+
+def test_rows_that_say_the_same_are_one(monkeypatch):
+    """With so few episodes the first are the last, and these all there are."""
+    found = made_up(monkeypatch, {"none": around(-60.0, 5)[:, :3], "COMBREL": around(-5.0, 5)[:, :3]})
+    _, rows = found.rows
+    assert rows[0][0] == "jumpstart, asymptotic performance, mean return over steps"
+    assert len({row[1:] for row in rows}) == len(rows) == 3
+
+
+def test_a_random_mapping_that_does_as_well_is_mentioned(monkeypatch):
+    runs = {"none": around(-60.0, 5), "COMBREL": around(-50.0, 5), "random mapping": around(-40.0, 5)}
+    reports = (TransferReport("COMBREL()", "prior", mappings=(MappingReport("go", "went"),)),)
+    found = replace(made_up(monkeypatch, runs), reports={"COMBREL": reports})
+    assert "transfer helped" in found.sentences["COMBREL"] and "But random mapping did as well" in found.sentences["COMBREL"]
+    assert "But" not in found.sentences["random mapping"]
+    better = replace(made_up(monkeypatch, {**runs, "COMBREL": around(-30.0, 5)}), reports={"COMBREL": reports})
+    assert "But" not in better.sentence
+
+
+def controls_of(methods, **learner):
+    """The control that is added to some methods, each bound as ``compare`` finds it."""
+    bound = {name: FittedRMax(Walk(), transfer=each, seed=0, **LEARNER | learner).transfer for name, each in methods.items()}
+    return random_control(bound)
+
+
+def test_a_random_mapping_of_the_same_set_is_the_control():
+    prior, instances = COMBREL(walk_source(), "signed_factored"), COMBREL(walk_source(), "surjective", breadth=0.2)
+    control = controls_of({"none": None, "COMBREL": prior}, degree=1)
+    assert (control.mapping, control.mappings, control.use) == ("random", "signed_factored", "prior")
+    control = controls_of({"none": None, "given": METHODS["TIMBREL"], "COMBREL": instances})
+    assert (control.mapping, control.mappings, control.use, control.breadth) == ("random", "surjective", "instances", 0.2)
+    # Of a mapping that is given, the default set.
+    control = controls_of(METHODS)
+    assert (control.mapping, control.mappings, control.use) == ("random", "injective", "instances")
+
+
+@pytest.mark.parametrize(
+    "methods",
+    [
+        {"none": None, "mine": Mine()},
+        {"none": None, "COMBREL": COMBREL(walk_source()), "any": TIMBREL(walk_source(), "random")},
+        {"random mapping": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1))), "COMBREL": COMBREL(walk_source())},
+    ],
+)
+def test_there_is_no_control_where_nothing_is_mapped_or_there_is_one(methods):
+    assert controls_of(methods) is None
+
+
+def test_the_control_is_run_unless_it_is_left_out(monkeypatch):
+    carried_out = []
+
+    def run_missing(jobs, **_):
+        carried_out.extend(jobs)
+        return [job.result([10] * 12, [-1.0] * 12, [True] * 12, 120, {"report": None}) for job in jobs]
+
+    monkeypatch.setattr(module, "run_missing", run_missing)
+    for controls, names in ((True, ["none", "TIMBREL", "random mapping"]), (False, ["none", "TIMBREL"])):
+        carried_out.clear()
+        found = compare(Walk, METHODS, seeds=[7, 8, 9, 10, 11], steps=120, controls=controls, **LEARNER)
+        assert list(found.curves) == names
+        assert [job.seed for job in carried_out] == [7, 8, 9, 10, 11] * len(names)
+        assert [job.seed for job in carried_out if job.is_shown] == [7] * len(names)
+
+
+def test_a_control_that_cannot_be_made_is_warned_of(monkeypatch):
+    def refuse(self, *_):
+        if self.mapping == "random":
+            raise ValueError("too many variables")
+
+    monkeypatch.setattr(TIMBREL, "_replace_names", refuse)
+    monkeypatch.setattr(
+        module,
+        "run_missing",
+        lambda jobs, **_: [job.result([10] * 12, [-1.0] * 12, [True] * 12, 120, {"report": None}) for job in jobs],
+    )
+    with pytest.warns(UserWarning, match=r"there is no control \(random mapping: too many variables\): controls=False"):
+        compare(Walk, {"none": None, "COMBREL": COMBREL(walk_source())}, seeds=5, steps=120, **LEARNER)
+
+
 SHORT = InterTaskMapping((0,), (0, 1))
-GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
+GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, **LEARNER)
 
 
 @pytest.mark.parametrize(
@@ -163,10 +263,8 @@ GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, learner=LEARNER)
         (dict(steps=0), "steps must be a whole number"),
         (dict(n_jobs=0), "n_jobs must be a whole number"),
         (dict(threshold=np.inf), "threshold must be a finite number"),
-        (dict(learner=3), "learner must be a dict of arguments of FittedRMax"),
-        (dict(learner={"breadth": 1}), "learner must have arguments out of .*model_breadth.*, got 'breadth'"),
-        (dict(learner={"seed": 1}), "learner must have arguments out of .*, got 'seed'"),
-        (dict(learner={"model_breadth": -1}), "none: model_breadth must be"),
+        (dict(controls="no"), "controls must be"),
+        (dict(model_breadth=-1), "none: model_breadth must be"),
     ],
 )
 def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
@@ -176,6 +274,22 @@ def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
     monkeypatch.setattr(module, "run_missing", refuse)
     with pytest.raises(ValueError, match=message):
         compare(**{**GOOD, **change})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (dict(model_bread=1), "got 'model_bread'; did you mean 'model_breadth'"),
+        (dict(seed=1), "got 'seed'; did you mean 'seeds'"),
+        (
+            dict(learner={"gamma": 0.9}),
+            "those of FittedRMax, such as gamma=0.99, got 'learner'; FittedRMax has .*model_breadth",
+        ),
+    ],
+)
+def test_arguments_that_the_learner_does_not_have_are_refused_with_one_that_it_has(wrong, message):
+    with pytest.raises(TypeError, match=message):
+        compare(**GOOD, **wrong)
 
 
 def test_runs_that_cannot_begin_or_end_are_named():
@@ -188,7 +302,7 @@ def test_runs_that_cannot_begin_or_end_are_named():
 
 @pytest.mark.long
 def test_in_processes_the_results_are_the_same(result):
-    here = compare(Walk, METHODS, seeds=[3, 1], steps=150, learner=LEARNER, n_jobs=2)
+    here = compare(Walk, METHODS, seeds=[3, 1], steps=150, controls=False, n_jobs=2, **LEARNER)
     assert str(here) == str(result)
     assert list(map(str, here.reports["TIMBREL"])) == list(map(str, result.reports["TIMBREL"]))
 
@@ -201,12 +315,13 @@ class Breaking(Walk):
 
 
 def test_an_error_within_a_run_is_named_with_its_run_and_traceback():
-    with pytest.raises(JobError, match=r"(?s)^none, seed 0: OSError: broken \(3 other runs failed, too\)\nTraceback.*step"):
+    with pytest.raises(JobError, match=r"(?s)^none, seed 0: OSError: broken \(5 other runs failed, too\)\nTraceback.*step"):
         compare(**{**GOOD, "env": Breaking})
 
 
 def test_methods_may_differ_in_case_and_punctuation_alone():
-    found = compare(Walk, dict.fromkeys(["none", "None"]), seeds=1, steps=30, baseline="none")
+    with pytest.warns(UserWarning, match="Only 1 seed:"):
+        found = compare(Walk, dict.fromkeys(["none", "None"]), seeds=1, steps=30, baseline="none")
     assert list(found.curves) == ["none", "None"]
 
 

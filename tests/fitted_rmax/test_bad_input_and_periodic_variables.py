@@ -15,8 +15,8 @@ from stable_baselines3.dqn.policies import DQNPolicy
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
+from sb3_combrel.pages.plane import plane_through
 from sb3_combrel.planning.grid import StateGrid
-from sb3_combrel.tensorboard.plane import plane_through
 
 
 class Scripted(gym.Env):

@@ -37,8 +37,9 @@ def drawn():
 def blank_pictures(request, monkeypatch):
     """Most of the time of a picture is spent on drawing what was read from the agent."""
     if "drawn" not in request.fixturenames:
-        blank = np.zeros((20, 350, 3), dtype=np.uint8)
-        monkeypatch.setattr("sb3_combrel.tensorboard.pictures._pixels", lambda figure: blank)
+        blank = np.zeros((20, 640, 3), dtype=np.uint8)
+        monkeypatch.setattr("sb3_combrel.tensorboard.pictures._pixels", lambda figure, dpi: blank)
+        monkeypatch.setattr("sb3_combrel.pages.page.data_address", lambda figure: "data:,")
 
 
 @pytest.fixture

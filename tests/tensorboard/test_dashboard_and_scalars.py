@@ -3,6 +3,7 @@
 import functools
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_combrel import COMBREL, SourceInstances
 from sb3_combrel.callbacks import DashboardCallback
+from sb3_combrel.runs.episodes import EpisodeRecorder
 from sb3_combrel.tensorboard.readings import bellman_residual, mean_compliance, spread
 from sb3_combrel.transfer.instances.bandwidths import default_bandwidths
 
@@ -250,21 +252,54 @@ def test_scalars_stay_within_their_share_of_the_time(tmp_path, monkeypatch, cloc
 @pytest.mark.parametrize("method", ["none", "COMBREL"])
 def test_between_logs_there_are_points_of_all_that_a_log_has(method, transfers, tmp_path):
     """With few and long episodes, too."""
+    recorder = EpisodeRecorder()
     walker(tmp_path, transfers[method], NamedWalk(limit=10**6, start=-1.0), max_value=0.0).learn(
-        300, DashboardCallback(scalar_share=1.0), log_interval=10**6
+        300, [recorder, DashboardCallback(scalar_share=1.0)], log_interval=10**6
     )
     found = events(run_folder(tmp_path))
     steps = {tag: [event.step for event in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
-    assert not any(tag.startswith("rollout/") for tag in steps)
+    assert steps["rollout/ep_rew_mean"] == steps["rollout/ep_len_mean"] == np.cumsum(recorder.episodes.steps).tolist()
     assert len(steps["model/known"]) >= 100 and steps["model/known"][-1] == 300
     assert steps["planner/residual"] == steps["planner/sweeps"] == steps["model/known"]
     assert ("transfer/pairs_modelled" in steps) == (method != "none")
 
 
-def test_no_step_has_two_points(tmp_path):
-    walker(tmp_path).learn(200, DashboardCallback(scalar_share=1.0), log_interval=1)
-    steps = [event.step for event in events(run_folder(tmp_path)).Scalars("planner/residual")]
+@pytest.mark.parametrize("log_interval", [1, 3])
+def test_no_step_has_two_points_and_each_episode_has_one(log_interval, tmp_path):
+    recorder = EpisodeRecorder()
+    walker(tmp_path).learn(200, [recorder, DashboardCallback(scalar_share=1.0)], log_interval=log_interval)
+    found = events(run_folder(tmp_path))
+    steps = [event.step for event in found.Scalars("planner/residual")]
     assert len(steps) > 100 and len(set(steps)) == len(steps) and steps == sorted(steps)
+    returns = recorder.episodes.returns
+    means = [returns[: k + 1].mean() for k in range(len(returns))]
+    assert [event.step for event in found.Scalars("rollout/ep_rew_mean")] == np.cumsum(recorder.episodes.steps).tolist()
+    assert [event.value for event in found.Scalars("rollout/ep_rew_mean")] == pytest.approx(means, rel=1e-6)
+
+
+def test_evidence_and_bound_of_a_source_as_prior_are_scalars(transfers, tmp_path):
+    def plainly(model):
+        prior = model.policy.transfer.source_prior
+        bound = prior.value_bound()
+        strengths = [np.exp(np.mean(np.log(each))) for each in prior.evidence.strength]
+        names = [f"evidence/{name}" for name in NamedWalk.action_names]
+        of_bound = {} if bound is None else {"transfer/value_bound": sum(bound) / len(bound)}
+        return dict(zip(names, strengths, strict=True)) | of_bound
+
+    witness = Witness(plainly)
+    prior = replace(transfers["COMBREL"], use="prior")
+    walker(tmp_path, prior).learn(150, [witness, DashboardCallback(scalar_share=1.0)], log_interval=1)
+    found = events(run_folder(tmp_path))
+    tags = set().union(*witness.seen.values())
+    assert len(tags) == 3 and "transfer/value_bound" in tags
+    for tag in tags:
+        expected = {step: seen[tag] for step, seen in witness.seen.items() if tag in seen}
+        assert scalars(found, tag, witness.seen) == pytest.approx(expected, rel=1e-5), tag
+
+
+def test_by_default_there_are_several_sets_of_pictures_in_a_run(tmp_path):
+    walker(tmp_path).learn(160, DashboardCallback())
+    assert image_steps(tmp_path) == list(range(20, 161, 20))
 
 
 def test_planning_takes_a_share_of_the_time(tmp_path):

@@ -154,6 +154,7 @@ class InstanceTransfer:
             mappings=tuple(map(self._mapping_report, range(self.task.n_actions))),
             error=self.errors.error(),
             statistics=statistics,
+            source_actions=tuple(self.candidates.source_action_names()),
             **self.errors.report_fields(self.check.evidence),
         )
 

@@ -27,6 +27,7 @@ from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
 from sb3_combrel.transfer.instances.relevance import renew_relevance
 from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
 from sb3_combrel.transfer.instances.translation import Translator
+from sb3_combrel.transfer.outcome_evidence import RegionErrors
 from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
@@ -274,6 +275,12 @@ class MappingTransfer(Transfer):
     def mapping_counts(self) -> list[tuple[str, int]]:
         """Return how often each candidate's instances were used, the most used first, by name."""
         return [(self.describe(candidate), n) for candidate, n in Counter(self.uses()).most_common()]
+
+    @property
+    def region_errors(self) -> RegionErrors:
+        """Where predictions of the source were right and wrong, once bound."""
+        self._check_bound("region_errors")
+        return self._source_use.errors
 
     def statistics(self) -> dict[str, float]:
         return self._source_use.statistics()

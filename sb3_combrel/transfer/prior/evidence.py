@@ -77,6 +77,11 @@ class PriorEvidence:
         """The mean of :attr:`strength`."""
         return float(self.strength.mean())
 
+    def strength_of_actions(self) -> np.ndarray:
+        """The geometric mean of :attr:`strength` over variables, shape (n_actions,)."""
+        with np.errstate(divide="ignore"):  # a source that is surely wrong may count as nothing at all
+            return np.asarray(np.exp(np.log(self.strength).mean(axis=1)))
+
     def renew(self) -> None:
         """Renew :attr:`strength`."""
         posterior = PROBABILITIES * np.exp(self.likelihood - self.likelihood.max(axis=2, keepdims=True))

@@ -89,6 +89,14 @@ class PriorCandidates:
         words = (f"{self._action_name(copy, used)} on {variables_of(self.mapping(copy))}" for copy, used in moves)
         return ", ".join(words) if moves else "nothing"
 
+    def describe_moves(self, candidate: int) -> str:
+        """Say what the target action of a candidate is made of, as :meth:`describe_action` does."""
+        return self._describe_moves(self._made_of(candidate)[1], describe_copy)
+
+    def names(self) -> list[str]:
+        """Return what :meth:`describe_moves` says of all candidates, each once, in the order in which they came up."""
+        return list(dict.fromkeys(self.describe_moves(number) for number in range(len(self._listed))))
+
     def describe_copies(self, choice: Choice) -> str:
         """Name the copies of a choice: "(x, vx) and (y, vy)", or "no copy at all"."""
         copies = dict.fromkeys(choice.copies[choice.copies >= 0].tolist())

@@ -17,6 +17,7 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
+from sb3_combrel.transfer.prior.prior_history import PriorHistory
 from sb3_combrel.transfer.prior.value_bound import ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
@@ -73,6 +74,8 @@ class SourcePrior:
         self.evidence = PriorEvidence(task.n_actions, task.n_variables)
         #: Errors of the mapping in use, where the source has data.
         self.errors = RegionErrors(task)
+        #: The evidence over time.
+        self.history = PriorHistory(task.n_actions)
         self._own: OwnPrediction | None = None
         #: Number of the environment that the transitions observed now come from.
         self.environment = 0
@@ -220,6 +223,7 @@ class SourcePrior:
             self.evidence.renew()
             self.explains = self._explains()
             self.version += 1
+        self.history.note(self)
 
     def _set_choice(self, choice: Choice) -> None:
         self.choice = choice
@@ -308,6 +312,7 @@ class SourcePrior:
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": self.errors.sums.ravel().copy(),
             "prior_uses": self.candidates.get_state(),
+            "prior_history": self.history.get_state(),
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
 
@@ -336,3 +341,4 @@ class SourcePrior:
             self._episodes[int(row[0])].append((row[1 : d + 1].copy(), float(row[d + 1]), row[d + 2 :].copy()))
         self.errors.sums.ravel()[:] = state["prior_errors"]
         self.candidates.set_state(state["prior_uses"])
+        self.history.set_state(state["prior_history"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -10,10 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.planning.grid import StateGrid
 
 VariablePair = tuple[int | str, int | str]
+#: How the velocity of a variable "x" is called, in lower case without blanks and underscores.
+VELOCITIES = ("v{}", "{}v", "d{}", "{}dot", "dot{}", "vel{}", "{}vel", "velocity{}", "{}velocity", "velocityof{}")
+#: Words in names of variables, and those in the names of their velocities.
+WORDS = (("position", "velocity"), ("angle", "angularvelocity"), ("angle", "velocity"))
 
 
 class Plane(NamedTuple):
@@ -36,16 +40,20 @@ def check_matplotlib(otherwise: str) -> None:
         raise ModuleNotFoundError(f"pictures need matplotlib: install it, or {otherwise}", name="matplotlib")
 
 
-def planes_of(agent: FittedRMaxAgent, variables: Sequence[VariablePair] | None, at: ArrayLike | None) -> list[Plane]:
+def planes_of(
+    grid: StateGrid,
+    scaling: StateScaling,
+    names: Sequence[str],
+    variables: Sequence[VariablePair] | None,
+    at: ArrayLike | None = None,
+) -> list[Plane]:
     """Find the planes over which pictures are drawn; for the arguments see :func:`~sb3_combrel.tensorboard.explain.explain`.
 
     :raises ValueError: if they do not fit the task
     """
-    task = agent.task
-    if at is not None and np.shape(at) != (task.n_variables,):
-        raise ValueError(f"at must be {task.n_variables} numbers, one a state variable, got {at!r}")
-    names = task.state_names
-    return [plane_through(agent.grid, task.scaling, names, pair, at) for pair in numbered(variables, names)]
+    if at is not None and np.shape(at) != (len(names),):
+        raise ValueError(f"at must be {len(names)} numbers, one a state variable, got {at!r}")
+    return [plane_through(grid, scaling, names, pair, at) for pair in numbered(variables, names)]
 
 
 def plane_through(
@@ -88,17 +96,40 @@ def _edges(grid: StateGrid, scaling: StateScaling, variable: int) -> tuple[float
 
 
 def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> list[tuple[int, int]]:
-    """Turn pairs of variables, by name or number, into pairs of numbers; None is the first two."""
+    """Turn pairs of variables, by name or number, into pairs of numbers; None is a variable beside its own velocity.
+
+    :raises ValueError: if a pair is none of two different variables, or names one that there is not
+    """
     if variables is None:
-        return [(0, min(1, len(names) - 1))]
+        return [default_pair(names)]
     number: dict[Any, int] = {**{name: k for k, name in enumerate(names)}, **{k: k for k in range(len(names))}}
     pairs = []
     for pair in variables:
-        found = () if isinstance(pair, str) else tuple(number.get(each, -1) for each in pair)
+        given = [] if isinstance(pair, str) else list(pair)
+        found = tuple(number.get(each, -1) for each in given)
         if len(found) != 2 or -1 in found or (found[0] == found[1] and len(names) > 1):
             raise ValueError(
                 f"variables must be pairs of two different state variables, by numbers below {len(names)} or names out of "
-                f"{', '.join(names)}, such as [({names[0]!r}, {names[-1]!r})], got {pair!r}"
+                f"{', '.join(names)}, such as [({names[0]!r}, {names[-1]!r})], got {pair!r}{_meant(given, names)}"
             )
         pairs.append((found[0], found[1]))
     return pairs
+
+
+def default_pair(names: Sequence[str]) -> tuple[int, int]:
+    """Find a variable and its own velocity, by their names; else the first two; or the only one, twice."""
+    plain = [name.lower().replace(" ", "").replace("_", "") for name in names]
+    for k, name in enumerate(plain):
+        called = [pattern.format(name) for pattern in VELOCITIES]
+        called += [name.replace(word, other) for word, other in WORDS if word in name]
+        for velocity in called:
+            if velocity in plain:
+                return k, plain.index(velocity)
+    return 0, min(1, len(names) - 1)
+
+
+def _meant(given: Sequence[int | str], names: Sequence[str]) -> str:
+    """Suggest a name for the first that is unknown."""
+    unknown = [each for each in given if isinstance(each, str) and each not in names]
+    near = difflib.get_close_matches(unknown[0], names, n=1) if unknown else []
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,38 @@
+"""The control that a comparison adds by itself: a mapping drawn at random from the set that a method chooses from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
+from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.methods.timbrel import TIMBREL
+
+#: Its name among the methods.
+CONTROL = "random mapping"
+# What the control has in common with the method that it controls for.
+_SAME = ("use", "source_breadth", "transfer_terminals", "breadth", "breadth_decay")
+
+
+def random_control(in_use: Mapping[str, Transfer | None]) -> TIMBREL | None:
+    """Make the control of the first method that chooses among mappings, or of the first to which one is given.
+
+    :param in_use: the methods by name, each bound to the task
+    :return: None if no method transfers through mappings, or one of them is such a control
+    """
+    if CONTROL in in_use or any(isinstance(each, TIMBREL) and each.mapping == "random" for each in in_use.values()):
+        return None
+    with_mappings = [each for each in in_use.values() if isinstance(each, MappingTransfer)]
+    if not with_mappings:
+        return None
+    choosing = [each for each in with_mappings if not _is_given(each)]
+    method = (choosing or with_mappings)[0]
+    # Where the mapping is given there is no set to draw from but the default one.
+    default = "factored" if method.use == "prior" else "injective"
+    same = {name: getattr(method, name) for name in _SAME}
+    return TIMBREL(method.source, "random", mappings=method.mappings if choosing else default, **same)
+
+
+def _is_given(method: MappingTransfer) -> bool:
+    return isinstance(method, TIMBREL) or isinstance(method.mappings, FactoredMapping)

@@ -1,0 +1,63 @@
+"""The evidence for a source over time: one point whenever it is renewed, between which nothing of it changes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_combrel.transfer.report import EvidencePoint
+
+if TYPE_CHECKING:
+    from sb3_combrel.transfer.prior.source_prior import SourcePrior
+
+# Columns before those of the target actions: steps, error (-1 for none: saved models have no NaN), excess, whether bounded.
+N_FIRST = 4
+
+
+class PriorHistory:
+    """Rows of steps, error, excess, whether values are bounded, and by target action the strength and the candidate.
+
+    Renewals come ever more rarely, so the rows stay few.
+
+    :param n_actions: target actions
+    """
+
+    def __init__(self, n_actions: int):
+        self._n_actions = n_actions
+        self._rows: list[np.ndarray] = []
+
+    def note(self, prior: SourcePrior) -> None:
+        """Add what is believed now."""
+        self._rows.append(self._row(prior))
+
+    def points(self, prior: SourcePrior) -> tuple[EvidencePoint, ...]:
+        """Return all points by name, the last of them of now."""
+        rows = [row for row in self._rows if row[0] < prior.n_observed]
+        return tuple(self._point(prior, row) for row in [*rows, self._row(prior)])
+
+    def _row(self, prior: SourcePrior) -> np.ndarray:
+        error = prior.error()
+        first = prior.n_observed, -1.0 if np.isnan(error) else error, prior.excess, prior.value_bound() is not None
+        return np.concatenate([first, prior.evidence.strength_of_actions(), prior.choices_by_action()], dtype=np.float64)
+
+    def _point(self, prior: SourcePrior, row: np.ndarray) -> EvidencePoint:
+        step, error, exceeded, bounded = row[:N_FIRST].tolist()
+        strengths, candidates = row[N_FIRST:].reshape(2, self._n_actions)
+        describe = prior.candidates.describe_moves
+        return EvidencePoint(
+            step=int(step),
+            error=np.nan if error < 0.0 else error,
+            exceeded=exceeded,
+            bounds_values=bool(bounded),
+            strengths=tuple(strengths.tolist()),
+            mappings=tuple("nothing" if number < 0 else describe(int(number)) for number in candidates),
+        )
+
+    def get_state(self) -> np.ndarray:
+        """Return the rows, float64, shape (n, 4 + 2 * n_actions)."""
+        return np.array(self._rows, dtype=np.float64).reshape(-1, N_FIRST + 2 * self._n_actions)
+
+    def set_state(self, rows: np.ndarray) -> None:
+        """Take over what :meth:`get_state` returned."""
+        self._rows = list(rows.copy())
