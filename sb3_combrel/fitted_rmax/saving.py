@@ -23,6 +23,7 @@ from sb3_combrel.common.serialisation import damage_text, to_plain
 from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.fitted_rmax.unpickling import check_pickles
 from sb3_combrel.transfer.by_name import describe_transfer
 
 # The digits of real numbers hardly compress: higher levels take longer and gain a hundredth.
@@ -106,8 +107,10 @@ class SavedAlgorithm(BaseAlgorithm):
         if "seed" in kwargs:
             kwargs["_generator_state"] = None
         with _naming(path):
+            archive = _read(path)
+            check_pickles(archive, {**(custom_objects or {})})
             return super().load(
-                _read(path), environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
+                archive, environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
             )
 
     def set_parameters(
