@@ -16,6 +16,7 @@ from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.optimism import RewardRange
+from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
@@ -111,6 +112,7 @@ class FittedRMaxAgent:
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
         self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
+        self.promises = Promises(self.grid.arrays, self.task.n_actions)
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
         if self.transfer is not None:
@@ -143,7 +145,7 @@ class FittedRMaxAgent:
             if not explore:
                 return self._exploit(state)
             decided = self._decided_by_transfer(state, environment) if self._transfer_decides else None
-            return self._explore(state) if decided is None else decided
+            return self._explore(state, environment) if decided is None else decided
 
     def _decided_by_transfer(self, state: np.ndarray, environment: int) -> int | None:
         """The action that the transfer method decides on; None if it leaves it to the agent."""
@@ -158,7 +160,7 @@ class FittedRMaxAgent:
             f"got {action!r}"
         )
 
-    def _explore(self, state: np.ndarray) -> int:
+    def _explore(self, state: np.ndarray, environment: int) -> int:
         prediction, given = self.model.predict_at(state)
         if given is not None and self.transfer is not None:
             self.transfer.note_use(given)
@@ -166,9 +168,10 @@ class FittedRMaxAgent:
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())
             best = int(ties[self.rng.integers(len(ties))])
-        if not prediction.modelled[best]:
+        chosen = self.promises.choose(environment, state, float(self._q.q.max()), best, self.rng)
+        if not prediction.modelled[chosen]:
             self.n_optimistic_actions += 1
-        return best
+        return chosen
 
     def _exploit(self, state: np.ndarray) -> int:
         """The best of what is known: nobody has seen what the others do."""
@@ -220,6 +223,7 @@ class FittedRMaxAgent:
             self._widen(reward)
             if self.transfer is not None:
                 self.transfer.environment = environment
+            self.promises.pay(environment, reward, self.mdp.gamma)
             self._take_in(state, action, reward, next_state, terminated)
             self._plan(SWEEPS_A_STEP)
 
@@ -260,6 +264,7 @@ class FittedRMaxAgent:
         """
         with self._lock:
             self.rewards.n_truncated += bool(truncated)
+            self.promises.end_episode(environment)
             if self.transfer is not None:
                 self.transfer.environment = environment
                 self.transfer.end_episode(truncated)
@@ -352,6 +357,7 @@ class FittedRMaxAgent:
                 "values": self.planner.values.copy(),
                 "lowest_value": np.array([self.planner.bounds[0]]),
                 "rewards": self.rewards.get_state(),
+                "promises": self.promises.rows(),
             }
 
     def set_state(self, state: dict[str, np.ndarray], scaling: StateScaling | None = None) -> None:
@@ -369,6 +375,7 @@ class FittedRMaxAgent:
             if self.transfer is not None and self.transfer.use == "prior":
                 self.planner.set_upper(self.transfer.value_bound())
             self.planner.restore(state["values"])
+            self.promises.restore(state["promises"])
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

@@ -1,0 +1,86 @@
+"""Whether values keep their promise where the agent stays, and what it does where they do not."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+
+from sb3_combrel.common.constants import KEPT, MAX_MODEL_STEPS
+from sb3_combrel.planning.grid import GridArrays
+
+
+@dataclass
+class Stay:
+    """A stay of one environment within a cell of the grid, since the value was last compared."""
+
+    state: np.ndarray  # where it began, unit coordinates, shape (n_variables,)
+    value: float  # of the state at the last comparison
+    paid: float = 0.0  # discounted rewards since
+    discount: float = 1.0
+    n_steps: int = 0
+    held: int = -1  # the action that is held until the cell is left; -1 for none
+
+
+class Promises:
+    """Leads the agent away from where interpolated values promise what nobody can have.
+
+    A row of the plan leaves its cell of the grid within ``MAX_MODEL_STEPS`` steps. An agent that has not moved by a cell in
+    so many steps has either been paid for staying, or its value has risen by what the steps have cost; if more than a part
+    of that is missing (``KEPT``), values between the grid points are too high here, and the agent would stay for ever. It
+    then holds an action, drawn at random, until the cell is left, and another after as many steps more.
+
+    :param grid: of the plan
+    :param n_actions: number of actions
+    """
+
+    def __init__(self, grid: GridArrays, n_actions: int):
+        self._grid, self._n_actions = grid, n_actions
+        #: By environment.
+        self.stays: dict[int, Stay] = {}
+
+    def choose(self, environment: int, state: np.ndarray, value: float, best: int, rng: np.random.Generator) -> int:
+        """Return the best action, or the one that is held.
+
+        :param state: unit coordinates, shape (n_variables,); ``value``: the largest of its action values
+        """
+        stay = self.stays.get(environment)
+        if stay is None or self._has_left(state, stay.state):
+            self.stays[environment] = Stay(state.copy(), value)
+            return best
+        if stay.n_steps >= MAX_MODEL_STEPS:
+            missing = stay.value - stay.paid - stay.discount * value
+            broken = stay.held >= 0 or missing > KEPT * abs(stay.paid)
+            held = int(rng.integers(self._n_actions)) if broken else -1
+            stay = self.stays[environment] = Stay(stay.state if broken else state.copy(), value, held=held)
+        return best if stay.held < 0 else stay.held
+
+    def pay(self, environment: int, reward: float, gamma: float) -> None:
+        """Take in the reward of a step."""
+        if environment in self.stays:
+            stay = self.stays[environment]
+            stay.paid += stay.discount * reward
+            stay.discount *= gamma
+            stay.n_steps += 1
+
+    def end_episode(self, environment: int) -> None:
+        """Forget a stay."""
+        self.stays.pop(environment, None)
+
+    def _has_left(self, state: np.ndarray, before: np.ndarray) -> bool:
+        apart = np.abs(state - before)
+        apart = np.where(self._grid.periodic, np.minimum(apart, 1.0 - apart), apart)
+        return bool((apart * self._grid.cells >= 1.0).any())
+
+    def rows(self) -> np.ndarray:
+        """The stays, float64, shape (n_environments, n_variables + 6), for :meth:`restore`."""
+        rows = [[environment, *stay.state, *astuple(stay)[1:]] for environment, stay in self.stays.items()]
+        return np.array(rows, dtype=np.float64).reshape(-1, len(self._grid.cells) + 6)
+
+    def restore(self, rows: np.ndarray) -> None:
+        """Take over what :meth:`rows` returned, whatever a file says."""
+        self.stays.clear()
+        for row in rows:
+            environment, state, (value, paid, discount, n_steps, held) = int(row[0]), row[1:-5].copy(), row[-5:].tolist()
+            action = int(np.clip(held, -1, self._n_actions - 1))
+            self.stays[environment] = Stay(state, value, paid, discount, int(n_steps), action)
