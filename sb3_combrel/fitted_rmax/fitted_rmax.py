@@ -58,6 +58,8 @@ class FittedRMax(PastData):
       every step spread over the grid.
     - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``).
     - A time limit is not a terminal state.
+    - Where an agent stays although its values promise otherwise it holds an action drawn at random
+      (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
     transferred instances; ``deterministic=False`` takes optimistic ones first, as in learning.
