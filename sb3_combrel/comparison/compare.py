@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.common.checks import as_count, check_boolean, check_count, check_finite
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.comparison.controls import CONTROL, random_control
 from sb3_combrel.comparison.result import CompareResult, evaluate
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
@@ -192,10 +192,9 @@ def check_learner(learner: Mapping[str, Any]) -> None:
     own = [each.name for each in inspect.signature(compare).parameters.values() if each.kind != each.VAR_KEYWORD]
     for name in learner:
         if name not in known:
-            near = difflib.get_close_matches(name, [*own, *known], n=1, cutoff=0.7)
-            meant = f"did you mean {near[0]!r}?" if near else f"FittedRMax has {', '.join(known)}"
+            meant = did_you_mean(name, [*own, *known]) or f"; FittedRMax has {', '.join(known)}"
             wanted = "compare takes its own arguments and those of FittedRMax, such as gamma=0.99"
-            raise TypeError(f"{wanted}, got {name!r}; {meant}")
+            raise TypeError(f"{wanted}, got {name!r}{meant}")
 
 
 def task_of(env: Any) -> Task:

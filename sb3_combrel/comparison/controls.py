@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.methods.combrel import DEFAULT_OF_PRIOR
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.methods.timbrel import TIMBREL
 
@@ -29,7 +30,7 @@ def random_control(in_use: Mapping[str, Transfer | None]) -> TIMBREL | None:
     choosing = [each for each in with_mappings if not _is_given(each)]
     method = (choosing or with_mappings)[0]
     # Where the mapping is given there is no set to draw from but the default one.
-    default = "factored" if method.use == "prior" else "injective"
+    default = DEFAULT_OF_PRIOR if method.use == "prior" else "injective"
     same = {name: getattr(method, name) for name in _SAME}
     return TIMBREL(method.source, "random", mappings=method.mappings if choosing else default, **same)
 

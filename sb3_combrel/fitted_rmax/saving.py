@@ -108,7 +108,7 @@ class SavedAlgorithm(BaseAlgorithm):
             kwargs["_generator_state"] = None
         with _naming(path):
             archive = _read(path)
-            check_pickles(archive, {**(custom_objects or {})})
+            check_pickles(archive, custom_objects or ())
             return super().load(
                 archive, environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.planning.grid import StateGrid
 
 VariablePair = tuple[int | str, int | str]
@@ -131,5 +131,4 @@ def default_pair(names: Sequence[str]) -> tuple[int, int]:
 def _meant(given: Sequence[int | str], names: Sequence[str]) -> str:
     """Suggest a name for the first that is unknown."""
     unknown = [each for each in given if isinstance(each, str) and each not in names]
-    near = difflib.get_close_matches(unknown[0], names, n=1) if unknown else []
-    return f"; did you mean {near[0]!r}?" if near else ""
+    return did_you_mean(unknown[0], names) if unknown else ""

@@ -55,6 +55,7 @@ class SourcePrior:
         first_renewal: int = FIRST_RENEWAL,
     ):
         self.task = task
+        self._periodic = np.array(task.periodic)
         self.sources = copies.sources
         self.copies = copies
         self.candidates = PriorCandidates(copies, task)
@@ -152,7 +153,7 @@ class SourcePrior:
         episode.append((state, reward, effect))
 
     def _leads_to(self, last: tuple[np.ndarray, float, np.ndarray], state: np.ndarray) -> bool:
-        apart = differences(last[0] + last[2], state, np.array(self.task.periodic))
+        apart = differences(last[0] + last[2], state, self._periodic)
         return float(np.abs(apart).max()) < SAME_STATE
 
     def _is_measured(self, number: Any) -> Any:
