@@ -27,13 +27,14 @@ from sb3_combrel.experiments.warm_up import warm_up
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder
 from sb3_combrel.runs.job import Job, Result, chosen_on_purpose, make_env
 from sb3_combrel.runs.runner import FOLDER, Backend, check_all_succeeded, prepare_folder, result_file, run_missing
+from sb3_combrel.runs.source_files import FOLDER as SOURCES
 from sb3_combrel.runs.source_files import load_or_learn
 
-SOURCE, TENSORBOARD = "source.npz", "tensorboard"
+TENSORBOARD = "tensorboard"
 FIGURE, TABLES, RESULTS = "learning_curves.png", "tables.md", "results.csv"
 MODEL, VIDEO = "car.zip", "car.mp4"
 #: All that the demonstration writes into its folder.
-OUTPUTS = (SOURCE, FOLDER, TENSORBOARD, FIGURE, TABLES, RESULTS, MODEL, VIDEO)
+OUTPUTS = (SOURCES, FOLDER, TENSORBOARD, FIGURE, TABLES, RESULTS, MODEL, VIDEO)
 MAPPINGS_SHOWN = 8
 FILMED = "COMBREL"
 
@@ -124,12 +125,13 @@ def run_demo(
         # By this folder the next line knows it as one of results, whatever else is in it.
         (output / FOLDER).mkdir()
     prepare_folder(output)
-    source = load_or_learn(output / SOURCE, mountain_car.learn_source, console)
+    files = [output / SOURCES / f"mountain_car_2d_seed{seed}.npz" for seed in range(n_seeds)]
+    sources = [load_or_learn(file, mountain_car.learn_source, seed, console) for seed, file in enumerate(files)]
     learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
     task: dict[str, Any] = {"env": mountain_car.TARGET_ID, "n_episodes": n_episodes, "max_episode_steps": max_episode_steps}
     runs = [
         DemoRun(group="", method=method, seed=seed, learner=learner, transfer=transfer, folder=output, **task)
-        for seed in range(n_seeds)
+        for seed, source in enumerate(sources)
         for method, transfer in mountain_car.methods(source).items()
     ]
     incomplete = [run for run in runs if not run.model_file.exists()]
@@ -270,7 +272,7 @@ def load_car(path: Path) -> FittedRMax:
 def _epilogue(output: Path, n_seeds: int, console: Console) -> None:
     what = {FIGURE: "steps to goal, episode by episode", TABLES: "the tables above", RESULTS: "every episode of every run"}
     what |= {VIDEO: "the trained car", MODEL: "the trained model: FittedRMax.load"}
-    what |= {SOURCE: "the source instances: SourceInstances.load", FOLDER: "result and model of each run"}
+    what |= {SOURCES: "source instances, a source for each seed: SourceInstances.load", FOLDER: "result and model of each run"}
     what |= {TENSORBOARD: "logs of each run"}
     console.print(f"\nEverything is in {output.resolve()}:", highlight=False, soft_wrap=True)
     for name, meaning in what.items():

@@ -58,7 +58,7 @@ class TestDemo:
         assert status == 0, written
         assert sorted(path.name for path in folder.iterdir()) == sorted(set(OUTPUTS) - {"car.mp4"})
         assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
-        assert len(SourceInstances.load(folder / "source.npz")) == 1000
+        assert len(SourceInstances.load(folder / "sources" / "mountain_car_2d_seed1.npz")) == 1000
         for method in METHODS:
             for seed in range(2):
                 assert list(folder.glob(f"tensorboard/{method}_seed{seed}_*/events.out.tfevents.*"))

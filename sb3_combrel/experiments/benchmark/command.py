@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 from rich.console import Console
@@ -67,7 +68,7 @@ def benchmark(
     if seeds < FEWEST_RUNS:
         console.print(few_runs(seeds), markup=False, soft_wrap=True)
     all_seeds = range(first_seed, first_seed + seeds)
-    sources, failed = prepare_sources(chosen_pairs, output, console)
+    sources, failed = prepare_sources(chosen_pairs, all_seeds, output, console)
     jobs = jobs_of(chosen_pairs, chosen_methods, all_seeds, sources)
     results = run_missing([job for job in jobs if job.group not in failed], output, backend, console)
     results += [job.result(error=failed[job.group]) for job in jobs if job.group in failed]
@@ -101,18 +102,22 @@ def methods_of(names: Sequence[str]) -> list[Method]:
 
 
 def prepare_sources(
-    pairs: Sequence[Pair], output: Path, console: Console
-) -> tuple[dict[str, tuple[SourceInstances, ...]], dict[str, str]]:
-    """Learn or load the sources of pairs: instances, () where they could not be learned, and why not, by the pair's name."""
-    found: dict[str, tuple[SourceInstances, ...]] = {}
-    failed = {}
-    for pair in pairs:
-        files = [output / FOLDER / file_of(source, pair) for source in pair.sources]
+    pairs: Sequence[Pair], seeds: Sequence[int], output: Path, console: Console
+) -> tuple[dict[tuple[str, int], tuple[SourceInstances, ...]], dict[str, str]]:
+    """Learn or load the sources of pairs, one of each for each seed.
+
+    :return: instances, by the pair's name and the seed, () where they could not be learned; and why not, by the pair's name
+    """
+    found: dict[tuple[str, int], tuple[SourceInstances, ...]] = {}
+    failed: dict[str, str] = {}
+    for pair, seed in product(pairs, seeds):
+        found[pair.name, seed] = ()
+        if pair.name in failed:
+            continue
         try:
-            rows = zip(files, pair.sources, strict=True)
-            found[pair.name] = tuple(load_or_learn(file, source.learn, console) for file, source in rows)
+            rows = [(output / FOLDER / file_of(source, pair, seed), source.learn) for source in pair.sources]
+            found[pair.name, seed] = tuple(load_or_learn(file, learn, seed, console) for file, learn in rows)
         except Exception as error:  # a third party's environment raises what it likes
-            found[pair.name] = ()
             failed[pair.name] = f"its source could not be learned: {type(error).__name__}: {' '.join(str(error).split())}"
             console.print(f"{pair.name}: {failed[pair.name]}", markup=False, soft_wrap=True)
     return found, failed
@@ -125,7 +130,7 @@ def _check_names(argument: str, chosen: Sequence[Pair] | Sequence[Method]) -> No
         raise ValueError(f"{argument} must be at least one, with different names, got {', '.join(names) or 'none'}")
 
 
-def file_of(source: Source, pair: Pair) -> str:
-    """Name of the file of a pair's source: another one if it is recorded in another way."""
+def file_of(source: Source, pair: Pair, seed: int) -> str:
+    """Name of the file of a pair's source, recorded with a seed: another one if it is recorded in another way."""
     how = json.dumps([__version__, pair.digest, described(source.learn)])
-    return f"{source.name}-{hashlib.sha256(how.encode()).hexdigest()[:8]}.npz"
+    return f"{source.name}-{hashlib.sha256(how.encode()).hexdigest()[:8]}_seed{seed}.npz"

@@ -25,7 +25,7 @@ LEARNERS: dict[str, Callable[..., SourceInstances]] = {
 
 
 def recorded(name: str, task: Task, learner: str = "fitted_rmax", n_instances: int = 1000, **arguments: Any) -> Source:
-    """Describe how a source is recorded: learned once for an output folder, with seed 0.
+    """Describe how a source is recorded: for each seed once in an output folder.
 
     :param name: of its file; sources of the same name must be recorded in the same way
     :param task: the environment, an id or a function that makes it
@@ -40,9 +40,9 @@ def recorded(name: str, task: Task, learner: str = "fitted_rmax", n_instances: i
     return Source(name, functools.partial(_learn, task, learner, n_instances, arguments))
 
 
-def _learn(task: Task, learner: str, n_instances: int, arguments: Mapping[str, Any]) -> SourceInstances:
+def _learn(task: Task, learner: str, n_instances: int, arguments: Mapping[str, Any], seed: int) -> SourceInstances:
     with closing(make_env(task)) as env, chosen_on_purpose():
-        return LEARNERS[learner](env, n_instances, seed=0, **arguments)
+        return LEARNERS[learner](env, n_instances, seed=seed, **arguments)
 
 
 @dataclass(frozen=True)

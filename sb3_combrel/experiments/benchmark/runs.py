@@ -116,9 +116,15 @@ def _mapping_steps(transfer: Any, result: Result, callbacks: list[BaseCallback])
 
 
 def jobs_of(
-    pairs: Sequence[Pair], methods: Sequence[Method], seeds: Sequence[int], sources: Mapping[str, tuple[SourceInstances, ...]]
+    pairs: Sequence[Pair],
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    sources: Mapping[tuple[str, int], tuple[SourceInstances, ...]],
 ) -> list[BenchmarkRun]:
-    """Make the runs, seed by seed, so that methods can be compared before all are complete; those of equal methods once."""
+    """Make the runs, seed by seed, so that methods can be compared before all are complete; those of equal methods once.
+
+    :param sources: instances of the sources, by the pair's name and the seed
+    """
     by_name = {method.name: method for method in methods}
     jobs: dict[tuple[str, str, int], BenchmarkRun] = {}
     for seed in seeds:
@@ -126,7 +132,7 @@ def jobs_of(
             for method in methods:
                 name = run_as(method, methods, pair)
                 task: dict[str, Any] = {"env": pair.target, "n_steps": pair.n_steps, "n_episodes": pair.n_episodes}
-                own: dict[str, Any] = {"pair": pair, "of_method": by_name[name], "sources": sources[pair.name]}
+                own: dict[str, Any] = {"pair": pair, "of_method": by_name[name], "sources": sources[pair.name, seed]}
                 job = BenchmarkRun(group=pair.name, method=name, seed=seed, learner=pair.learner, **task, **own)
                 jobs.setdefault((pair.name, name, seed), job)
     return list(jobs.values())

@@ -68,16 +68,16 @@ def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
     """Learn the source tasks of a domain, or load what was learned before from the output folder."""
 
     def instances_of(each: Domain) -> SourceInstances:
-        return load_or_learn(output / FOLDER / f"{each.name}.npz", lambda: each.learn_source(SOURCE_SEED), console)
+        return load_or_learn(output / FOLDER / f"{each.name}.npz", each.learn_source, SOURCE_SEED, console)
 
-    def record_target() -> SourceInstances:
+    def record_target(seed: int) -> SourceInstances:
         max_value = domain.settings[PAPER].learner["max_value"]
-        return SourceInstances.from_fitted_rmax(domain.target_id, N_TARGET_TRANSITIONS, TARGET_SEED, max_value=max_value)
+        return SourceInstances.from_fitted_rmax(domain.target_id, N_TARGET_TRANSITIONS, seed, max_value=max_value)
 
     (other,) = (each for each in DOMAINS.values() if each.name != domain.name)
     target = None
     if domain.name == ICUB.name:
-        target = load_or_learn(output / FOLDER / f"{domain.name}_target.npz", record_target, console)
+        target = load_or_learn(output / FOLDER / f"{domain.name}_target.npz", record_target, TARGET_SEED, console)
     return Sources(instances_of(domain), instances_of(other), target)
 
 

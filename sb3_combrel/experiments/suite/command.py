@@ -101,7 +101,11 @@ def run_suite(
     console = console or Console()
     prepare_folder(output)
     wanted = {source.name: source for task in tasks for own in variants if (source := own.source(task)) is not None}
-    sources = {name: load_or_learn(output / FOLDER / f"{name}.npz", source.learn, console) for name, source in wanted.items()}
+    sources = {
+        (source.name, seed): load_or_learn(output / FOLDER / f"{source.name}_seed{seed}.npz", source.learn, seed, console)
+        for seed in seeds
+        for source in wanted.values()
+    }
     runs = suite_runs(tasks, variants, seeds, evaluation_episodes, sources)
     results = run_missing(runs, output, Backend(n_jobs=jobs), console)
     write_csv_files(output)

@@ -52,7 +52,12 @@ class SuiteRun(Job):
     def settings(self) -> dict[str, Any]:
         """What the result depends on besides the names."""
         budget = {"n_steps": self.n_steps, "n_episodes": self.n_episodes, "evaluation_episodes": self.evaluation_episodes}
-        return {"learner": dict(self.learner), "transfer": self.variant.transfer, **budget}
+        source = self.variant.source(self.task)
+        transfer = {
+            "transfer": self.variant.transfer,
+            "source": None if source is None else f"{source.name}, seed {self.seed}",
+        }
+        return {"learner": dict(self.learner), **transfer, **budget}
 
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
         """Measure the learning, and play the task without exploration: a row of ``runs.csv``."""
@@ -74,13 +79,13 @@ def suite_runs(
     variants: Sequence[Variant],
     seeds: Sequence[int],
     evaluation_episodes: int,
-    sources: Mapping[str, SourceInstances],
+    sources: Mapping[tuple[str, int], SourceInstances],
 ) -> list[SuiteRun]:
-    """Make the runs, seed by seed; ``sources``: instances of the source tasks, by name."""
+    """Make the runs, seed by seed; ``sources``: instances of the source tasks, by name and seed."""
 
-    def transfer_of(task: Task, variant: Variant) -> Any:
+    def transfer_of(task: Task, variant: Variant, seed: int) -> Any:
         source = variant.source(task)
-        return None if source is None else TRANSFERS[str(variant.transfer)](sources[source.name], task.name)
+        return None if source is None else TRANSFERS[str(variant.transfer)](sources[source.name, seed], task.name)
 
     return [
         SuiteRun(
@@ -91,7 +96,7 @@ def suite_runs(
             n_steps=task.n_steps,
             n_episodes=task.n_episodes,
             learner={**task.learner, **variant.learner},
-            transfer=transfer_of(task, variant),
+            transfer=transfer_of(task, variant, seed),
             task=task,
             variant=variant,
             evaluation_episodes=evaluation_episodes,

@@ -47,10 +47,10 @@ class NoisyActions(gym.ActionWrapper):
 
 @dataclass(frozen=True)
 class Source:
-    """A source task of transfer: the name of its file, and what learns it and returns its instances."""
+    """A source task of transfer. Each run has a source of its own, recorded with the seed of the run."""
 
-    name: str
-    learn: Callable[[], SourceInstances]
+    name: str  # of its files
+    learn: Callable[[int], SourceInstances]  # learns it with a seed and returns its instances
 
 
 @dataclass(frozen=True)

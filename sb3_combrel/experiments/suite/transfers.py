@@ -1,16 +1,19 @@
 """The transfer methods of the suite, by name, and the source from which each transfers.
 
-``COMBREL@...`` is COMBREL from a source that misleads: the task's own one changed, see
-:mod:`~sb3_combrel.experiments.tasks.misleading_sources`, or with ``COMBREL@other-domain`` one of another domain.
+``COMBREL@...`` is COMBREL from another recording of the source, see :mod:`~sb3_combrel.experiments.tasks.car_sources`, or from
+a source that misleads: the task's own one changed, see :mod:`~sb3_combrel.experiments.tasks.misleading_sources`, or with
+``COMBREL@other-domain`` one of another domain.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from sb3_combrel import COMBREL, MASTER, TIMBREL, FactoredMapping, InterTaskMapping, MappingExperts, SourceInstances
 from sb3_combrel.experiments.suite.tasks import CAR_2D, CART_POLE, TORSO, Source, Task
 from sb3_combrel.experiments.tasks import cart_pole
+from sb3_combrel.experiments.tasks.car_sources import RECORDINGS, q_learning
 from sb3_combrel.experiments.tasks.misleading_sources import MISLEADING
 from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.transfer.base import Transfer
@@ -20,6 +23,11 @@ def _misled(change: Callable[[SourceInstances], SourceInstances]) -> Callable[[S
     return lambda source, task: COMBREL(change(source))
 
 
+#: The car in two dimensions, recorded by other means or at greater length, by the transfer method's name.
+RECORDED: dict[str, Source] = {
+    **{f"COMBREL@{name}": Source(f"{CAR_2D.name}-{name}", record) for name, record in RECORDINGS.items()},
+    **{f"COMBREL@{n}": Source(f"{CAR_2D.name}-{n}", partial(q_learning, n=n)) for n in (3_000, 10_000)},
+}
 OTHER_DOMAIN = "COMBREL@other-domain"
 #: By the name of a task's own source: the source of another domain.
 OTHER_DOMAINS: dict[str, Source] = {CAR_2D.name: TORSO, TORSO.name: CAR_2D, CART_POLE.name: CAR_2D}
@@ -50,15 +58,22 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
     "random": lambda source, task: TIMBREL(source, "random", mappings="factored", use="prior"),
     "oracle": lambda source, task: TIMBREL(source, ORACLES[task], use="prior"),
     "oracle-instances": lambda source, task: TIMBREL(source, INSTANCE_ORACLES[task], use="instances"),
-    OTHER_DOMAIN: lambda source, task: COMBREL(source),
+    **dict.fromkeys((*RECORDED, OTHER_DOMAIN), lambda source, task: COMBREL(source)),
     **{f"COMBREL@{name}": _misled(change) for name, change in MISLEADING.items()},
 }
 
 
 def source_for(name: str, task: Task) -> Source:
-    """Return a transfer method's source task: the task's own; ``COMBREL@other-domain``: another's; else ValueError."""
+    """Return a transfer method's source: the task's own, another recording of it, or that of another domain.
+
+    :raises ValueError: if there is none
+    """
     if task.source is None:
         raise ValueError(f"transfer={name}: the task {task.name} has no source task")
+    if name in RECORDED:
+        if task.source.name != CAR_2D.name:
+            raise ValueError(f"transfer={name}: {CAR_2D.name} is recorded so, and {task.name} learns from {task.source.name}")
+        return RECORDED[name]
     if name != OTHER_DOMAIN:
         return task.source
     if task.source.name not in OTHER_DOMAINS:

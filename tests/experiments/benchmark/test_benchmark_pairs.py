@@ -164,7 +164,7 @@ class TestAgreement:
 
 def carried_out(pair, method, sources):
     """The result of one run of the mirrored car."""
-    return run_missing(jobs_of([pair], [method], [0], {pair.name: sources["mirrored-car"]}), backend=Backend(n_jobs=1))[0]
+    return run_missing(jobs_of([pair], [method], [0], {(pair.name, 0): sources["mirrored-car"]}), backend=Backend(n_jobs=1))[0]
 
 
 class TestStepsToAMapping:

@@ -103,7 +103,7 @@ class TestRanks:
 
     def test_a_method_is_run_by_itself_where_the_one_that_makes_the_same_is_not_chosen(self):
         pair, methods = pair_of(), [method_of(NONE), method_of("b", same_as="c")]
-        jobs = jobs_of([pair], methods, range(5), {pair.name: ()})
+        jobs = jobs_of([pair], methods, range(5), {(pair.name, seed): () for seed in range(5)})
         assert [job.method for job in jobs[:2]] == [NONE, "b"]
         cells = cells_of(pair, methods, [job.result([1 + job.seed], [1.0], [True], 1) for job in jobs], range(5))
         assert len(cells["b"].outcomes) == 5 and report.note_of("b", cells["b"]) == ""

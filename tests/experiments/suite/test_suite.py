@@ -18,7 +18,7 @@ from sb3_combrel.experiments.suite.measures import failures
 from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
 from sb3_combrel.experiments.suite.runs import Variant
 from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Source, Task, tasks_of
-from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, TRANSFERS, check_transfer, source_for
+from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, RECORDED, TRANSFERS, check_transfer, source_for
 from sb3_combrel.experiments.tasks.point_robot import make_point_robot
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.episodes import Episodes
@@ -64,20 +64,24 @@ def test_a_suite_is_written_run_by_run_and_resumed(tmp_path):
         run(tmp_path, variants=[Variant("narrow", {"model_breadth": 0.1})])
 
 
-def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
+def test_a_variant_with_transfer_learns_a_source_once_for_each_seed(tmp_path):
     calls = []
 
-    def learn():
-        calls.append(1)
-        return SourceInstances.record(None, make_point_robot(2), n_instances=100, seed=0)
+    def learn(seed):
+        calls.append(seed)
+        return SourceInstances.record(None, make_point_robot(2), n_instances=100, seed=seed)
 
     task = Task("robot", partial(make_point_robot, 3), n_steps=150, source=Source("robot_2d", learn))
     run(tmp_path, tasks=[task], variants=[Variant("combrel", {"gamma": 0.99}, "COMBREL")])
-    assert len(calls) == 1 and len(pd.read_csv(tmp_path / "runs.csv")) == 2
-    assert SourceInstances.load(tmp_path / "sources" / "robot_2d.npz").n_variables == 2
+    rows = pd.read_csv(tmp_path / "runs.csv")
+    assert calls == [5, 6]
+    assert [json.loads(own)["source"] for own in rows["settings"]] == ["robot_2d, seed 5", "robot_2d, seed 6"]
+    one, other = (SourceInstances.load(tmp_path / "sources" / f"robot_2d_seed{seed}.npz") for seed in calls)
+    assert one.n_variables == 2 and not np.array_equal(one.states, other.states)
     # Neither the right mapping nor a source of another domain is known for a task of our own.
     unknown = {"oracle": "nobody knows the mapping of robot", "oracle-instances": "nobody knows the mapping of robot"}
     unknown["COMBREL@other-domain"] = "robot no source of another domain"
+    unknown |= dict.fromkeys(RECORDED, "mountain_car_2d is recorded so, and robot learns from robot_2d")
     for name in TRANSFERS:
         if name not in unknown:
             check_transfer(name, task)
@@ -88,6 +92,8 @@ def test_a_variant_with_transfer_learns_the_source_once(tmp_path):
         run(tmp_path, tasks=[SHORT], variants=[Variant("combrel", {}, "COMBREL")])
     other = {name: source_for("COMBREL@other-domain", TASKS[name]).name for name in ("MountainCar6D", "ICubArm-noisy")}
     assert other == {"MountainCar6D": "icub_torso", "ICubArm-noisy": "mountain_car_2d"}
+    assert source_for("COMBREL@uniform", TASKS["MountainCar6D"]).name == "mountain_car_2d-uniform"
+    assert len(source_for("COMBREL@3000", TASKS["MountainCar4D"]).learn(7)) == 3000
     with pytest.raises(ValueError, match="transfer must be one of"):
         run(tmp_path, tasks=[task], variants=[Variant("other", {}, "OTHER")])
 
