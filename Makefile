@@ -8,7 +8,8 @@
 # make icub    of these Figure 5, the arm of the iCub with and without transfer from its torso, in setting "explore"
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
-# make suite   the learner on all tasks, as in docs/results/learner.md (hours); SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
+# make learner the learner on all tasks, as in docs/results/learner.md (an hour)
+# make suite   tasks, settings and transfer methods of your choice; SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
 # make tutorials   execute all cells of tutorials/, and renew the outputs and figures in them
 # make doc     the documentation as HTML, in docs/_build; any warning is an error
 # make figures the figures of README.md and docs/; make dashboard the screenshots of TensorBoard
@@ -40,7 +41,7 @@ endif
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo doc figures dashboard suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
+.PHONY: demo doc figures dashboard learner suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -84,6 +85,13 @@ icub-breadths: $(VENV)/.installed-demo
 	mkdir -p docs/results
 	cp breadths_experiment/summary.csv docs/results/icub_breadths.csv
 	cp breadths_experiment/tables.md docs/results/icub_breadths.md
+
+# The tasks of docs/results/protocol.md, without transfer. A later call goes on with what is there.
+LEARNER_TASKS := MountainCar4D-60 MountainCar2D MountainCar2D-noisy MountainCar-v0 MountainCar-v0-noisy Acrobot-v1 CartPole-v1 \
+	Pendulum-v1 MountainCarContinuous-v0 dm_control-pendulum dm_control-cart-pole ICubTorso ICubTorso-noisy ICubArm ICubArm-noisy \
+	MountainCar6D PointRobot2D PointRobot3D PointRobot3D-exact PointRobot3D-random
+learner: $(VENV)/.installed-demo
+	$(BIN)/python -m sb3_combrel.experiments.suite.command --output learner --first-seed 20000 --tasks $(LEARNER_TASKS) $(SUITE_ARGS)
 
 # A later call goes on with what is there.
 suite: $(VENV)/.installed-demo
