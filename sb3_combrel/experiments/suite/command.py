@@ -17,8 +17,10 @@ from typing import Any
 from rich.console import Console
 
 from sb3_combrel.common.checks import check_count
+from sb3_combrel.common.files import write_whole
 from sb3_combrel.comparison.statistics import TESTS
-from sb3_combrel.experiments.suite.report import cells_of, frozen_table, overview_table, task_table
+from sb3_combrel.comparison.tables import write_tables
+from sb3_combrel.experiments.suite.report import cells_of, frozen_table, headline_table, task_table
 from sb3_combrel.experiments.suite.runs import Variant, suite_runs, write_csv_files
 from sb3_combrel.experiments.suite.tasks import Task, tasks_of
 from sb3_combrel.experiments.suite.transfers import check_transfer
@@ -26,7 +28,7 @@ from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, run_missing
 from sb3_combrel.runs.source_files import FOLDER, load_or_learn
 
-TABLES = "tables.md"
+TABLES, BY_TASK = "tables", "tasks.md"
 DEFAULT = "default"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]*")
 
@@ -79,7 +81,7 @@ def run_suite(
     test: str = "welch",
     console: Console | None = None,
 ) -> None:
-    """Learn each task with each variant and seed, and write ``runs.csv``, ``episodes.csv`` and ``tables.md``.
+    """Learn each task with each variant and seed, and write ``runs.csv``, ``episodes.csv``, ``tables.md`` and ``tasks.md``.
 
     What is complete is not done again; all runs in the folder are in the CSV files, the tables are of these arguments' runs.
 
@@ -111,10 +113,9 @@ def run_suite(
     write_csv_files(output)
     check_all_succeeded(results)
     cells = cells_of([result.more["row"] for result in results], tasks, names, reference, test)
-    overview, frozen = overview_table(cells, tasks, names), frozen_table(cells, tasks, names)
-    tables = [overview, frozen, *(task_table(cells, task, names, f"p against {reference}") for task in tasks)]
-    (output / TABLES).write_text("\n".join(table.as_markdown() for table in tables))
-    console.print(overview.for_terminal())
+    write_tables([headline_table(cells, tasks, names, reference), frozen_table(cells, tasks, names)], output / TABLES, console)
+    by_task = [task_table(cells, task, names, f"p against {reference}") for task in tasks]
+    write_whole(output / BY_TASK, "\n".join(table.as_markdown() for table in by_task).encode())
 
 
 def _value(text: str) -> Any:

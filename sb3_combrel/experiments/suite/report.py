@@ -8,8 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_combrel.comparison.statistics import ALPHA, holm, p_value_of_difference
-from sb3_combrel.comparison.tables import Table
+from sb3_combrel.comparison.statistics import (
+    bootstrap_difference,
+    bootstrap_relative_difference,
+    holm,
+    p_value_of_difference,
+)
+from sb3_combrel.comparison.tables import Table, share_text
 from sb3_combrel.experiments.suite.tasks import Task
 
 #: Not tested: it depends on the machine.
@@ -68,15 +73,44 @@ def cells_of(
     return cells
 
 
-def overview_table(cells: Cells, tasks: Sequence[Task], variants: Sequence[str]) -> Table:
-    """Make a table with a row for each task and a column for each variant: mean and standard error of the task's headline."""
+def headline_table(cells: Cells, tasks: Sequence[Task], variants: Sequence[str], reference: str) -> Table:
+    """Make a table with a row for each task and variant: the task's headline, and what it gains over the reference variant."""
+    alone = len(variants) == 1
     rows = []
     for task in tasks:
-        found = [cells.get((task.name, task.headline, variant)) for variant in variants]
-        texts = ["" if cell is None else cell.mean() + (" *" if cell.p_value < ALPHA else "") for cell in found]
-        rows.append((task.name, task.headline, *texts))
-    title = "Mean over the seeds and its standard error (*: p < 0.05 against the reference, by Holm's correction)"
-    return Table(title, ("task", "measure", *variants), rows)
+        of_reference = cells.get((task.name, task.headline, reference))
+        for variant in variants:
+            cell = cells.get((task.name, task.headline, variant))
+            if cell is None:
+                continue
+            row: tuple[str, ...] = (
+                str(len(cell.values)),
+                cell.mean(),
+                format_number(float(np.median(cell.values))),
+                cell.worst(),
+            )
+            if not alone:
+                gain = "" if variant == reference or of_reference is None else gain_text(cell, of_reference)
+                row = (*row, gain, "" if np.isnan(cell.p_value) else f"{cell.p_value:.2g}")
+            rows.append((task.name, task.headline, *(() if alone else (variant,)), *row))
+    compared = () if alone else (f"better than {reference} by", "p")
+    names = ("task", "measure") if alone else ("task", "measure", "variant")
+    title = "Mean over the seeds ± its standard error" + ("" if alone else "; 95% intervals; p by Holm's correction")
+    return Table(title, (*names, "seeds", "mean", "median", "worst", *compared), rows)
+
+
+def gain_text(cell: Cell, reference: Cell) -> str:
+    """By how much the mean is better than the reference's, with a bootstrap interval: of steps in parts of the reference's."""
+    sign = 1.0 if cell.higher_is_better else -1.0
+    if not (np.isfinite(cell.values).all() and np.isfinite(reference.values).all()):
+        return "-"
+    if cell.higher_is_better or min(cell.values.min(), reference.values.min()) < 0.0:
+        found = bootstrap_difference(cell.values, reference.values)
+        value, low, high = (format_number(sign * each) for each in found)
+    else:
+        found = bootstrap_relative_difference(cell.values, reference.values)
+        value, low, high = (share_text(sign * each) if np.isfinite(each) else "-" for each in found)
+    return f"{value} ({low} to {high})" if sign > 0.0 else f"{value} ({high} to {low})"
 
 
 def frozen_table(cells: Cells, tasks: Sequence[Task], variants: Sequence[str]) -> Table:

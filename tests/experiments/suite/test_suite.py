@@ -1,6 +1,8 @@
 """The suite: runs that go on where they stopped, measures of hand-made episodes, tables and tests."""
 
+import dataclasses
 import json
+import re
 from functools import partial
 
 import gymnasium as gym
@@ -15,7 +17,7 @@ from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.suite import command as suite
 from sb3_combrel.experiments.suite import measures
 from sb3_combrel.experiments.suite.measures import failures
-from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, overview_table, task_table
+from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_number, frozen_table, headline_table, task_table
 from sb3_combrel.experiments.suite.runs import Variant
 from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Source, Task, tasks_of
 from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, RECORDED, TRANSFERS, check_transfer, source_for
@@ -59,7 +61,7 @@ def test_a_suite_is_written_run_by_run_and_resumed(tmp_path):
         assert json.loads(row.settings)["learner"] == ({"model_breadth": 0.05} if row.variant == "narrow" else {})
     narrow = rows[(rows["task"] == "small") & (rows["variant"] == "narrow")]["steps_1_to_3"]
     mean, error = (format_number(number) for number in (narrow.mean(), narrow.sem()))
-    assert f"| steps_1_to_3 | narrow | 2 | {mean} ± {error} |" in (tmp_path / "tables.md").read_text()
+    assert f"| steps_1_to_3 | narrow | 2 | {mean} ± {error} |" in (tmp_path / "tasks.md").read_text()
     with pytest.raises(ValueError, match=r"other settings \(small, narrow, seed 5: learner was .*0.05.* and is .*0.1"):
         run(tmp_path, variants=[Variant("narrow", {"model_breadth": 0.1})])
 
@@ -231,8 +233,17 @@ def test_tables_of_hand_made_runs():
     assert table["steps_1_to_3", "a"] == ("3", "102.0 ± 1.15", "102.0", "104.0", "")
     assert table["steps_1_to_3", "c"][:4] == ("3", "2 of 3 reached it", "103.0", "never")
     assert table["greedy_mean", "b"][:4] == ("3", "-52.0 ± 1.15", "-52.0", "-54.0")
-    overview = overview_table(cells, [SMALL], list(steps)).rows
-    assert overview == [("small", "steps_1_to_3", "102.0 ± 1.15", "52.0 ± 1.15 *", "2 of 3 reached it")]
+    table = headline_table(cells, [SMALL], list(steps), "a")
+    assert table.header[-2:] == ("better than a by", "p")
+    (first, *found), (*second, gain, p_value), (*third, nothing, _) = (line[2:] for line in table.rows)
+    assert (first, *found) == ("a", "3", "102.0 ± 1.15", "102.0", "104.0", "", "")
+    assert second == ["b", "3", "52.0 ± 1.15", "52.0", "54.0"] and float(p_value) < 0.01
+    assert re.fullmatch(r"49% \(4[678]% to 5[01]%\)", gain)
+    assert third == ["c", "3", "2 of 3 reached it", "103.0", "never"] and nothing == "-"
+    alone = headline_table(cells, [SMALL], ["b"], "b")
+    assert alone.rows == [("small", "steps_1_to_3", "3", "52.0 ± 1.15", "52.0", "54.0")]
+    returns = headline_table(cells, [dataclasses.replace(SMALL, headline="greedy_mean")], ["a", "b"], "a").rows[1][-2]
+    assert re.fullmatch(r"50.0 \(4[678].\d to 5[123].\d\)", returns)
 
 
 def test_the_table_of_frozen_policies_counts_seeds():
