@@ -91,7 +91,7 @@ LEARNER_TASKS := MountainCar4D-60 MountainCar2D MountainCar2D-noisy MountainCar-
 	Pendulum-v1 MountainCarContinuous-v0 dm_control-pendulum dm_control-cart-pole ICubTorso ICubTorso-noisy ICubArm ICubArm-noisy \
 	MountainCar6D PointRobot2D PointRobot3D PointRobot3D-exact PointRobot3D-random
 learner: $(VENV)/.installed-demo
-	$(BIN)/python -m sb3_combrel.experiments.suite.command --output learner --first-seed 20000 --tasks $(LEARNER_TASKS) $(SUITE_ARGS)
+	$(BIN)/python -m sb3_combrel.experiments.suite.command --output learner --first-seed 21000 --tasks $(LEARNER_TASKS) $(SUITE_ARGS)
 
 # A later call goes on with what is there.
 suite: $(VENV)/.installed-demo

@@ -17,6 +17,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.optimism import RewardRange
 from sb3_combrel.fitted_rmax.promises import Promises
+from sb3_combrel.fitted_rmax.search import Search
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
@@ -67,7 +68,7 @@ class FittedRMaxAgent:
         transfers = transfer is not None and transfer.informs_model
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
         warn_if_long(self.workload, self.grid)
-        self.rewards = RewardRange(settings.gamma, settings.max_value)
+        self.rewards, self.search = RewardRange(settings.gamma, settings.max_value), Search()
         self.n_sweeps = 0
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
@@ -110,7 +111,8 @@ class FittedRMaxAgent:
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
+        breadth = self.search.breadth(self.model_settings.model_breadth, self.task.n_variables)
+        self.model = self.model_class(self.mdp, replace(self.model_settings, model_breadth=breadth), self._model_transfer)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
         # Pairs whose rows are to be updated: an interrupt in between loses none.
@@ -171,6 +173,8 @@ class FittedRMaxAgent:
         chosen = self.promises.choose(environment, state, float(self._q.q.max()), best, self.rng)
         if not prediction.modelled[chosen]:
             self.n_optimistic_actions += 1
+        if prediction.weight[chosen] < self.model.exploration_threshold:
+            self.search.met_unknown.add(environment)
         return chosen
 
     def _exploit(self, state: np.ndarray) -> int:
@@ -221,6 +225,9 @@ class FittedRMaxAgent:
         with self._lock:
             self.rewards.note(reward, terminated)
             self._widen(reward)
+            if self.search.n_halvings and self.rewards.differ:
+                self.search.n_halvings = 0
+                self._use_other_kernel()
             if self.transfer is not None:
                 self.transfer.environment = environment
             self.promises.pay(environment, reward, self.mdp.gamma)
@@ -268,6 +275,9 @@ class FittedRMaxAgent:
             if self.transfer is not None:
                 self.transfer.environment = environment
                 self.transfer.end_episode(truncated)
+            if self.model.narrows and self.search.end_episode(environment, self.rewards.differ):
+                self._use_other_kernel()
+                return
             self._outdated.append(self.model.end_episode())
             self._plan(SWEEPS_AT_EPISODE_END)
 
@@ -295,6 +305,19 @@ class FittedRMaxAgent:
                 ]
             )
             self._plan(SWEEPS_AT_EPISODE_END)
+
+    def _use_other_kernel(self) -> None:
+        """Compute the model anew with the breadth that the search asks for; what a transfer method has found stays."""
+        transitions, lowest = self.model.transitions(), self.planner.bounds[0]
+        self._build()
+        self._widen(min(0.0, lowest) / LONGEST_PLAN)
+        if self.transfer is not None and self.transfer.use == "prior":
+            self.planner.set_upper(self.transfer.value_bound())
+        for transition in transitions:
+            self.model.add(*transition)
+        # What is not known may be modelled with transferred instances.
+        self._outdated = [self.model.outdated(), np.flatnonzero(~self.model.known)]
+        self._plan(SWEEPS_AT_EPISODE_END)
 
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""
@@ -358,6 +381,7 @@ class FittedRMaxAgent:
                 "lowest_value": np.array([self.planner.bounds[0]]),
                 "rewards": self.rewards.get_state(),
                 "promises": self.promises.rows(),
+                **self.search.get_state(),
             }
 
     def set_state(self, state: dict[str, np.ndarray], scaling: StateScaling | None = None) -> None:
@@ -365,6 +389,7 @@ class FittedRMaxAgent:
         with self._lock:
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling)
             self.rewards.set_state(state["rewards"])
+            self.search.set_state(state)
             self._bind()
             self._build()
             if self.transfer is not None:

@@ -33,6 +33,11 @@ class RewardRange:
             self.largest = max(self.largest, reward)
 
     @property
+    def differ(self) -> bool:
+        """Whether an outcome has told states apart: an episode has ended, or a reward was another one."""
+        return self.n_ended > 0 or self.lowest < self.largest
+
+    @property
     def gamma(self) -> float:
         """The discount factor."""
         if self._gamma is not None:

@@ -72,6 +72,8 @@ class Model(ABC):
 
     #: Whether a transfer method may give the mean that the target's own instances are fitted to (``use="prior"``).
     takes_prior: ClassVar[bool] = False
+    #: Whether its kernel narrows while a search for what is rewarded finds nothing (see ``fitted_rmax.search``).
+    narrows: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp, self.grid, self.n_actions = mdp, mdp.grid, mdp.n_actions
