@@ -25,10 +25,8 @@ from scipy import stats
 
 from sb3_combrel.comparison.statistics import TESTS, p_value_of_difference
 
-WITH_FIGURES = [
-    ROOT / "README.md",
-    *(DOCS / name for name in ("results.md", "benchmark.md", "results/learner.md", "results/transfer.md")),
-]
+FIGURES_IN = ("results.md", "benchmark.md", "results/learner.md", "results/transfer.md")
+WITH_FIGURES = [ROOT / "README.md", *(DOCS / name for name in FIGURES_IN)]
 #: Tables that need no mark, by their first heading.
 UNMARKED = {
     "| | paper | explore | best |": "settings",
