@@ -172,7 +172,7 @@ class TestBadInput:
 
     def test_files_that_are_no_results(self, tmp_path):
         (tmp_path / "thesis.tex").write_text("mine")
-        with pytest.raises(ValueError, match="has files that are not results of this command; choose another --output"):
+        with pytest.raises(ValueError, match="has files that are not results of such runs; choose another folder as output"):
             reproduce("fig4", output=tmp_path)
         assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
