@@ -38,6 +38,7 @@ BACKENDS = ("loky", "ray", "dask")
 FOLDER = "runs"
 # Of a setting that one of two calls has not.
 ABSENT = "(not given)"
+USE_ANOTHER = "use another folder by --output or output="
 #: How often jobs are begun again, without a single result in between, because workers have died.
 MAX_BREAKDOWNS = 3
 SECONDS_TO_REACH = 5.0
@@ -190,7 +191,7 @@ def prepare_folder(output: Path) -> None:
     # What must not be read, or is no folder, is named by what follows.
     with suppress(PermissionError, NotADirectoryError):
         if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
-            raise ValueError(f"{output} has files that are not results of such runs; choose another folder as output")
+            raise ValueError(f"{output} has files that are not results of such runs; {USE_ANOTHER}")
     check_folder("output", output / FOLDER)
 
 
@@ -205,7 +206,7 @@ def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
         now = _settings(job)
         other = "; ".join(text for key in now for text in _differences(key, read[0].get(key), now[key]))
         if other:
-            raise ValueError(f"{output} has results of other settings ({job.title}: {other}); use another folder as output")
+            raise ValueError(f"{output} has results of other settings ({job.title}: {other}); {USE_ANOTHER}")
         if not read[1].error:
             found[job.name] = read[1]
     return found

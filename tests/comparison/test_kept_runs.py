@@ -131,9 +131,7 @@ def test_runs_of_other_settings_are_refused_and_stay(before, now, message, carri
     quietly(**before, controls=False, output=tmp_path)
     kept = {file: file.read_bytes() for file in files_of(tmp_path)}
     carried_out.clear()
-    with pytest.raises(
-        ValueError, match=f"^{tmp_path} has results of other settings .*{message}.*; use another folder as out"
-    ):
+    with pytest.raises(ValueError, match=f"^{tmp_path} has results of other settings .*{message}.*; use another folder by"):
         quietly(**{**before, **now}, controls=False, output=tmp_path)
     assert not carried_out and {file: file.read_bytes() for file in files_of(tmp_path)} == kept
 

@@ -252,7 +252,7 @@ class TestBadInput:
         changed.write_text((files / "two_walks.py").read_text().replace("n_episodes=6", "n_episodes=7"))
         message = fail("--pairs", changed, "--methods", "none", "--output", copied)
         assert "has results of other settings (two-walks, none, seed 7000: " in message
-        assert "n_episodes was 6 and is 7" in message and "use another folder as output" in message
+        assert "n_episodes was 6 and is 7" in message and "use another folder by --output" in message
         assert len(list((copied / "sources").iterdir())) == 2, "a source that may be another one has a file of its own"
 
     def test_what_the_package_has_is_sent_by_name(self):
