@@ -27,3 +27,20 @@ def write_whole(target: Path, content: bytes) -> None:
     except BaseException:
         Path(temporary.name).unlink(missing_ok=True)
         raise
+
+
+def check_folder(name: str, folder: Path) -> None:
+    """Make a folder and see that files can be written to it, before there is anything to lose.
+
+    :param name: of the argument, for the error
+    :raises OSError: if not
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".sb3_combrel_probe"
+        write_whole(probe, b"")
+        probe.unlink(missing_ok=True)
+    except OSError as error:
+        raise type(error)(
+            f"{name} must be in a folder that can be written to, got {folder}: {error.strerror or error}"
+        ) from error

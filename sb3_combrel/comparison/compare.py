@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
+import json
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.common.checks import as_count, check_boolean, check_count, check_finite
+from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.comparison.controls import CONTROL, random_control
 from sb3_combrel.comparison.result import CompareResult, evaluate
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.pages.snapshot import snapshot_of
-from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose
-from sb3_combrel.runs.runner import Backend, check_all_succeeded, run_missing
+from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose, described, file_name
+from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, run_missing
 from sb3_combrel.sources.recipes import task_spec
 from sb3_combrel.transfer.base import Transfer
 
 # What ``compare`` passes to the learner itself.
 _TAKEN = ("env", "transfer", "seed", "_init_setup_model")
+# So many characters of a method's name begin the names of its files, which may have 255 bytes.
+NAME_LENGTH = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +41,23 @@ class ComparedRun(Job):
     """A run of a comparison, whose result has the transfer method's report.
 
     :param is_shown: whether the result has values and policy too, for the page
+    :param in_use: what the transfer method is once it is bound to the task, as :func:`settings_of` describes it
     """
 
     is_shown: bool = False
+    in_use: Any = None
 
     @property
     def name(self) -> str:
-        """Name of the run. No file has it: methods may differ in case or punctuation alone."""
-        return self.title
+        """Name of the run in files, with a digest: methods may differ in case or punctuation alone, or at their ends."""
+        digest = hashlib.sha256(self.method.encode()).hexdigest()[:8]
+        return file_name(self.method[:NAME_LENGTH], f"{digest}{' shown' if self.is_shown else ''}", self.seed)
+
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on; of a source that is named by its file, its content."""
+        found = super().settings()
+        found["transfer"] = found.pop("in_use")
+        return found
 
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
         """Report what transfer did, and what was learned."""
@@ -61,6 +78,7 @@ def compare(
     threshold: float | None = None,
     n_jobs: int | None = 1,
     progress_bar: bool = False,
+    output: str | os.PathLike[str] | None = None,
     **learner: Any,
 ) -> CompareResult:
     """Learn a task with several methods of transfer and without, and say whether transfer helped.
@@ -93,12 +111,14 @@ def compare(
     :param n_jobs: runs at a time, each in a process of its own; 1: one after the other in this process; None: one a core.
         Results do not depend on it.
     :param progress_bar: show how many runs are complete
+    :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from there
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
     :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument
     :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short
-        for a single episode
+        for a single episode; or if the folder has runs of other settings
     :raises FileNotFoundError: if a source does not exist
+    :raises OSError: if the folder cannot be written to
     :raises ~sb3_combrel.runs.runner.JobError: if a run failed
     """
     baseline = check_methods(methods, baseline)
@@ -109,30 +129,31 @@ def compare(
     if threshold is not None:
         check_finite("threshold", threshold)
     check_learner(learner)
-    task = task_of(env)
+    task, folder = task_of(env), check_output(output)
 
-    def run_of(method: str, transfer: TransferLike, seed: int) -> ComparedRun:
-        is_shown = seed == numbers[0]
-        return ComparedRun(
-            group="", method=method, seed=seed, env=task, n_steps=steps, learner=learner, transfer=transfer, is_shown=is_shown
-        )
+    def first_run(method: str, transfer: TransferLike) -> ComparedRun:
+        fixed: dict[str, Any] = {"group": "", "env": task, "n_steps": steps, "learner": learner}
+        return ComparedRun(method=method, seed=numbers[0], transfer=transfer, is_shown=True, **fixed)
 
-    in_use = {method: _try_out(run_of(method, transfer, numbers[0])) for method, transfer in methods.items()}
+    first = {method: first_run(method, transfer) for method, transfer in methods.items()}
+    in_use = {method: _try_out(run) for method, run in first.items()}
     control = random_control(in_use) if controls else None
     if control is not None:
+        run = first_run(CONTROL, control)
         try:
-            _try_out(run_of(CONTROL, control, numbers[0]))
-            methods = {**methods, CONTROL: control}
+            in_use[CONTROL], first[CONTROL] = _try_out(run), run
         except ValueError as error:
             warnings.warn(f"there is no control ({error}): controls=False leaves it out without a warning", stacklevel=2)
-    runs = [run_of(method, transfer, seed) for method, transfer in methods.items() for seed in numbers]
-    results = run_missing(runs, backend=Backend(n_jobs=n_jobs), console=Console(stderr=True) if progress_bar else None)
+    first = {method: replace(run, in_use=settings_of(in_use[method])) for method, run in first.items()}
+    runs = [replace(run, seed=seed, is_shown=seed == numbers[0]) for run in first.values() for seed in numbers]
+    console = Console(stderr=True) if progress_bar else None
+    results = run_missing(runs, output=folder, backend=Backend(n_jobs=n_jobs), console=console)
     check_all_succeeded(results)
     for result in results:
         if not result.steps:
             where = f"the run of {result.method}, seed {result.seed}"
             raise ValueError(f"steps={steps} is too few: no episode ended in {where}; take more, or a time limit")
-    by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(methods)}
+    by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(first)}
     found = evaluate(by_method, baseline, threshold, _name_of(env))
     for words in found.warnings:
         warnings.warn(words, stacklevel=2)
@@ -154,6 +175,26 @@ def _try_out(run: ComparedRun) -> Transfer | None:
         # Subclasses may ask for more than a message.
         kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
         raise kind(f"{run.method}: {error}") from error
+
+
+def settings_of(transfer: Transfer | None) -> Any:
+    """Describe a transfer method in use as JSON can hold it; a set of mappings by digest, as its name says the size only."""
+    mappings = getattr(transfer, "mappings", None)
+    if not isinstance(mappings, MappingSet):
+        return described(transfer)
+    digest = hashlib.sha256(json.dumps(to_plain(mappings)).encode()).hexdigest()[:12]
+    return {"mappings": f"{mappings!r} {digest}", "method": described(transfer)}
+
+
+def check_output(output: Any) -> Path | None:
+    """Return the folder that runs are kept in, ready to be written to; None for none."""
+    if output is None:
+        return None
+    if not isinstance(output, str | os.PathLike):
+        raise ValueError(f"output must be the path of a folder, or None to keep nothing, got {output!r}")
+    folder = Path(output)
+    prepare_folder(folder)
+    return folder
 
 
 def check_methods(methods: Any, baseline: Any) -> str:

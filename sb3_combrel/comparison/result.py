@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_combrel.common.files import check_folder
 from sb3_combrel.comparison.controls import CONTROL
 from sb3_combrel.comparison.curves import LearningCurves, curves_of, returns_over_steps
 from sb3_combrel.comparison.measure_table import measure_table, p_value_text
@@ -22,7 +23,6 @@ from sb3_combrel.comparison.measures import (
 )
 from sb3_combrel.comparison.statistics import ALPHA, bootstrap_band, fewest_runs, holm, smallest_p_value
 from sb3_combrel.comparison.tables import markdown_table
-from sb3_combrel.pages.page import check_folder
 from sb3_combrel.pages.palette import method_colours
 from sb3_combrel.pages.plane import VariablePair
 from sb3_combrel.pages.snapshot import Snapshot

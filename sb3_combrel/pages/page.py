@@ -101,20 +101,3 @@ def data_address(figure: Figure) -> str:
     for number, name in enumerate(dict.fromkeys(re.findall(r'<clipPath id="(\w+)"', text))):
         text = text.replace(name, f"clip{number}")
     return f"data:image/svg+xml;base64,{base64.b64encode(text.encode()).decode()}"
-
-
-def check_folder(name: str, folder: Path) -> None:
-    """Make a folder and see that files can be written to it, before there is anything to lose.
-
-    :param name: of the argument, for the error
-    :raises OSError: if not
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".sb3_combrel_probe"
-        write_whole(probe, b"")
-        probe.unlink()
-    except OSError as error:
-        raise type(error)(
-            f"{name} must be in a folder that can be written to, got {folder}: {error.strerror or error}"
-        ) from error

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.serialisation import register_reader, register_writer
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.pages.plane import Plane
 from sb3_combrel.planning.grid import StateGrid
@@ -69,3 +71,25 @@ def greedy_actions(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
     """Find the action with the highest Q at grid points, -1 where one is optimistic; int64, the shape of the points."""
     q = action_values(agent, points)
     return np.where(np.isnan(q).any(axis=0), -1, np.nan_to_num(q, nan=-np.inf).argmax(axis=0))
+
+
+def _write(shown: Snapshot) -> tuple[str, dict[str, Any]]:
+    grid = {"resolution": shown.grid.resolution, "margin": shown.grid.margin, "periodic": shown.grid.arrays.periodic}
+    scaling = {"low": shown.scaling.low, "high": shown.scaling.high}
+    return "Snapshot", {**vars(shown), "grid": grid, "scaling": scaling}
+
+
+def _read(grid: Any, scaling: Any, state_names: Any, action_names: Any, values: Any, greedy: Any, bound: Any) -> Snapshot:
+    return Snapshot(
+        grid=StateGrid(len(grid["resolution"]), **grid),
+        scaling=StateScaling(**scaling),
+        state_names=tuple(state_names),
+        action_names=tuple(action_names),
+        values=np.array(values, dtype=np.float64),
+        greedy=np.array(greedy, dtype=np.int64),
+        bound=None if bound is None else np.array(bound, dtype=np.float64),
+    )
+
+
+register_writer(Snapshot, _write)
+register_reader("Snapshot", _read)

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields
+from types import CodeType, FunctionType
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -190,7 +191,10 @@ def chosen_on_purpose() -> Iterator[None]:
 
 
 def described(value: Any) -> Any:
-    """Return as JSON: functions by name and arguments, transfers by arguments, arrays by digest, others by repr."""
+    """Return as JSON: functions by name and arguments, transfers by arguments, arrays by digest, others by repr.
+
+    Of a lambda the names and constants count, as it has no name that tells it from others.
+    """
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, functools.partial):
@@ -210,9 +214,23 @@ def described(value: Any) -> Any:
         return f"{len(value)} instances {_digest(*arrays)}"
     if isinstance(value, np.ndarray):
         return _digest(value)
+    if isinstance(value, EnvSpec):
+        return described(vars(value))
+    if isinstance(value, FunctionType) and value.__name__ == "<lambda>":
+        return {_name_of(value): _content_of(value)}
     if callable(value) and hasattr(value, "__qualname__"):
         return _name_of(value)
-    return _name_of(type(value)) if type(value).__repr__ is object.__repr__ else repr(value)
+    if type(value).__repr__ is object.__repr__:
+        return _name_of(type(value))
+    # Another process has the same objects elsewhere.
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+def _content_of(function: FunctionType) -> list[Any]:
+    """The names, constants and values that a function without a name of its own is made of, as JSON."""
+    code, cells = function.__code__, function.__closure__ or ()
+    constants = [each for each in code.co_consts if not isinstance(each, CodeType)]
+    return described([*code.co_names, *constants, *(function.__defaults__ or ()), *(cell.cell_contents for cell in cells)])
 
 
 def _name_of(defined: Any) -> str:

@@ -16,7 +16,7 @@ import threading
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,12 +29,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from threadpoolctl import threadpool_limits
 
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.common.files import write_whole
+from sb3_combrel.common.files import check_folder, write_whole
+from sb3_combrel.common.serialisation import from_plain, to_plain
 from sb3_combrel.common.version import __version__
 from sb3_combrel.runs.job import Job, Result
 
 BACKENDS = ("loky", "ray", "dask")
 FOLDER = "runs"
+# Of a setting that one of two calls has not.
+ABSENT = "(not given)"
+USE_ANOTHER = "use another folder by --output or output="
 #: How often jobs are begun again, without a single result in between, because workers have died.
 MAX_BREAKDOWNS = 3
 SECONDS_TO_REACH = 5.0
@@ -167,7 +171,7 @@ def read_result(output: Path, name: str) -> tuple[dict[str, Any], Result] | None
     """Read the settings and the result of a job from a folder; None if it has none or a file that is not whole."""
     try:
         content = json.loads(result_file(output, name).read_text())
-        return dict(content["settings"]), Result(**content["result"])
+        return dict(content["settings"]), Result(**from_plain(content["result"]))
     except (FileNotFoundError, ValueError, TypeError, KeyError):
         return None
 
@@ -179,10 +183,16 @@ def read_results(output: Path, begins: str = "") -> list[tuple[dict[str, Any], R
 
 
 def prepare_folder(output: Path) -> None:
-    """Prepare a folder for results; those that are there are kept, other files are a ValueError."""
-    if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
-        raise ValueError(f"{output} has files that are not results of this command; choose another --output")
-    (output / FOLDER).mkdir(parents=True, exist_ok=True)
+    """Prepare a folder for results; those that are there are kept.
+
+    :raises ValueError: if it has other files only
+    :raises OSError: if nothing can be written to it
+    """
+    # What must not be read, or is no folder, is named by what follows.
+    with suppress(PermissionError, NotADirectoryError):
+        if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
+            raise ValueError(f"{output} has files that are not results of such runs; {USE_ANOTHER}")
+    check_folder("output", output / FOLDER)
 
 
 def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
@@ -193,13 +203,21 @@ def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
         read = read_result(output, job.name)
         if read is None:
             continue
-        before, now = read[0], _settings(job)
-        other = [f"{key} was {before.get(key)!r} and is {now[key]!r}" for key in now if before.get(key) != now[key]]
+        now = _settings(job)
+        other = "; ".join(text for key in now for text in _differences(key, read[0].get(key), now[key]))
         if other:
-            raise ValueError(f"{output} has results of other settings ({job.title}: {'; '.join(other)}); use another --output")
+            raise ValueError(f"{output} has results of other settings ({job.title}: {other}); {USE_ANOTHER}")
         if not read[1].error:
             found[job.name] = read[1]
     return found
+
+
+def _differences(name: str, before: Any, now: Any) -> list[str]:
+    """What differs in a setting, each part of it by its own name."""
+    if isinstance(before, dict) and isinstance(now, dict) and before.keys() & now.keys():
+        pairs = ((f"{name}.{key}", before.get(key, ABSENT), now.get(key, ABSENT)) for key in before | now)
+        return [text for pair in pairs for text in _differences(*pair)]
+    return [] if before == now else [f"{name} was {before!r} and is {now!r}"]
 
 
 def _settings(job: Job) -> dict[str, Any]:
@@ -207,8 +225,14 @@ def _settings(job: Job) -> dict[str, Any]:
 
 
 def _write(job: Job, result: Result, output: Path) -> None:
-    content = {"settings": _settings(job), "result": vars(result)}
-    write_whole(result_file(output, job.name), (json.dumps(content) + "\n").encode())
+    try:
+        content = {"settings": _settings(job), "result": to_plain(vars(result))}
+        write_whole(result_file(output, job.name), (json.dumps(content) + "\n").encode())
+    except TypeError as error:
+        raise TypeError(f"{job.title}: {error}, which a result in a folder has to be") from error
+    except OSError as error:
+        wrong = f"output must be a folder that can be written to, got {output}: {error.strerror or error} ({job.title})"
+        raise type(error)(f"{wrong}; runs that were finished are kept there, and the same call goes on from them") from error
 
 
 def _carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Result]]:

@@ -6,18 +6,23 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, EventCallback
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.fitted_rmax.vec_envs import refuse_normalized_observations
 from sb3_combrel.pages.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
+from sb3_combrel.runs.episodes import EVALUATION_SEED
 from sb3_combrel.tensorboard import readings
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.tensorboard.mapping_table import mapping_table
@@ -29,8 +34,8 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 DEFAULT_PICTURE_FREQ = AUTO
-# Sets of pictures in a run, where their frequency is left open.
-PICTURES_A_RUN = 8
+# Sets of pictures in a run, and evaluations, where their frequency is left open.
+TIMES_A_RUN = 8
 # Of the time, for a dashboard that the user did not ask for. Matplotlib is loaded with the first set.
 DEFAULT_PICTURE_SHARE = 0.15
 FIRST_PICTURES_SECONDS = 1.0
@@ -52,6 +57,8 @@ class DashboardCallback(BaseCallback):
     - Pictures: V, what the source bounds it by, and the greedy policy over two state variables; of a source as prior the
       evidence over time; else the source action that each target action is mapped to (Figure 4 of the COMBREL paper), and
       which state mappings were chosen when. They need matplotlib.
+    - Evaluation, with ``eval_env``: episodes without exploration, ``eval/mean_reward`` and ``eval/mean_ep_length`` as of
+      Stable-Baselines3's ``EvalCallback``.
     - Text: the mappings used most (Table 2 of that paper). HPARAMS: the settings.
 
     :param picture_freq: environment steps between two sets of pictures and tables; the last comes at the end of ``learn``.
@@ -63,8 +70,12 @@ class DashboardCallback(BaseCallback):
         ``rollout/`` and ``time/`` only. 1 for all of them in every log
     :param picture_share: the same for pictures, each set complete or not at all, but for the last, which always comes
     :param verbose: verbosity level, as in any callback
-    :raises ValueError: if ``picture_freq`` is below 1 or a share not in (0, 1]; when learning starts, if variables or state do
-        not fit the task
+    :param eval_env: environment, or its id, in which the policy is evaluated without exploration; None: it is not. It must be
+        another than the one that is learned; one made from an id begins with a seed that no run has learned with
+    :param eval_freq: environment steps between two evaluations. "auto": an eighth of the run
+    :param n_eval_episodes: episodes of an evaluation
+    :raises ValueError: if a frequency or a number is below 1 or a share not in (0, 1]; when learning starts, if variables,
+        state or ``eval_env`` do not fit the task
     :raises ModuleNotFoundError: when learning starts, if pictures are wanted and matplotlib is not installed
     """
 
@@ -78,10 +89,16 @@ class DashboardCallback(BaseCallback):
         scalar_share: float = DEFAULT_SCALAR_SHARE,
         picture_share: float = 1.0,
         verbose: int = 0,
+        eval_env: GymEnv | str | None = None,
+        eval_freq: int | str = AUTO,
+        n_eval_episodes: int = 5,
     ):
         super().__init__(verbose)
         if picture_freq != AUTO:
             check_count("picture_freq", picture_freq, none_allowed=True)
+        if eval_freq != AUTO:
+            check_count("eval_freq", eval_freq)
+        check_count("n_eval_episodes", n_eval_episodes)
         check_positive("scalar_share", scalar_share, max=1.0)
         check_positive("picture_share", picture_share, max=1.0)
         self.picture_freq = picture_freq
@@ -89,6 +106,9 @@ class DashboardCallback(BaseCallback):
         self.at = at
         self.scalar_share = scalar_share
         self.picture_share = picture_share
+        self.eval_env = eval_env
+        self.eval_freq = eval_freq
+        self.n_eval_episodes = n_eval_episodes
         self._writer: SummaryWriter | None = None
 
     @property
@@ -108,8 +128,11 @@ class DashboardCallback(BaseCallback):
         self._follow_scales()
         self._shown_at = self._drawn_at = self._scalars_at = self.model.num_timesteps
         n_steps = self.model._total_timesteps - self.model.num_timesteps
-        self._picture_freq = self._steps_between_pictures(n_steps)
-        self._next_pictures = self._following_pictures()
+        self._picture_freq = _steps_between(self.picture_freq, n_steps)
+        self._next_pictures = self._following(self._picture_freq)
+        self._eval_freq = None if self.eval_env is None else _steps_between(self.eval_freq, n_steps)
+        self._next_evaluation = self._following(self._eval_freq)
+        self._played = None if self.eval_env is None else self._env_to_play(self.eval_env)
         # Nobody wants scalars between logs who wants no logs.
         self._scalar_freq = max(1, n_steps // MAX_POINTS) if self.locals.get("log_interval") is not None else None
         half = 1.0 if self.scalar_share == 1.0 else 0.5 * self.scalar_share
@@ -155,6 +178,8 @@ class DashboardCallback(BaseCallback):
             self._write_scalars(self._writer)
         if self.num_timesteps >= self._next_pictures:
             self._show(self._writer, at_end=False)
+        if self.num_timesteps >= self._next_evaluation:
+            self._evaluate(self._writer)
         return True
 
     def _log_follows(self, n_ended: int) -> bool:
@@ -182,6 +207,8 @@ class DashboardCallback(BaseCallback):
         self._show(self._writer, at_end=True)
         self._writer.flush()
         self._writer = None
+        if isinstance(self.eval_env, str) and self._played is not None:
+            self._played.close()
 
     def _follow_scales(self) -> None:
         """Begin anew with planes and history if the agent has other scales: candidates are then numbered anew."""
@@ -225,21 +252,38 @@ class DashboardCallback(BaseCallback):
         self._marked = now, planning = time.perf_counter(), self.agent.planning_seconds
         return (planning - planning_before) / max(now - since, 1e-9)
 
-    def _steps_between_pictures(self, n_steps: int) -> int | None:
-        if isinstance(self.picture_freq, str):
-            return max(1, n_steps // PICTURES_A_RUN)
-        return self.picture_freq
+    def _following(self, freq: int | None) -> float:
+        """Return the next step that is a multiple of ``freq``; None: never."""
+        return float("inf") if freq is None else float((self.model.num_timesteps // freq + 1) * freq)
 
-    def _following_pictures(self) -> float:
-        """Return the next multiple of ``picture_freq``."""
-        if self._picture_freq is None:
-            return float("inf")
-        return float((self.model.num_timesteps // self._picture_freq + 1) * self._picture_freq)
+    def _env_to_play(self, given: GymEnv | str) -> VecEnv:
+        """Prepare the environment of evaluations."""
+        learned, env = self.training_env, self.model._wrap_env(gym.make(given) if isinstance(given, str) else given)
+        if _objects_of(env) & _objects_of(learned):
+            raise ValueError(f"eval_env must be another environment than the one that is learned, or an id, got {given!r}")
+        refuse_normalized_observations(env)
+        spaces, wanted = ((each.observation_space, each.action_space) for each in (env, learned))
+        if spaces != wanted:
+            raise ValueError(f"eval_env must have the spaces of the environment that is learned, {wanted}, got {spaces}")
+        if isinstance(given, str) and self.model.seed is not None:
+            env.seed(EVALUATION_SEED + self.model.seed)
+        return env
+
+    def _evaluate(self, writer: SummaryWriter) -> None:
+        """Write how the policy does without exploration."""
+        from sb3_combrel.tensorboard.summaries import scalars_summary
+
+        assert self._played is not None
+        played: Any = evaluate_policy(self.model, self._played, self.n_eval_episodes, return_episode_rewards=True, warn=False)
+        tags = ("eval/mean_reward", "eval/mean_ep_length")
+        scalars = {tag: float(np.mean(each)) for tag, each in zip(tags, played, strict=True)}
+        writer._get_file_writer().add_summary(scalars_summary(scalars), self.num_timesteps)
+        self._next_evaluation = self._following(self._eval_freq)
 
     def _show(self, writer: SummaryWriter, at_end: bool) -> None:
         """Write table and pictures, unless there are some of this step."""
         now = self.model.num_timesteps
-        self._next_pictures = self._following_pictures()
+        self._next_pictures = self._following(self._picture_freq)
         if now > self._shown_at and self._transfer is not None:
             writer.add_text("transfer/most_chosen_mappings", mapping_table(self._transfer, self.agent.task.action_names), now)
         self._shown_at = now
@@ -275,6 +319,15 @@ class _Allowance:
     def spend_since(self, began: float) -> None:
         self.next_seconds = time.perf_counter() - began
         self.spent += self.next_seconds
+
+
+def _steps_between(freq: int | str | None, n_steps: int) -> int | None:
+    return max(1, n_steps // TIMES_A_RUN) if isinstance(freq, str) else freq
+
+
+def _objects_of(env: VecEnv) -> set[int]:
+    """What a vectorized environment is made of below all wrappers."""
+    return {id(env.unwrapped), *(id(each.unwrapped) for each in getattr(env.unwrapped, "envs", ()))}
 
 
 def tensorboard_writer(logger: Logger) -> SummaryWriter | None:

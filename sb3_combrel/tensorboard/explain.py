@@ -8,9 +8,9 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
+from sb3_combrel.common.files import check_folder
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
-from sb3_combrel.pages.page import check_folder
 from sb3_combrel.pages.plane import Plane, VariablePair, check_matplotlib, planes_of
 from sb3_combrel.tensorboard.mapping_table import mapping_table
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer

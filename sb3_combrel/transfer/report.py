@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from sb3_combrel.common.serialisation import register_reader, register_writer
 
 if TYPE_CHECKING:
     # What an agent imports goes without Stable-Baselines3, which sources use.
@@ -203,3 +206,12 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
         cells = [cell.ljust(w) if k < 2 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))]
         lines.append("  " + "  ".join(cells).rstrip())
     return lines
+
+
+def _read(kind: Any, **content: Any) -> Any:
+    return kind(**{name: tuple(each) if isinstance(each, list) else each for name, each in content.items()})
+
+
+for _kind in (MappingReport, Contradiction, EvidencePoint, TransferReport):
+    register_writer(_kind, lambda one: (type(one).__name__, dict(vars(one))))
+    register_reader(_kind.__name__, partial(_read, _kind))

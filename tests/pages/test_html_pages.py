@@ -10,10 +10,11 @@ from helpers.command_line import call_for_all_output
 from matplotlib.colors import to_hex
 
 from sb3_combrel import FittedRMax, explain
+from sb3_combrel.common.files import check_folder
 from sb3_combrel.comparison.compare_page import compare_page
 from sb3_combrel.pages.drawings import contradictions_figure
 from sb3_combrel.pages.evidence_drawings import MAX_NAMED, OTHERS_COLOUR, evidence_figure, mean_evidence_figure, shortened
-from sb3_combrel.pages.page import Cell, Page, PageTable, Section, check_folder, data_address
+from sb3_combrel.pages.page import Cell, Page, PageTable, Section, data_address
 from sb3_combrel.pages.palette import METHOD_COLOURS, NONE_COLOUR, mapping_colours, method_colours
 from sb3_combrel.pages.plane import default_pair, numbered
 from sb3_combrel.pages.report_sections import ANOTHER, colour_of, colours_of_reports, contradictions_table, mapping_section

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,8 +28,20 @@ while True:
     model.learn(200, callback=keeps, reset_num_timesteps=False)
     model.save(path)
 """
-DEMO = ("demo", "--seeds", "3", "--episodes", "1", "--max-episode-steps", "60", "--workers", "2", "--output")
-BENCHMARK = ("benchmark", "--pairs", "mirrored-car", "--methods", "none", "COMBREL", "--seeds", "2", "--jobs", "2", "--output")
+COMPARE = """
+import sys, warnings
+from pathlib import Path
+from sb3_combrel import COMBREL, SourceInstances, compare
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    car, output = "MountainCar-v0", Path(sys.argv[1])
+    methods = {"none": None, "COMBREL": COMBREL(SourceInstances.record(None, car, n_instances=300, seed=0))}
+    compare(car, methods, seeds=2, steps=1_000, n_jobs=2, output=output, resolution=5).save(output / "report.html")
+"""
+CLI = ("-m", "sb3_combrel.cli")
+DEMO = (*CLI, "demo", "--seeds", "3", "--episodes", "1", "--max-episode-steps", "60", "--workers", "2", "--output")
+PAIR = ("--pairs", "mirrored-car", "--methods", "none", "COMBREL", "--seeds", "2")
+BENCHMARK = (*CLI, "benchmark", *PAIR, "--jobs", "2", "--output")
 
 
 def start(*arguments, **options):
@@ -72,20 +83,26 @@ def finished_runs(output, found):
     return found
 
 
-@pytest.mark.parametrize("command", [DEMO, BENCHMARK], ids=lambda command: command[0])
+@pytest.mark.parametrize("command", [DEMO, ("-c", COMPARE), BENCHMARK], ids=["demo", "compare", "benchmark"])
 def test_the_same_command_goes_on_however_often_it_is_killed(command, tmp_path):
+    began = time.monotonic()
+    assert start(*command, tmp_path / "in one go").wait() == 0
+    # At any moment of it, whatever the machine: in the first seconds there is nothing to lose.
+    seconds = time.monotonic() - began
     rng, output, found = np.random.default_rng(1), tmp_path / "output", {}
     for _ in range(N_KILLS):
-        process = start("-m", "sb3_combrel.cli", *command, output)
+        process = start(*command, output)
         try:
-            process.wait(timeout=rng.uniform(1.0, 20.0))
+            process.wait(timeout=rng.uniform(0.0, seconds))
         except subprocess.TimeoutExpired:
             kill(process)
         finished_runs(output, found)
         if process.returncode == 0:
             break
-    assert start("-m", "sb3_combrel.cli", *command, output).wait() == 0
+    assert start(*command, output).wait() == 0
     assert finished_runs(output, found)
-    before = {file: file.read_bytes() for file in Path(output).rglob("*.csv")}
-    assert before and start("-m", "sb3_combrel.cli", *command, output).wait() == 0
+    before = {file: file.read_bytes() for file in [*output.rglob("*.csv"), *output.glob("*.html")]}
+    assert before and start(*command, output).wait() == 0
     assert {file: file.read_bytes() for file in before} == before
+    for page in output.glob("*.html"):  # of a comparison: its page does not tell that it was killed
+        assert (tmp_path / "in one go" / page.name).read_bytes() == page.read_bytes()

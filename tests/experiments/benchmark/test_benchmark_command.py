@@ -252,7 +252,7 @@ class TestBadInput:
         changed.write_text((files / "two_walks.py").read_text().replace("n_episodes=6", "n_episodes=7"))
         message = fail("--pairs", changed, "--methods", "none", "--output", copied)
         assert "has results of other settings (two-walks, none, seed 7000: " in message
-        assert "n_episodes was 6 and is 7" in message and "use another --output" in message
+        assert "n_episodes was 6 and is 7" in message and "use another folder by --output" in message
         files_of_sources = {file.name.rpartition("_seed")[0] for file in (copied / "sources").iterdir()}
         assert len(files_of_sources) == 2, "a source that may be another one has files of its own"
 

@@ -167,12 +167,12 @@ class TestBadInput:
         car = DOMAINS["mountain_car"]
         changed = replace(car.settings["paper"], combrel={"breadth": 0.7})
         monkeypatch.setitem(DOMAINS, "mountain_car", replace(car, settings={**car.settings, "paper": changed}))
-        with pytest.raises(ValueError, match=r"other settings .*'breadth': 0\.4.*'breadth': 0\.7"):
+        with pytest.raises(ValueError, match=r"other settings .*COMBREL\.breadth was 0\.4 and is 0\.7"):
             reproduce("fig4", output=complete)
 
     def test_files_that_are_no_results(self, tmp_path):
         (tmp_path / "thesis.tex").write_text("mine")
-        with pytest.raises(ValueError, match="has files that are not results of this command; choose another --output"):
+        with pytest.raises(ValueError, match="has files that are not results of such runs; use another folder by --output"):
             reproduce("fig4", output=tmp_path)
         assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

@@ -1,0 +1,231 @@
+"""``compare(output=folder)``: finished runs are kept, the same call goes on from them, and what would be mixed is refused."""
+
+import json
+import os
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from helpers.dashboard import NamedWalk
+from helpers.walk import Walk, walk_source
+
+from sb3_combrel import COMBREL, MappingSet, SourceInstances
+from sb3_combrel.common.files import write_whole
+from sb3_combrel.comparison import compare as module
+from sb3_combrel.comparison.compare import ComparedRun, compare
+from sb3_combrel.runs.job import described
+from sb3_combrel.runs.runner import FOLDER, Backend, run_missing
+
+METHODS = {"none": None, "COMBREL": COMBREL(walk_source(), use="instances")}
+CALL = dict(env=Walk, methods=METHODS, seeds=1, steps=60, model_breadth=0.15, resolution=3, degree=0)
+POLE = dict(env="CartPole-v1", methods={"none": None, "other": None}, baseline="none")
+
+
+def quietly(**change):
+    """Compare; warnings of few runs do not matter here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return compare(**{**CALL, **change})
+
+
+@pytest.fixture
+def carried_out(monkeypatch):
+    """Method and seed of each run that is carried out."""
+    found, carry_out = [], ComparedRun.carry_out
+
+    def noted(self):
+        found.append((self.method, self.seed))
+        return carry_out(self)
+
+    monkeypatch.setattr(ComparedRun, "carry_out", noted)
+    return found
+
+
+def files_of(output):
+    return sorted((output / FOLDER).glob("*.json"))
+
+
+def test_a_comparison_that_goes_on_has_the_same_page_as_one_in_one_go(carried_out, tmp_path):
+    source = SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0)
+    call = dict(env=NamedWalk, methods={"none": None, "COMBREL": COMBREL(source)}, seeds=2, steps=250, degree=1)
+    output = tmp_path / "kept"
+    plain = quietly(**call)
+    carried_out.clear()
+    quietly(**call, output=output)
+    assert len(carried_out) == len(files_of(output)) == 6
+    carried_out.clear()
+    again = quietly(**call, output=str(output))
+    assert not carried_out
+    # As after a kill: two runs are missing, and of a third there is half a file, which a crash of the machine may leave.
+    lost, cut, also_lost = files_of(output)[::2]
+    lost.unlink()
+    also_lost.unlink()
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
+    resumed = quietly(**call, output=output)
+    assert len(carried_out) == 3
+    pages = [found.save(tmp_path / "report.html").read_bytes() for found in (plain, resumed)]
+    assert pages[0] == pages[1] and str(again) == str(plain)
+    assert repr(again.reports) == repr(plain.reports) and again.reports["COMBREL"][0].history
+    for method, shown in plain.snapshots.items():
+        for name in ("values", "greedy", "bound"):
+            np.testing.assert_array_equal(getattr(again.snapshots[method], name), getattr(shown, name), strict=True)
+
+
+def test_more_seeds_and_methods_use_what_is_there(carried_out, tmp_path):
+    quietly(output=tmp_path, methods={"none": None, "None": None}, baseline="none")
+    carried_out.clear()
+    quietly(output=tmp_path, seeds=2, methods={"none": None, "None": None, "more": None}, baseline="none", threshold=-10)
+    assert carried_out == [("none", 1), ("None", 1), ("more", 0), ("more", 1)]
+    # The page needs more of the first run than there is.
+    carried_out.clear()
+    quietly(output=tmp_path, seeds=[1], methods={"none": None, "more": None}, baseline="none")
+    assert carried_out == [("none", 1), ("more", 1)]
+
+
+def test_files_have_names_that_are_safe_and_differ():
+    alike, long = ["none", "None", "no ne", "no/ne", "../none"], ["a" * 300, "a" * 299 + "b", "移" * 300]
+    methods = [*alike, *long, "", 'n"<one>:*?|\\', "nul\0"]
+    runs = [ComparedRun(group="", method=method, seed=0, env="CartPole-v1") for method in methods]
+    names = [replace(run, is_shown=is_shown).name for run in runs for is_shown in (False, True)]
+    assert len({name.lower() for name in names}) == 2 * len(methods)
+    for name in names:
+        assert Path(name).name == name and not set(name) & set('/\\"<>:*?|\0 ')
+        assert len(f"{name}.json12345678.part".encode()) < 255
+
+
+def tasks(noise):
+    """A task whose function has no name and holds a number."""
+    return lambda: Walk(limit=noise)
+
+
+def sets(*states):
+    mappings = MappingSet([[0, 1], list(states)], [[0, 1]])
+    return {"none": None, "x": COMBREL(walk_source(), mappings, use="instances")}
+
+
+def with_combrel(source=None, **arguments):
+    return dict(methods={"none": None, "COMBREL": COMBREL(source or walk_source(), use="instances", **arguments)})
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "message"),
+    [
+        ({}, dict(steps=61), r"\(none, seed 0: n_steps was 60 and is 61\)"),
+        (
+            {},
+            dict(resolution=4, gamma=0.9),
+            r"learner.resolution was 3 and is 4; learner.gamma was '\(not given\)' and is 0.9",
+        ),
+        ({}, dict(env=NamedWalk), "env was 'helpers.walk.Walk' and is 'helpers.dashboard.NamedWalk'"),
+        (dict(env=tasks(20)), dict(env=tasks(30)), r"env\.\S*lambda> was .*20.* and is .*30"),
+        ({}, with_combrel(breadth=0.4), r"\(COMBREL, seed 0: transfer\.\S*COMBREL.breadth was .* and is 0.4\)"),
+        ({}, with_combrel(walk_source(61)), "source was '60 instances .* and is '61 instances "),
+        (dict(methods=sets(1, 0)), dict(methods=sets(1, 1)), "transfer.mappings was '<2 mappings.* and is '<2 mappings"),
+        (POLE, {**POLE, "env": "CartPole-v0"}, "env.id was 'CartPole-v1' and is 'CartPole-v0'"),
+    ],
+)
+def test_runs_of_other_settings_are_refused_and_stay(before, now, message, carried_out, tmp_path):
+    quietly(**before, controls=False, output=tmp_path)
+    kept = {file: file.read_bytes() for file in files_of(tmp_path)}
+    carried_out.clear()
+    with pytest.raises(ValueError, match=f"^{tmp_path} has results of other settings .*{message}.*; use another folder by"):
+        quietly(**{**before, **now}, controls=False, output=tmp_path)
+    assert not carried_out and {file: file.read_bytes() for file in files_of(tmp_path)} == kept
+
+
+def test_a_source_named_by_its_file_is_known_by_its_content(tmp_path):
+    def methods(n):
+        walk_source(n).save(tmp_path / "source.npz")
+        return {"none": None, "COMBREL": COMBREL(str(tmp_path / "source.npz"), use="instances")}
+
+    quietly(methods=methods(60), output=tmp_path / "kept", controls=False)
+    quietly(methods=methods(60), output=tmp_path / "kept", controls=False)
+    with pytest.raises(ValueError, match=r"source was '60 instances .*' and is '70 instances "):
+        quietly(methods=methods(70), output=tmp_path / "kept", controls=False)
+
+
+def test_settings_do_not_depend_on_where_things_lie_in_memory():
+    class Odd:
+        def __repr__(self):
+            return f"Odd({object.__repr__(self)})"
+
+    one, other = (
+        ComparedRun(group="", method="m", seed=0, env=gym.envs.registration.EnvSpec("Odd-v0", Walk, kwargs={"odd": Odd()}))
+        for _ in range(2)
+    )
+    settings = json.dumps(one.settings())
+    assert settings == json.dumps(other.settings()) and " at 0x" not in settings and "helpers.walk.Walk" in settings
+    assert described(tasks(3)) == described(tasks(3)) != described(tasks(4))
+    assert " at 0x" not in str(described(lambda: [each for each in (lambda: 3)()]))
+
+
+@pytest.mark.parametrize("kind", ["file", "below a file", "number", "others"])
+def test_an_output_that_cannot_be_one_is_refused_before_anything_is_tried_out(kind, tmp_path, monkeypatch):
+    (tmp_path / "thesis.txt").write_text("mine")
+    wrong = {"file": tmp_path / "thesis.txt", "below a file": tmp_path / "thesis.txt" / "x", "number": 3, "others": tmp_path}[
+        kind
+    ]
+    monkeypatch.setattr(module, "_try_out", lambda run: pytest.fail("the error should have come before"))
+    message = {
+        "number": "output must be the path of a folder, or None to keep nothing, got 3",
+        "others": "has files that are not",
+    }
+    with pytest.raises(
+        (ValueError, OSError), match=message.get(kind, "^output must be in a folder that can be written to, got .*")
+    ):
+        quietly(output=wrong)
+    assert os.listdir(tmp_path) == ["thesis.txt"] and (tmp_path / "thesis.txt").read_text() == "mine"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="permissions are those of POSIX")
+@pytest.mark.parametrize("rights", [0o000, 0o500])
+def test_a_folder_without_permission_is_named(rights, tmp_path):
+    output = tmp_path / "kept"
+    output.mkdir()
+    output.chmod(rights)
+    is_root = os.geteuid() == 0
+    if is_root:  # who may write anywhere
+        os.seteuid(65534)
+    try:
+        with pytest.raises(
+            PermissionError, match=r"^output must be in a folder that can be written to, got .*Permission denied$"
+        ):
+            quietly(output=output)
+    finally:
+        if is_root:
+            os.seteuid(0)
+        output.chmod(0o700)
+    assert not any(output.iterdir())
+
+
+def test_a_disk_that_is_full_loses_no_finished_run(carried_out, tmp_path, monkeypatch):
+    n_written = []
+
+    def write_two(target, content):
+        n_written.append(target)
+        if len(n_written) > 2:
+            raise OSError(28, "No space left on device", str(target))
+        write_whole(target, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_combrel.runs.runner.write_whole", write_two)
+        with pytest.raises(
+            OSError, match=r"^output must be .*: No space left on device \(COMBREL, seed 0\); runs that .* kept"
+        ):
+            quietly(output=tmp_path, seeds=2)
+    assert len(carried_out) == 3 and len(files_of(tmp_path)) == 2
+    carried_out.clear()
+    quietly(output=tmp_path, seeds=2)
+    assert carried_out[0] == ("COMBREL", 0) and len(carried_out) == 4
+
+
+def test_a_report_that_cannot_be_kept_says_so(monkeypatch, tmp_path):
+    """Of a method of the user's own, which may report anything; without a folder it is handed on."""
+    monkeypatch.setattr(ComparedRun, "measure", lambda *_: {"report": {"odd": object()}})
+    run = ComparedRun(group="", method="Mine", seed=0, env=Walk, n_steps=30)
+    assert run_missing([run], backend=Backend(n_jobs=1))[0].error == ""
+    with pytest.raises(TypeError, match=r"Mine, seed 0: cannot write <object object .*> as plain data"):
+        run_missing([run], tmp_path, Backend(n_jobs=1))
