@@ -9,13 +9,14 @@ from pathlib import Path
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.paper.domains import SETTINGS
 
-#: What is copied of the folders that ``reproduce`` and ``benchmark`` write. Runs, sources and SVG figures stay where they are,
-#: and the benchmark's other Markdown files: its page has their tables.
+#: What is copied of the folders that ``reproduce``, ``benchmark`` and ``make learner`` write. Single runs, sources and SVG
+#: figures stay where they are, and the benchmark's other Markdown files: its page has their tables.
 COPIED = {Path("reproduction") / setting: ("*.md", "*.csv", "*.png") for setting in SETTINGS}
 COPIED[Path("benchmark")] = ("benchmark.md", "*.csv", "*.png")
+COPIED[Path("learner")] = ("*.md", "tables_*.csv", "runs.csv")
 DOCS = Path("docs/results")
 #: Pages with marks.
-PAGES = (Path("docs/results.md"), Path("docs/benchmark.md"))
+PAGES = (Path("docs/results.md"), Path("docs/benchmark.md"), Path("docs/results/learner.md"))
 
 # <!-- table: path, number --> ... <!-- end of table -->; the number is that of the table in the file, from 1 on.
 _MARKED = re.compile(r"(<!-- table: (?P<path>[^,>]+), (?P<number>\d+) -->\n).*?(<!-- end of table -->)", re.DOTALL)

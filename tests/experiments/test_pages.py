@@ -32,8 +32,8 @@ def test_a_table_that_is_not_there_is_named(tmp_path):
 
 def test_results_are_copied_but_runs_are_not(tmp_path):
     names = ("table6.md", "icub.csv", "fig2.png", "fig2.svg", "benchmark.md", "runs/a.json", "sources/a.npz")
-    for folder in ("reproduction/paper", "reproduction/best", "benchmark"):
-        for name in names:
+    for folder in ("reproduction/paper", "reproduction/best", "benchmark", "learner"):
+        for name in (*names, "runs.csv", "tables_1.csv", "episodes.csv"):
             file = tmp_path / folder / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(f"{folder} {name}")
@@ -43,8 +43,12 @@ def test_results_are_copied_but_runs_are_not(tmp_path):
     pages.main(tmp_path)
     docs = tmp_path / pages.DOCS
     made = {str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file()}
-    of_setting = ("table6.md", "benchmark.md", "icub.csv", "fig2.png")
+    of_setting, tables = ("table6.md", "benchmark.md", "icub.csv", "fig2.png"), ("runs.csv", "tables_1.csv", "episodes.csv")
     expected = {f"{setting}/{name}" for setting in ("paper", "best") for name in of_setting}
     # The tables of a page of the benchmark are in it.
-    assert made == expected | {f"benchmark/{name}" for name in of_setting[1:]}
+    expected |= {f"{setting}/{name}" for setting in ("paper", "best") for name in tables}
+    expected |= {f"benchmark/{name}" for name in (*of_setting[1:], *tables)}
+    # Of single episodes nothing is shown.
+    expected |= {f"learner/{name}" for name in ("table6.md", "benchmark.md", "runs.csv", "tables_1.csv")}
+    assert made == expected | {"learner.md"}, "a page that is filled in"
     assert (docs / "best" / "icub.csv").read_text() == "reproduction/best icub.csv"
