@@ -185,7 +185,7 @@ torch_index = $(if $(and $(PYTHON),$(WITHOUT_CUDA)),$(shell $(answers) && echo -
 # dm_control goes in without labmaze where this has no wheel: only dm_control's locomotion tasks use it.
 define install
 @$(if $(PYTHON),,echo "Python 3.11, 3.12 or 3.13 is needed, and none was found. Install one, or name it: make PYTHON=/path/to/python" >&2; exit 1)
-@$(PYTHON) -c '$(SUPPORTED)' || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1); Python 3.11, 3.12 or 3.13 is needed: make PYTHON=/path/to/python" >&2; exit 1; }
+@$(PYTHON) -c '$(SUPPORTED)' || { echo "$(PYTHON) is $$($(PYTHON) --version 2>&1 | head -n 1); Python 3.11, 3.12 or 3.13 is needed: make PYTHON=/path/to/python" >&2; exit 1; }
 @[ ! -e $(VENV)/.unfinished ] && $(BIN)/python -m pip --version >/dev/null 2>&1 || { $(call new_venv,$(VENV)) && touch $(VENV)/.unfinished; }
 @install="$(call pip,$(VENV))" && $$install setuptools && $$install --no-build-isolation -e ".[$(1)]" && \
 	{ $(BIN)/python -c 'import importlib.util as u; exit(u.find_spec("dm_control") is None)' || \

@@ -1,6 +1,7 @@
 """Versions and commands are stated in several files, which must agree: pins, pre-commit, the workflow, the Makefile."""
 
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -66,3 +67,14 @@ def test_every_layer_of_the_import_contracts_exists_and_every_module_is_in_one(c
     on_disk = {path.stem for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     named = [name.strip() for layer in contract["layers"] for name in re.split("[|:]", layer)]
     assert sorted(named + contract.get("exhaustive_ignores", [])) == sorted(on_disk - {"__init__"})
+
+
+def test_an_interpreter_that_does_not_run_is_told_by_its_first_line(tmp_path):
+    """That of pyenv says more, in six lines, at the end of which nobody finds what is needed."""
+    python = tmp_path / "python3.13"
+    python.write_text("#!/bin/sh\nprintf 'command not found\\nThis and that\\n' >&2\nexit 127\n")
+    python.chmod(0o755)
+    given = f"PYTHON={python}", f"VENV={tmp_path / 'venv'}", "TORCH_INDEX="
+    made = subprocess.run(["make", "lint", *given], cwd=ROOT, capture_output=True, text=True)
+    assert made.returncode != 0 and not (tmp_path / "venv").exists()
+    assert f"{python} is command not found; Python 3.11, 3.12 or 3.13 is needed: make PYTHON=" in made.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +110,7 @@ class PastData(SavedAlgorithm):
         if isinstance(buffer, ReplayBuffer) and buffer.size() > 0:
             return _of_buffer(buffer, task)
         if isinstance(given, type) or not (hasattr(given, "predict") or callable(given)):
-            raise ValueError(f"instances must be {KINDS}, got {given!r}")
+            raise ValueError(f"instances must be {KINDS}, got {reprlib.repr(given)}")
         return self._act(given, n_instances)
 
     def _act(self, controller: Callable[[np.ndarray], int] | Any, n_instances: int) -> SourceInstances:
@@ -144,6 +145,9 @@ class PastData(SavedAlgorithm):
         task = self.policy.agent.task
         other = "; for experience of another task there is transfer=COMBREL(source)"
         if found.n_variables != task.scaling.n_variables or found.n_actions > task.n_actions:
+            if found.n_variables > task.scaling.n_variables:
+                chosen = 'load_instances(SourceInstances.from_table(table, state_names=["x", ...]))'
+                other = f"; where a table has other columns too, name those of the state: {chosen}{other}"
             raise ValueError(
                 f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"

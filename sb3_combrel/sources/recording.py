@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -107,15 +108,27 @@ def _actor(
         if not callable(model):
             raise ValueError(f"model must be an SB3 model or policy, a function of the state, or None, got {model!r}")
         function = model
-        return lambda seen, states, starts: np.array([int(function(state)) for state in states])
+        return lambda seen, states, starts: np.array([_checked(function(state), env, state) for state in states])
     memory: list[Any] = [None]
 
     def predict(seen: Any, states: NDArray[Any], starts: NDArray[np.bool_]) -> NDArray[Any]:
         # Recurrent policies carry a hidden state from step to step.
         actions, memory[0] = predict_action(seen, state=memory[0], episode_start=starts, deterministic=deterministic)
-        return np.asarray(actions)
+        return np.array([_checked(action, env, state) for action, state in zip(actions, states, strict=True)])
 
     return predict
+
+
+def _checked(action: Any, env: VecEnv, state: NDArray[Any]) -> int:
+    """What a behaviour has returned, or an array of it alone, as a number; ``ValueError`` if it is no action of the task."""
+    first, n_actions = int(env.action_space.start), count_actions(env.action_space)  # type: ignore[attr-defined]
+    number = np.asarray(action)
+    if number.size == 1 and number.dtype.kind in "iuf" and number.item() in range(first, first + n_actions):
+        return int(number.item())
+    raise ValueError(
+        f"model must return a whole number from {first} to {first + n_actions - 1}, got {reprlib.repr(action)} in the state "
+        f"{state.tolist()}; of a continuous action return the number of the nearest of those that the task has"
+    )
 
 
 @contextmanager

@@ -56,9 +56,18 @@ def _read(table: Table) -> pd.DataFrame:
     if isinstance(table, pd.DataFrame):
         return table
     try:
-        return pd.read_csv(table, skipinitialspace=True)
+        frame = pd.read_csv(table, skipinitialspace=True)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"there is no file {os.fspath(table)}, looked for in {os.getcwd()}") from error
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise ValueError(f"{os.fspath(table)} is no table with named columns: {' '.join(str(error).split())}") from error
+    for separator in (";", "\t"):
+        if len(frame.columns) == 1 and separator in str(frame.columns[0]):
+            raise ValueError(
+                f"{os.fspath(table)} must have commas between its columns, got {separator!r}: read it with "
+                f"pandas.read_csv(path, sep={separator!r}), and pass that table (where numbers have a comma, with decimal=',')"
+            )
+    return frame
 
 
 def _state_names(frame: pd.DataFrame) -> tuple[str, ...]:
@@ -66,10 +75,12 @@ def _state_names(frame: pd.DataFrame) -> tuple[str, ...]:
     return tuple(str(name) for name in frame.columns if str(name) not in _NO_STATES and not str(name).startswith(NEXT))
 
 
-def _require(frame: pd.DataFrame, name: str) -> None:
+def _require(frame: pd.DataFrame, name: str, others: Sequence[str] = ()) -> None:
+    """:param others: names that are right, none of which is this one misspelt"""
     if name not in frame.columns:
         columns = [str(each) for each in frame.columns]
-        raise ValueError(f"the table has no column {name!r}, its columns are {columns}{did_you_mean(name, columns)}")
+        meant = did_you_mean(name, set(columns).difference(others))
+        raise ValueError(f"the table has no column {name!r}, its columns are {columns}{meant}")
 
 
 def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.DataFrame, Floats]:
@@ -77,7 +88,7 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
     following = [f"{NEXT}{name}" for name in names]
     if any(name in frame.columns for name in following):
         for name in following:
-            _require(frame, name)
+            _require(frame, name, following)
         return frame, _numbers(frame, following)
     ends = _flags(frame, TERMINATED) | _flags(frame, DONE) | _flags(frame, TRUNCATED)
     acts = frame[ACTION].notna().to_numpy()

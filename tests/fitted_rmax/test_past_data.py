@@ -105,6 +105,11 @@ def loaded_dqn(env, steps):
     return dqn.learn(steps) if steps else dqn
 
 
+def test_a_controller_of_continuous_actions_is_refused_with_what_to_return():
+    with pytest.raises(ValueError, match=r"got 0\.3 in the state .*number of the nearest"):
+        model().load_instances(lambda state: 0.3)
+
+
 def test_a_replay_buffer_is_read_transition_by_transition():
     dqn = loaded_dqn(Walk(limit=4), 90)
     for given in (dqn, dqn.replay_buffer):
@@ -187,6 +192,7 @@ def other_task():
         ("nothere", FileNotFoundError, "nothere"),
         (7, ValueError, "instances must be .* got 7"),
         (COMBREL, ValueError, "instances must be"),
+        ([7] * 1_000, ValueError, "instances must be .{,300}$"),
     ],
 )
 def test_what_cannot_be_loaded_is_named_and_nothing_changes(given, error, message):
@@ -194,6 +200,14 @@ def test_what_cannot_be_loaded_is_named_and_nothing_changes(given, error, messag
     with pytest.raises(error, match=message):
         learner.load_instances(given)
     assert learner.agent.model.n_instances == 0
+
+
+def test_a_table_with_other_columns_is_read_with_the_names_of_the_states():
+    table = walk_source().to_table().assign(second=0.5, next_second=0.5)
+    with pytest.raises(ValueError, match=r"got 3 .*'second'.*from_table\(table, state_names="):
+        model().load_instances(table)
+    chosen = SourceInstances.from_table(table, state_names=["s0", "s1"])
+    assert model().load_instances(chosen).agent.model.n_instances == 60
 
 
 def test_other_names_are_another_task():

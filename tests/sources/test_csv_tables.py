@@ -1,5 +1,7 @@
 """Tables of past transitions: CSV files and data frames, with and without columns of next states."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -89,7 +91,7 @@ def test_what_is_written_as_a_table_is_read_again(n, d, n_actions, seed):
     ("change", "message"),
     [
         ({"reward": None, "rewards": STEPS["reward"]}, "no column 'reward'.*did you mean 'rewards'"),
-        ({"next_v": None}, "no column 'next_v'"),
+        ({"next_v": None}, r"no column 'next_v', its columns are .*\]$"),
         ({"x": [0.0, np.nan, 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got nan in row 1"),
         ({"x": [0.0, "wall", 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got 'wall' in row 1"),
         ({"action": [0, 1, 0.5, 1, 1]}, "'action' must be whole numbers from 0 on, got 0.5 in row 2"),
@@ -116,3 +118,17 @@ def test_a_file_that_is_no_table_is_refused(tmp_path, content):
     (tmp_path / "log.csv").write_bytes(content)
     with pytest.raises(ValueError, match=r"log\.csv is no table|no column"):
         SourceInstances.from_table(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_other_separators_than_commas_are_named_and_what_reads_them(tmp_path, separator):
+    pd.DataFrame(STEPS).to_csv(tmp_path / "log.csv", index=False, sep=separator)
+    with pytest.raises(ValueError, match=re.escape(f"sep={separator!r}")):
+        SourceInstances.from_table(tmp_path / "log.csv")
+    assert len(SourceInstances.from_table(pd.read_csv(tmp_path / "log.csv", sep=separator))) == len(STEPS["x"])
+
+
+def test_a_file_that_is_not_there_is_named_with_its_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=re.escape(f"no file lgo.csv, looked for in {tmp_path}")):
+        SourceInstances.from_table("lgo.csv")

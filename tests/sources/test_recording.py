@@ -36,6 +36,24 @@ class TestRecord:
         check_corridor(source)
         np.testing.assert_array_equal(source.actions, np.where(source.states[:, 0] < 0.6, 1, 0))
 
+    def test_an_action_may_be_an_array_of_one_number(self):
+        plain = SourceInstances.record(lambda state: 0, Corridor(), 20, seed=0)
+        for made in (np.array([0]), np.float32(0.0), [0], np.array([[0]])):
+            assert_same(SourceInstances.record(lambda state, made=made: made, Corridor(), 20, seed=0), plain)
+
+    @pytest.mark.parametrize("answer", [0.5, -2, 1, np.nan, None, "left", np.array([0, 0]), np.array([])])
+    def test_what_is_no_action_is_refused_at_the_first_step(self, answer):
+        seen = []
+        with pytest.raises(ValueError, match=r"model must return a whole number from -1 to 0, got .*number of the nearest"):
+            SourceInstances.record(lambda state: (seen.append(state), answer)[1], Corridor(), 20, seed=0)
+        assert len(seen) == 1
+
+    def test_a_model_with_continuous_actions_is_refused_at_the_first_step(self):
+        model = PPO("MlpPolicy", "Pendulum-v1", seed=0, n_steps=8, batch_size=8)
+        pendulum = gym.wrappers.DiscretizeAction(gym.make("Pendulum-v1"), bins=5)
+        with pytest.raises(ValueError, match=r"model must return a whole number from 0 to 4, got .*number of the nearest"):
+            SourceInstances.record(model, pendulum, 20, seed=0)
+
     @pytest.mark.parametrize("vec_env", [DummyVecEnv, pytest.param(SubprocVecEnv, marks=pytest.mark.long)])
     def test_vectorised_environments_are_recorded_and_left_open(self, vec_env):
         env = vec_env([lambda: Monitor(Corridor()), lambda: Monitor(Corridor(limit=4)), lambda: Monitor(Corridor())])
