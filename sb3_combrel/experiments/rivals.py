@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
@@ -104,8 +104,8 @@ class RivalJob(Job):
         """The number of environments that learning takes steps in at the same time."""
         return int(self.learner.get("n_envs", 1))
 
-    def make_learner(self, envs: VecEnv) -> BaseAlgorithm:
-        """Make the algorithm, which has learnt nothing yet."""
+    def make_learner(self, envs: VecEnv) -> Any:
+        """Make the model, of Stable-Baselines3's kind, which has learnt nothing yet."""
         if self.method == FITTED_RMAX:
             return FittedRMax(envs, seed=self.seed)
         return class_of(self.method)(env=envs, seed=self.seed, **arguments_of(self.learner))
@@ -188,13 +188,6 @@ def folder_of(package: str, user: str) -> Path:
     return Path(spec.origin).parent
 
 
-def environment(algorithm: str, task: str) -> Task:
-    """Return the environment that an algorithm learns a task in."""
-    if algorithm == FITTED_RMAX:
-        return SUITE[task].make
-    return DISCRETISED.get(task, task) if algorithm == "DQN" else task
-
-
 def rival_jobs(tasks: Sequence[str], algorithms: Sequence[str], seeds: Sequence[int], max_steps: int) -> list[RivalJob]:
     """Make the jobs, seed by seed; CrossQ has none where actions are discrete.
 
@@ -208,28 +201,30 @@ def rival_jobs(tasks: Sequence[str], algorithms: Sequence[str], seeds: Sequence[
             raise ValueError(f"{argument} must be some of {', '.join(known)}, got {unknown[0]!r}{close}")
     if CROSSQ in algorithms:
         folder_of("sbx", CROSSQ)
-    jobs = []
-    for seed in seeds:
-        for task in tasks:
-            for algorithm in algorithms:
-                if algorithm == CROSSQ and task not in DISCRETISED:
-                    continue
-                name = ALIKE.get(task, task) if algorithm == "DQN" else task
-                learner = {} if algorithm == FITTED_RMAX else published(algorithm, name)
-                most = min(max_steps, int(learner.get("n_timesteps", MAX_STEPS_OF_FITTED_RMAX)))
-                jobs.append(
-                    RivalJob(
-                        group=task,
-                        method=algorithm,
-                        seed=seed,
-                        env=environment(algorithm, task),
-                        n_steps=most,
-                        learner=learner,
-                        threshold=THRESHOLDS[task],
-                        every=EVERY[algorithm],
-                    )
-                )
-    return jobs
+    runs = [run for run in product(tasks, algorithms) if run[1] != CROSSQ or run[0] in DISCRETISED]
+    return [rival_job(*run, seed, max_steps) for seed in seeds for run in runs]
+
+
+def rival_job(task: str, algorithm: str, seed: int, max_steps: int) -> RivalJob:
+    """Make the job of one run."""
+    env: Task = task
+    learner: dict[str, Any] = {}
+    if algorithm == FITTED_RMAX:
+        env = SUITE[task].make
+    elif algorithm == "DQN":
+        env, learner = DISCRETISED.get(task, task), published(algorithm, ALIKE.get(task, task))
+    else:
+        learner = published(algorithm, task)
+    return RivalJob(
+        group=task,
+        method=algorithm,
+        seed=seed,
+        env=env,
+        n_steps=min(max_steps, int(learner.get("n_timesteps", MAX_STEPS_OF_FITTED_RMAX))),
+        learner=learner,
+        threshold=THRESHOLDS[task],
+        every=EVERY[algorithm],
+    )
 
 
 def table_of(results: Sequence[Result]) -> pd.DataFrame:
