@@ -6,8 +6,10 @@ missing.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -151,8 +153,21 @@ def class_of(name: str) -> Any:
     if name == CROSSQ:
         import sbx
 
+        keep_compiled()
         return sbx.CrossQ
     return {"DQN": DQN, "PPO": PPO}[name]
+
+
+@functools.cache
+def keep_compiled() -> tempfile.TemporaryDirectory[str]:
+    """Let JAX, which compiles anew for each model, keep what it has compiled on disk as Numba does, until the process ends."""
+    import jax
+
+    folder = tempfile.TemporaryDirectory()
+    jax.config.update("jax_compilation_cache_dir", folder.name)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return folder
 
 
 def arguments_of(published: Mapping[str, Any]) -> dict[str, Any]:
