@@ -58,9 +58,9 @@ def test_versions_agree():
     assert f"\n## [{version}] - 20" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_all_contains_every_extra_but_those_of_developers():
+def test_all_contains_every_extra_but_those_of_developers_and_rivals():
     (line,) = EXTRAS["all"]
-    assert set(re.fullmatch(r"sb3-combrel\[(.+)\]", line)[1].split(",")) == set(EXTRAS) - {"all", "dev", "docs"}
+    assert set(re.fullmatch(r"sb3-combrel\[(.+)\]", line)[1].split(",")) == set(EXTRAS) - {"all", "benchmarks", "dev", "docs"}
 
 
 def test_constraints_pin_all_that_is_required():

@@ -25,9 +25,14 @@ def with_forces(env: gym.Env, forces: Sequence[float]) -> gym.Env:
     return TransformAction(env, lambda action: values[[int(action)]], Discrete(len(values)))
 
 
+def make_torques() -> gym.Env:
+    """Make Gymnasium's pendulum with five torques, from the least to the largest."""
+    return with_forces(make_env("Pendulum-v1", disable_env_checker=True), np.linspace(-2.0, 2.0, 5).tolist())
+
+
 def make_pendulum() -> gym.Env:
-    """Make Gymnasium's pendulum with five torques, from the least to the largest, and its angle as a state variable."""
-    return AngleObservation(with_forces(make_env("Pendulum-v1", disable_env_checker=True), np.linspace(-2.0, 2.0, 5).tolist()))
+    """Make it with its angle as a state variable."""
+    return AngleObservation(make_torques())
 
 
 def make_car() -> gym.Env:
