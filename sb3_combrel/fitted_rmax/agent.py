@@ -275,7 +275,9 @@ class FittedRMaxAgent:
             if self.transfer is not None:
                 self.transfer.environment = environment
                 self.transfer.end_episode(truncated)
-            if self.model.narrows and self.search.end_episode(environment, self.rewards.differ):
+            # A point of the grid that is not known draws the agent on, though one episode may be too short to get there.
+            goes_on = self.rewards.differ or not self.model.known.all()
+            if self.model.narrows and self.search.end_episode(environment, goes_on):
                 self._use_other_kernel()
                 return
             self._outdated.append(self.model.end_episode())

@@ -10,7 +10,7 @@ class Search:
 
     Until an episode ends or a reward is another one, nobody knows how small the place is that is looked for. An agent that
     knows all states by a kernel that is too broad for it would do the same for ever. So after an episode in which nothing was
-    unknown the kernel's volume is halved: about twice as many visits are needed then, and no search takes much more than twice
+    unknown, nor anything left to explore, the kernel's volume is halved: about twice as many visits are needed then, and no search takes much more than twice
     the visits that were necessary. Once outcomes differ the kernel is as broad again as it was.
     """
 
@@ -23,14 +23,14 @@ class Search:
         """What the kernel's breadth, unit coordinates, has become."""
         return float(breadth * 0.5 ** (self.n_halvings / n_variables))
 
-    def end_episode(self, environment: int, found: bool) -> bool:
+    def end_episode(self, environment: int, goes_on: bool) -> bool:
         """Halve the kernel's volume if all was known and nothing found; whether it has another breadth now.
 
-        :param found: whether outcomes differ
+        :param goes_on: whether outcomes differ, or something is left to explore
         """
         all_known = environment not in self.met_unknown
         self.met_unknown.discard(environment)
-        if found or not all_known:
+        if goes_on or not all_known:
             return False
         self.n_halvings += 1
         # Episodes of other environments that are under way were of the broader kernel.

@@ -76,9 +76,9 @@ def test_a_search_that_is_saved_goes_on_as_the_one_that_was_not(tmp_path):
 def test_an_episode_that_met_something_unknown_or_began_under_a_broader_kernel_halves_nothing():
     search = Search()
     search.met_unknown = {0, 1}
-    assert not search.end_episode(0, found=False) and search.met_unknown == {1}
-    assert not search.end_episode(0, found=True) and search.n_halvings == 0
-    assert search.end_episode(0, found=False) and search.breadth(0.4, 4) == pytest.approx(0.4 * 0.5**0.25)
+    assert not search.end_episode(0, goes_on=False) and search.met_unknown == {1}
+    assert not search.end_episode(0, goes_on=True) and search.n_halvings == 0
+    assert search.end_episode(0, goes_on=False) and search.breadth(0.4, 4) == pytest.approx(0.4 * 0.5**0.25)
     again = Search()
     again.met_unknown = {0, 3}
     again.set_state(search.get_state())

@@ -62,7 +62,7 @@ def test_a_suite_is_written_run_by_run_and_resumed(tmp_path):
     narrow = rows[(rows["task"] == "small") & (rows["variant"] == "narrow")]["steps_1_to_3"]
     mean, error = (format_number(number) for number in (narrow.mean(), narrow.sem()))
     assert f"| steps_1_to_3 | narrow | 2 | {mean} ± {error} |" in (tmp_path / "tasks.md").read_text()
-    with pytest.raises(ValueError, match=r"other settings \(small, narrow, seed 5: learner was .*0.05.* and is .*0.1"):
+    with pytest.raises(ValueError, match=r"other settings \(small, narrow, seed 5: learner.model_breadth was 0.05 and is 0.1"):
         run(tmp_path, variants=[Variant("narrow", {"model_breadth": 0.1})])
 
 
