@@ -10,8 +10,9 @@ class Search:
 
     Until an episode ends or a reward is another one, nobody knows how small the place is that is looked for. An agent that
     knows all states by a kernel that is too broad for it would do the same for ever. So after an episode in which nothing was
-    unknown, nor anything left to explore, the kernel's volume is halved: about twice as many visits are needed then, and no search takes much more than twice
-    the visits that were necessary. Once outcomes differ the kernel is as broad again as it was.
+    unknown, nor anything left to explore, the kernel's volume is halved: about twice as many visits are needed then, and no
+    search takes much more than twice the visits that were necessary. Once outcomes differ the kernel is as broad again as it
+    was.
     """
 
     def __init__(self) -> None:
