@@ -26,8 +26,6 @@ class Instances(NamedTuple):
     block_low: np.ndarray  # float64, (n_actions, n_variables, capacity / BLOCK): lower corners of the blocks' boxes
     block_high: np.ndarray  # the same: upper corners
     gap: np.ndarray  # float64 scratch, (capacity / BLOCK,): how far a state is from the boxes
-    seen: np.ndarray  # int64 scratch, (n_actions, capacity): the last search that began with each instance
-    searches: np.ndarray  # int64 scratch, (1,): how many searches there were
     periodic: np.ndarray  # bool, (n_variables,): coordinates of periodic variables are stored wrapped to [0, 1]
 
     @classmethod
@@ -47,8 +45,6 @@ class Instances(NamedTuple):
             block_low=np.full((n_actions, n_variables, n_blocks), np.inf),
             block_high=np.full((n_actions, n_variables, n_blocks), -np.inf),
             gap=np.empty(n_blocks),
-            seen=np.zeros((n_actions, capacity), dtype=np.int64),
-            searches=np.zeros(1, dtype=np.int64),
             periodic=flag_array(periodic, n_variables),
         )
 

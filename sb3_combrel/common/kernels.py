@@ -170,35 +170,22 @@ def insert_by_distance(items, distances, length, item, distance):
 
 
 @inner
-def nearest_instances(instances, action, state, farthest, items, distances, n_before, left_out=-1):
+def nearest_instances(instances, action, state, farthest, items, distances):
     """The nearest instances of ``action``, nearest first, as many as ``items`` has room for; how many.
 
     :param farthest: squared distance beyond which none counts
     :param items: int32, receives them; ``distances``: their squared distances
-    :param n_before: how many of the last query, which is looked at first, are in ``items``
-    :param left_out: an instance that does not count
     """
     count = instances.size[action]
     room = len(items)
     wraps = any_periodic(instances.periodic)
-    instances.searches[0] += 1
-    search = instances.searches[0]
     length = np.int64(0)
-    for b in range(n_before):
-        before = np.int64(items[b])
-        if before < count:
-            instances.seen[action, before] = search
-            distance = squared_distance(state, instances.state[action, before], instances.periodic, wraps)
-            if distance <= farthest:
-                length = insert_by_distance(items, distances, length, before, distance)
-    if length == room:
-        farthest = distances[room - 1]
     for block in range(measure_blocks(instances, action, state)):
         if instances.gap[block] > farthest * (1 + 1e-12):
             continue
         for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
             distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
-            if distance > farthest or i == left_out or instances.seen[action, i] == search:
+            if distance > farthest:
                 continue
             length = insert_by_distance(items, distances, length, i, distance)
             if length == room:

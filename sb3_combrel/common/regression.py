@@ -15,6 +15,8 @@ from sb3_combrel.common.constants import LAST_WEIGHT, RIDGE
 from sb3_combrel.common.periodic import difference
 
 PER_BREADTH = -np.log(LAST_WEIGHT)
+# Sums over instances are taken in so many parts at a time, as vector registers do: in the same order on any machine.
+GROUP = 4
 # A kernel is no narrower than this part of the breadth, for the arithmetic, where all instances lie at the very same state.
 NARROWEST = 1e-6
 
@@ -39,12 +41,16 @@ class LocalFit(NamedTuple):
     solution: np.ndarray  # float64, (d + 1, d + 2)
     low: np.ndarray  # float64, (d + 1,): the least of each number among the instances
     high: np.ndarray  # float64, the same: the largest
-    z: np.ndarray  # float64, (d + 1,): 1, then an instance's place
+    # What is fitted: for each instance 1 and its place, the same weighted, and its numbers. Float64, (d + 1, groups, GROUP).
+    z: np.ndarray
+    weighted: np.ndarray
+    number: np.ndarray
 
     @classmethod
     def empty(cls, n_neighbors: int, n_variables: int) -> "LocalFit":
         """Make room for a fit to so many instances."""
         d = n_variables
+        columns = d + 1, (n_neighbors + GROUP - 1) // GROUP, GROUP
         return cls(
             item=np.zeros(n_neighbors, dtype=np.int32),
             distance=np.empty(n_neighbors),
@@ -52,7 +58,9 @@ class LocalFit(NamedTuple):
             solution=np.zeros((d + 1, d + 2)),
             low=np.empty(d + 1),
             high=np.empty(d + 1),
-            z=np.ones(d + 1),
+            z=np.empty(columns),
+            weighted=np.empty(columns),
+            number=np.empty(columns),
         )
 
 
@@ -74,6 +82,59 @@ def known_weight(fit, length, kernel):
     return total
 
 
+@inlined
+def sum_of_products(a, b, p, q, groups):
+    """The sum of the products of row ``p`` of one array and row ``q`` of another."""
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for g in range(groups):
+        first += a[p, g, 0] * b[q, g, 0]
+        second += a[p, g, 1] * b[q, g, 1]
+        third += a[p, g, 2] * b[q, g, 2]
+        fourth += a[p, g, 3] * b[q, g, 3]
+    return (first + second) + (third + fourth)
+
+
+@inlined
+def write_instances(at, action, length, instances, target, scale, fit):
+    """Write what is fitted, and zeros up to a whole group; how many groups these are."""
+    d = len(at)
+    per_unit = np.sqrt(-scale)
+    z, weighted, number = fit.z, fit.weighted, fit.number
+    any_ended = False
+    for k in range(length):
+        any_ended = any_ended or instances.terminated[action, fit.item[k]]
+    reward_going_on = mean_reward(action, length, instances, scale, fit) if any_ended else 0.0
+    groups = (length + GROUP - 1) // GROUP
+    for k in range(GROUP * groups):
+        g, lane = k // GROUP, k % GROUP
+        if k >= length:
+            for p in range(d + 1):
+                z[p, g, lane], weighted[p, g, lane], number[p, g, lane] = 0.0, 0.0, 0.0
+            continue
+        i = fit.item[k]
+        # Seen from the nearest: far from all instances the ridge would outweigh them.
+        weight = np.exp((fit.distance[k] - fit.distance[0]) * scale)
+        z[0, g, lane], weighted[0, g, lane] = 1.0, weight
+        for j in range(d):
+            place = difference(instances.state[action, i, j], at[j], instances.periodic[j]) * per_unit
+            z[j + 1, g, lane], weighted[j + 1, g, lane] = place, weight * place
+            number[j, g, lane] = target[action, i, j]
+        number[d, g, lane] = reward_going_on if instances.terminated[action, i] else instances.reward[action, i]
+    return groups
+
+
+@inlined
+def write_ranges(length, fit):
+    """Write the least and the largest of each number among the instances."""
+    for p in range(len(fit.low)):
+        low, high = fit.number[p, 0, 0], fit.number[p, 0, 0]
+        for k in range(1, length):
+            number = fit.number[p, k // GROUP, k % GROUP]
+            low = number if number < low else low
+            high = number if number > high else high
+        fit.low[p], fit.high[p] = low, high
+
+
 @inner
 def fit_around(at, action, length, instances, target, kernel, fit):
     """Fit the numbers of ``action`` around ``at`` to the instances in ``fit.item``, of which there is at least one.
@@ -85,34 +146,15 @@ def fit_around(at, action, length, instances, target, kernel, fit):
     d = len(at)
     scale = kernel_scale(fit, length, kernel)
     per_unit = np.sqrt(-scale)
-    factor, solution, z = fit.factor, fit.solution, fit.z
-    factor[:] = 0.0
-    solution[:] = 0.0
-    fit.low[:] = np.inf
-    fit.high[:] = -np.inf
-    any_ended = False
-    for k in range(length):
-        any_ended = any_ended or instances.terminated[action, fit.item[k]]
-    reward_going_on = mean_reward(action, length, instances, scale, fit) if any_ended else 0.0
-    for k in range(length):
-        i = fit.item[k]
-        # Seen from the nearest: far from all instances the ridge would outweigh them.
-        weight = np.exp((fit.distance[k] - fit.distance[0]) * scale)
-        for j in range(d):
-            z[j + 1] = difference(instances.state[action, i, j], at[j], instances.periodic[j]) * per_unit
-        reward = reward_going_on if instances.terminated[action, i] else instances.reward[action, i]
-        for p in range(d + 1):
-            weighted = weight * z[p]
-            for q in range(p + 1):
-                factor[p, q] += weighted * z[q]
-            for v in range(d):
-                solution[p, v] += weighted * target[action, i, v]
-            solution[p, d] += weighted * reward
-        for v in range(d):
-            fit.low[v] = min(fit.low[v], target[action, i, v])
-            fit.high[v] = max(fit.high[v], target[action, i, v])
-        fit.low[d] = min(fit.low[d], reward)
-        fit.high[d] = max(fit.high[d], reward)
+    factor, solution = fit.factor, fit.solution
+    groups = write_instances(at, action, length, instances, target, scale, fit)
+    write_ranges(length, fit)
+    for p in range(d + 1):
+        for q in range(p + 1):
+            factor[p, q] = sum_of_products(fit.weighted, fit.z, p, q, groups)
+        for v in range(d + 1):
+            solution[p, v] = sum_of_products(fit.weighted, fit.number, p, v, groups)
+        solution[p, d + 1] = 0.0
     for p in range(1, d + 1):
         factor[p, p] += RIDGE
     solution[0, d + 1] = 1.0
@@ -177,15 +219,18 @@ def solve(factor, solution):
             for k in range(j):
                 factor[i, j] -= factor[i, k] * factor[j, k]
             factor[i, j] /= factor[j, j]
-    for c in range(columns):
-        for i in range(n):
-            for k in range(i):
+    for i in range(n):
+        for k in range(i):
+            for c in range(columns):
                 solution[i, c] -= factor[i, k] * solution[k, c]
+        for c in range(columns):
             solution[i, c] /= factor[i, i]
-        for step in range(n):
-            i = n - 1 - step
-            for k in range(i + 1, n):
+    for step in range(n):
+        i = n - 1 - step
+        for k in range(i + 1, n):
+            for c in range(columns):
                 solution[i, c] -= factor[k, i] * solution[k, c]
+        for c in range(columns):
             solution[i, c] /= factor[i, i]
 
 

@@ -23,11 +23,12 @@ class Ends(NamedTuple):
 
     state: np.ndarray  # float64, (capacity, n_variables)
     n: np.ndarray  # int64, (1,): how many there are
+    hint: np.ndarray  # int64 scratch, (2,): action and slot of an arrival near the last state that was asked for
 
     @classmethod
     def empty(cls, n_variables: int, capacity: int = 64) -> "Ends":
         """Make room for so many."""
-        return cls(np.empty((capacity, n_variables)), np.zeros(1, dtype=np.int64))
+        return cls(np.empty((capacity, n_variables)), np.zeros(1, dtype=np.int64), np.zeros(2, dtype=np.int64))
 
     @classmethod
     def of(cls, arrivals: Instances) -> "Ends":
@@ -93,6 +94,33 @@ def far_from_ends(moved, of_end, near, outcome_breadth):
     return apart > 0.0 and apart * apart - (moved + near) ** 2 > NEGLIGIBLE * outcome_breadth
 
 
+@inlined
+def reach_of(nearest, outcome_breadth):
+    """How far arrivals decide, if the nearest is so far; all squared."""
+    return nearest + NEGLIGIBLE * min(outcome_breadth, nearest + ROUNDING)
+
+
+@inlined
+def distance_of_nearest(state, nearest, of_end, outcome_breadth, arrivals, hint):
+    """The squared distance of the nearest arrival, or of one that is so near that no end decides.
+
+    :param nearest: that of some arrival; ``of_end``: that of the nearest end
+    """
+    wraps = any_periodic(arrivals.periodic)
+    if hint[1] < arrivals.size[hint[0]]:
+        nearest = min(nearest, squared_distance(state, arrivals.state[hint[0], hint[1]], arrivals.periodic, wraps))
+    for action in range(len(arrivals.size)):
+        if of_end > reach_of(nearest, outcome_breadth):
+            break
+        for block in range(measure_blocks(arrivals, action, state)):
+            if arrivals.gap[block] < nearest:
+                for i in range(block * BLOCK, min(arrivals.size[action], (block + 1) * BLOCK)):
+                    distance = squared_distance(state, arrivals.state[action, i], arrivals.periodic, wraps)
+                    if distance < nearest:
+                        nearest, hint[0], hint[1] = distance, action, i
+    return nearest
+
+
 @inner
 def end_at(state, near, outcome_breadth, arrivals, ends, found):
     """Write to ``found`` the probability that arriving at ``state`` ends the episode, and what an end there pays.
@@ -104,19 +132,14 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
     if ends.n[0] == 0:
         return
     of_end = squared_distance_of_end(state, ends, arrivals.periodic)
-    if of_end - near > NEGLIGIBLE * min(outcome_breadth, near + ROUNDING):
+    if of_end > reach_of(near, outcome_breadth):
         return
-    nearest = min(near, of_end)
-    wraps = any_periodic(arrivals.periodic)
-    for action in range(len(arrivals.size)):
-        for block in range(measure_blocks(arrivals, action, state)):
-            if arrivals.gap[block] < nearest:
-                for i in range(block * BLOCK, min(arrivals.size[action], (block + 1) * BLOCK)):
-                    nearest = min(nearest, squared_distance(state, arrivals.state[action, i], arrivals.periodic, wraps))
-    breadth = min(outcome_breadth, nearest + ROUNDING)
-    reach = nearest + NEGLIGIBLE * breadth
+    nearest = distance_of_nearest(state, min(near, of_end), of_end, outcome_breadth, arrivals, ends.hint)
+    reach = reach_of(nearest, outcome_breadth)
     if of_end > reach:
         return
+    wraps = any_periodic(arrivals.periodic)
+    breadth = min(outcome_breadth, nearest + ROUNDING)
     total, ended, reward = 0.0, 0.0, 0.0
     for action in range(len(arrivals.size)):
         for block in range(measure_blocks(arrivals, action, state)):

@@ -307,12 +307,25 @@ class GridModel(Model):
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
         self._fit_until(for_fitting, n_added + 1)
         self.n_added, self._replays = n_added, False
+        self._put_in_order(state["instances"])
         if self._giver is not None:
             # What is transferred now may be something else than when they were fitted, which stays as it was.
             before = [array.copy() for array in self.pairs]
             self._update_all(np.flatnonzero(~self.known))
             for array, copied in zip(self.pairs, before, strict=True):
                 array[:] = copied
+
+    def _put_in_order(self, rows: np.ndarray) -> None:
+        """Put instances where they were: sums over all of them depend on their order, in the last bit."""
+        capacity = self.instances.capacity
+        instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
+        self.instances = instances.enlarged(max(capacity, instances.capacity))
+        by_action = np.argsort(rows[:, 0], kind="stable")
+        numbers = np.split(rows[by_action, -1].astype(np.int64), np.cumsum(self.instances.size)[:-1])
+        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
+        for action, own in enumerate(numbers):
+            self._number[action, : len(own)] = own
+        self._renew_arrivals()
 
     def _fit_until(self, due: _Due, number: int) -> None:
         """Fit the pairs that were last fitted before transition ``number`` came."""

@@ -11,6 +11,9 @@ from sb3_combrel.common.regression import PER_BREADTH
 from sb3_combrel.planning.grid import GridArrays
 
 
+ROUNDING = 1e-12
+
+
 class PairArrays(NamedTuple):
     """What a model has of each pair (pair ``action * n_points + point``)."""
 
@@ -47,13 +50,14 @@ class PointScratch(NamedTuple):
     along: np.ndarray  # float64, (n_variables, largest axis of the grid): squared distances along one variable
     span: np.ndarray  # int64, (3, n_variables): first grid coordinate within reach, one past the last, the present one
     pair: np.ndarray  # int64, (n_pairs,): pairs that are due
+    predicted: np.ndarray  # float64, (n_variables + 1,): effect and reward that a pair predicts
 
     @classmethod
     def empty(cls, grid: GridArrays, n_pairs: int) -> "PointScratch":
         """Make room for a grid."""
         d = len(grid.shape)
         along = np.empty((d, int(grid.shape.max())))
-        return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64))
+        return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64), np.empty(d + 1))
 
 
 # Why the pairs around a state are looked at: an instance has come, has gone, or an episode has ended there.
@@ -61,35 +65,41 @@ CAME, WENT, ENDED = range(3)
 
 
 @inlined
-def surprise_of(pair, distance, pairs, numbers, state, at, grid, size):
+def surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted):
     """By how much an instance may change what a pair predicts, in parts of the mean size of the action's numbers."""
     d = len(state)
+    for v in range(d + 1):
+        predicted[v] = pairs.fit[pair, 0, v]
+    for k in range(d):
+        away = difference(state[k], (at[k] - grid.margin[k]) / grid.cells[k], grid.periodic[k])
+        for v in range(d + 1):
+            predicted[v] += pairs.fit[pair, k + 1, v] * away
     worst = 0.0
     for v in range(d + 1):
-        predicted = pairs.fit[pair, 0, v]
-        for k in range(d):
-            away = difference(state[k], (at[k] - grid.margin[k]) / grid.cells[k], grid.periodic[k])
-            predicted += pairs.fit[pair, k + 1, v] * away
-        worst = max(worst, abs(numbers[v] - predicted) / size[v])
+        worst = max(worst, abs(numbers[v] - predicted[v]) / size[v])
     return worst * np.exp(-PER_BREADTH * distance / pairs.reach[pair]) / max(1.0, SHARE_OF_LIST * pairs.length[pair])
 
 
 @inlined
-def look_at(pair, distance, why, pairs, instance, at, grid, rules):
+def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predicted):
     """Note at one pair what has happened near it; whether it is to be fitted at once."""
     state, numbers, size = instance
     scale, threshold, few = rules
-    if why != ENDED and distance > pairs.reach[pair]:
+    if why != ENDED and distance > pairs.reach[pair] * (1.0 + ROUNDING):
         return False
-    if why != CAME:
-        return pairs.known[pair] or why == WENT
+    if why == WENT:
+        # Another one, farther away, may take its place.
+        pairs.reach[pair] = widest
+        return True
+    if why == ENDED:
+        return pairs.known[pair]
     pairs.n_new[pair] += 1
     if not pairs.known[pair]:
         pairs.weight[pair] += np.exp(distance * scale)
         return pairs.weight[pair] >= threshold * (1.0 - 1e-9) or pairs.n_new[pair] * few > pairs.length[pair]
     if pairs.fit.shape[1] == 0:
         return True
-    pairs.surprise[pair] += surprise_of(pair, distance, pairs, numbers, state, at, grid, size)
+    pairs.surprise[pair] += surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted)
     return pairs.surprise[pair] > MAX_SURPRISE or pairs.n_new[pair] * 2 >= pairs.length[pair]
 
 
@@ -133,7 +143,9 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
             for j in range(first[inner], last[inner]):
                 distance = outer + scratch.along[inner, j]
                 at[inner] = j
-                if distance <= widest and look_at(base + j, distance, why, pairs, instance, at, grid, rules):
+                if distance > widest:
+                    continue
+                if look_at(base + j, distance, widest, why, pairs, instance, at, grid, rules, scratch.predicted):
                     scratch.pair[due] = base + j
                     due += 1
         k = inner - 1

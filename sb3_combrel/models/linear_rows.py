@@ -19,6 +19,7 @@ from sb3_combrel.planning.q_values import Prediction
 
 # In parts of a cell: an effect of less is none.
 STAYS = 1e-6
+ROUNDING = 1e-9
 
 
 class LinearArrays(NamedTuple):
@@ -26,8 +27,8 @@ class LinearArrays(NamedTuple):
 
     target: np.ndarray  # float64, (n_actions, capacity, n_variables): effect of each instance less the prior's
     prior: np.ndarray  # float64, (n_pairs, 2 * n_variables): effects that a prior predicts, and their weights; 0 without one
-    near: np.ndarray  # int32, (n_actions, n_neighbors): instances near the last exact state
-    n_near: np.ndarray  # int64, (n_actions,): how many these are
+    last: np.ndarray  # float64, (n_variables,): the exact state that was asked for last
+    radius: np.ndarray  # float64, (n_actions,): how far from it a full list of near instances reaches; infinite without one
 
 
 class LinearScratch(NamedTuple):
@@ -41,9 +42,9 @@ class LinearScratch(NamedTuple):
 
 
 @inlined
-def find_nearest(at, action, n_before, instances, kernel, fit):
-    """Find the instances that a fit around ``at`` is made to; how many."""
-    return nearest_instances(instances, action, at, kernel.reach, fit.item, fit.distance, n_before)
+def find_nearest(at, action, farthest, instances, fit):
+    """Find the instances that a fit around ``at`` is made to, none farther away than squared ``farthest``; how many."""
+    return nearest_instances(instances, action, at, farthest, fit.item, fit.distance)
 
 
 @inlined
@@ -82,13 +83,14 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
     scratch, prediction = LinearScratch(*scratch), Prediction(*prediction)
     d = len(state)
     least = np.inf
-    for action in range(len(linear.n_near)):
-        for k in range(linear.n_near[action]):
-            fit.item[k] = linear.near[action, k]
-        length = find_nearest(state, action, linear.n_near[action], instances, kernel, fit)
-        linear.n_near[action] = length
-        for k in range(length):
-            linear.near[action, k] = fit.item[k]
+    apart = np.sqrt(squared_distance(state, linear.last, instances.periodic, True))
+    for v in range(d):
+        linear.last[v] = state[v]
+    for action in range(len(linear.radius)):
+        # A full list around the last state lies within its radius, and as far again as that state is.
+        farthest = min(kernel.reach, (linear.radius[action] + apart) ** 2 * (1.0 + ROUNDING))
+        length = find_nearest(state, action, farthest, instances, fit)
+        linear.radius[action] = np.sqrt(fit.distance[length - 1]) if length == kernel.n_neighbors else np.inf
         weight = known_weight(fit, length, kernel)
         if length > 0:
             fit_around(state, action, length, instances, linear.target, kernel, fit)
@@ -122,7 +124,7 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     :return: the fit's leverage, by which the variance of one instance is multiplied; 0 without any instance near the state
     """
     instances, kernel, fit, scratch = Instances(*instances), Kernel(*kernel), LocalFit(*fit), LinearScratch(*scratch)
-    length = find_nearest(state, action, 0, instances, kernel, fit)
+    length = find_nearest(state, action, kernel.reach, instances, fit)
     if length == 0:
         return 0.0
     fit_around(state, action, length, instances, instances.effect, kernel, fit)
@@ -139,7 +141,7 @@ def weigh(instances, grid, kernel, pairs, fit, at, found):
     n_points = grid.shape[0] * grid.strides[0]
     for k in range(len(pairs)):
         unit_coordinates_of(pairs[k] % n_points, grid, at)
-        length = find_nearest(at, pairs[k] // n_points, 0, instances, kernel, fit)
+        length = find_nearest(at, pairs[k] // n_points, kernel.reach, instances, fit)
         found[k] = known_weight(fit, length, kernel)
 
 
@@ -250,16 +252,14 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
     gamma, threshold, has_prior, transitions = planned
     which, done = which
     n_points = len(mdp.n_optimistic)
-    length, action_before = np.int64(0), -1
     while done < len(which):
         pair = which[done]
         point = pair % n_points
         action = pair // n_points
         unit_coordinates_of(point, grid, scratch.at)
         coordinates_of(point, grid, row_scratch.at)
-        # What is near the point before is looked at first.
-        length = find_nearest(scratch.at, action, length if action == action_before else 0, instances, kernel, fit)
-        action_before = action
+        # Instances only come nearer, but for those that are removed (see grid_points.look_at).
+        length = find_nearest(scratch.at, action, pairs.reach[pair], instances, fit)
         weight = known_weight(fit, length, kernel)
         known = note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit)
         joined = not known and transferred.length[done] > 0

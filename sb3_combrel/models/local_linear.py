@@ -57,8 +57,8 @@ class LocalLinear(GridModel):
             LinearArrays(
                 target=self.instances.effect,
                 prior=np.zeros((n_pairs, 2 * d)),
-                near=np.zeros((self.n_actions, n_near), dtype=np.int32),
-                n_near=np.zeros(self.n_actions, dtype=np.int64),
+                last=np.zeros(d),
+                radius=np.full(self.n_actions, np.inf),
             )
         )
         self._fit = tuple(LocalFit.empty(n_near, d))
@@ -70,6 +70,12 @@ class LocalLinear(GridModel):
 
     def _set_linear(self, linear: LinearArrays) -> None:
         self.linear, self._plain_linear = linear, tuple(linear)
+
+    def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
+        slot, removed = super()._slot_for(state, action)
+        if slot < self.instances.size[action]:
+            self.linear.radius[action] = np.inf
+        return slot, removed
 
     def _numbers_of(self, action: int, slot: int) -> np.ndarray:
         if self._prior is not None:

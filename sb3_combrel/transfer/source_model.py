@@ -34,7 +34,7 @@ def source_arrays(plain):
 @inner
 def predict_source(instances, kernel, fit, away, action, state, effect):
     """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
-    length = nearest_instances(instances, action, state, kernel.reach, fit.item, fit.distance, 0)
+    length = nearest_instances(instances, action, state, kernel.reach, fit.item, fit.distance)
     if length == 0:
         effect[:] = 0.0
         return 0.0, 0.0, 0.0

@@ -20,7 +20,7 @@ problems = st.tuples(st.integers(0, 10**6), st.integers(1, 5), st.integers(1, 60
 @compiled
 def fit_and_predict(at, instances, kernel, fit, away, found):
     """Fit around a state; how many instances, their weight, and the numbers predicted ``away`` from there."""
-    n = nearest_instances(instances, 0, at, kernel.reach, fit.item, fit.distance, 0)
+    n = nearest_instances(instances, 0, at, kernel.reach, fit.item, fit.distance)
     if n > 0:
         fit_around(at, 0, n, instances, instances.effect, kernel, fit)
         for v in range(len(found)):
