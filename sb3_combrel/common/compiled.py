@@ -53,23 +53,20 @@ def remove_outdated(package: Path = PACKAGE, cache: str = str(getattr(config, "C
 _remove_outdated_once = lru_cache(1)(remove_outdated)
 
 _njit: Any = njit
-# Three options that are not in Numba's documentation, here alone; what they give up is noted with each.
-# _nrt: no reference counts, which take half of the time of a step. A function that allocates does not compile.
+# One option that is not in Numba's documentation, _nrt: no reference counts, which take a third of the time of a fit and half
+# of a step's. A function that allocates does not compile.
 _options: dict[str, Any] = dict(cache=True, error_model="numpy", _nrt=False)
 compiled = _njit(**_options)
 
-# Functions that only compiled code calls (no_cpython_wrapper: calling one from Python ends the process; none is exported).
-# Code for calls from Python takes longer to compile than most of them do.
-inner = _njit(**_options, no_cpython_wrapper=True)
+# Functions that only compiled code calls, from several places.
+inner = _njit(**_options)
 
-# Functions that have one caller: they are compiled as a part of it, not once more for themselves.
-part = _njit(**_options, inline="always")
-
-# Small functions called in the innermost loops (forceinline): a call costs more than what they do.
-inlined = _njit(**_options, no_cpython_wrapper=True, forceinline=True)
+# Small functions called in the innermost loops, where a call costs more than what they do, and functions with one caller: they
+# are compiled as a part of what calls them.
+inlined = _njit(**_options, inline="always")
 
 # ``inner``, for loops whose sums may be taken in any order, as vector registers do.
-inner_fast = _njit(**_options, no_cpython_wrapper=True, fastmath={"reassoc", "contract", "nsz", "arcp"})
+inner_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, part
+from sb3_combrel.common.compiled import EntryPoint, inlined
 from sb3_combrel.common.periodic import difference, flag_array
 
 BLOCK = 8
@@ -116,7 +116,7 @@ class Instances(NamedTuple):
         return larger
 
 
-@part
+@inlined
 def put_instance(instances, transition):
     """Write one instance to its slot, at or before the end of its action's instances.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import inlined, inner, part
+from sb3_combrel.common.compiled import inlined, inner
 from sb3_combrel.common.instances import BLOCK
 from sb3_combrel.common.periodic import difference
 
@@ -66,7 +66,7 @@ def squared_distance(state, other, periodic, wraps):
     return distance
 
 
-@part
+@inlined
 def measure_gaps(state, low, high, periodic, n_blocks, gap):
     """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers."""
     gap[:n_blocks] = 0.0
@@ -106,7 +106,7 @@ def measure_blocks(instances, action, at):
     return n_blocks
 
 
-@part
+@inlined
 def near_instances(instances, action, state, kernel, indices, weights):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
 

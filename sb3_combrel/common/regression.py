@@ -170,7 +170,7 @@ def weight_of_nearest(fit, length, kernel):
     return np.exp(fit.distance[0] * kernel_scale(fit, length, kernel))
 
 
-@inlined
+@inner
 def join_prior(weights, kernel, length, fit):
     """Let a fit to residuals know that a prior says of each effect that they are 0, as so many instances at its very state.
 

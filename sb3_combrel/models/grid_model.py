@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.constants import LEAST_SIZE, ON_GRID
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
@@ -40,7 +40,7 @@ def total_weight(own, transferred, row):
     return own
 
 
-@inlined
+@inner
 def add_to_row(reward, n_touched, transferred, row, total, scratch, grid):
     """Add transferred instances to the row of a pair; its reward, and see ``planning.mdp.add_successor``."""
     for j in range(transferred.length[row]):

@@ -10,7 +10,6 @@ from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.regression import PER_BREADTH
 from sb3_combrel.planning.grid import GridArrays
 
-
 ROUNDING = 1e-12
 
 

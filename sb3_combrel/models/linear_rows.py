@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, part
+from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances, squared_distance
@@ -47,7 +47,7 @@ def find_nearest(at, action, farthest, instances, fit):
     return nearest_instances(instances, action, at, farthest, fit.item, fit.distance)
 
 
-@inlined
+@inner
 def distances_around(at, action, length, experience, fit):
     """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
     _, arrivals, ends = experience
@@ -57,7 +57,7 @@ def distances_around(at, action, length, experience, fit):
     return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), near
 
 
-@inlined
+@inner
 def outcome_of(to, moved, around, experience, kernel, end):
     """Write to ``end`` what arriving at ``to`` means.
 
@@ -161,7 +161,7 @@ def prior_change(linear, pair, k, grid, at, away):
     return change
 
 
-@part
+@inlined
 def take_step(pair, linear, fit, grid, at, has_prior, scratch):
     """Write the effect of the next step to ``scratch.step``, within the grid; the part of it until the cell is left."""
     away, step = scratch.away, scratch.step
@@ -183,7 +183,7 @@ def take_step(pair, linear, fit, grid, at, has_prior, scratch):
     return inside if moved else 0.0
 
 
-@part
+@inlined
 def follow(pair, action, length, linear, experience, kernel, fit, grid, at, planned, scratch):
     """Follow a pair's model, the action held, until a variable has changed by a cell of the grid, or the episode ends.
 

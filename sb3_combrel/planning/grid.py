@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.periodic import flag_array
 
 # More variables are interpolated between by simplices.
@@ -73,7 +73,7 @@ def step_along(low, k, grid):
     return grid.strides[k] if low < grid.shape[k] - 1 else -(grid.shape[k] - 1) * grid.strides[k]
 
 
-@inlined
+@inner
 def corners_of(position, grid, corner_index, corner_weight):
     """Write the grid points around ``position`` and their weights; how many have a weight above 0.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inner_fast, part
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner_fast
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import difference, flag_array
 from sb3_combrel.transfer.candidates import Candidates, MappingTable
@@ -188,7 +188,7 @@ def _mapping_compliance(m, n, scratch):
     return (transition / total) * (rewarded / total)
 
 
-@part
+@inlined
 def _still_factors(effect, mappings, bandwidth, still):
     """Write to ``still`` the outcome kernel of each mapping's unmapped variables, which are predicted not to change."""
     for m in range(mappings.variable.shape[0]):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inner, part
+from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.kernels import any_periodic, squared_distance
 from sb3_combrel.common.periodic import difference
 
@@ -75,7 +75,7 @@ def add_neighbor(i, apart, near, distance):
     near[k] = i
 
 
-@part
+@inlined
 def find_nearest(query, recorded, limits, near, distance):
     """Find the nearest transitions of exact states and actions (line 17).
 

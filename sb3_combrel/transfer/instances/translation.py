@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, part
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
 from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.periodic import difference
@@ -80,7 +80,7 @@ def as_arrays(plain):
     return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]), plain[5])
 
 
-@part
+@inlined
 def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
     """Add an instance to the list of the ``kept`` selected, the highest rank first, and cut what is not needed any more.
 
@@ -117,7 +117,7 @@ def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
     return min(kept + 1, room), value[room - 1, _WEIGHT] if kept + 1 >= room else 0.0
 
 
-@part
+@inlined
 def add_near_instances(state, own, candidate, arrays, kept):
     """Add a candidate's instances that weigh at least ``min_weight`` at ``state`` to the ``kept`` selected; how many now."""
     source, rules, scratch = arrays.source, arrays.rules, arrays.scratch
@@ -169,7 +169,7 @@ def add_near_instances(state, own, candidate, arrays, kept):
     return kept
 
 
-@part
+@inlined
 def measure_mapped_gaps(low, high, size, n_mapped, scratch):
     """Write to ``scratch.gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
     variable, at, gap = scratch.variable, scratch.at, scratch.gap
@@ -192,7 +192,7 @@ def measure_mapped_gaps(low, high, size, n_mapped, scratch):
     return nearest_block
 
 
-@part
+@inlined
 def write_row(s, own, kept, arrays, transferred):
     """Write the selected instances to row ``s`` of ``transferred``, if they and ``own`` reach the threshold."""
     source, mappings, rules = arrays.source, arrays.mappings, arrays.rules
