@@ -115,6 +115,7 @@ class FittedRMaxAgent:
         self.model = self.model_class(self.mdp, replace(self.model_settings, model_breadth=breadth), self._model_transfer)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
+        self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
         if self.transfer is not None:
@@ -358,10 +359,10 @@ class FittedRMaxAgent:
     def _changed_by(self, transfer: Transfer) -> np.ndarray:
         """The pairs for which transfer has changed: all for a new prior, or those, not known, that may have new instances."""
         if transfer.use == "prior":
-            pairs = self.model.renew_prior()
-            if len(pairs):
+            if transfer.prior_version() != self._prior_version:
+                self._prior_version = transfer.prior_version()
                 self.planner.set_upper(transfer.value_bound())
-            return pairs
+            return self.model.renew_prior()
         changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
         if isinstance(changed, np.ndarray):
             return np.flatnonzero(changed.reshape(-1) & ~self.model.known)

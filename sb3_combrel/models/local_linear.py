@@ -118,12 +118,14 @@ class LocalLinear(GridModel):
             return NO_PAIRS
         self._prior_version = self._prior.prior_version()
         n_points, points = self.grid.n_points, self.grid.points()
+        changed = np.zeros((self.n_actions, 1), dtype=np.bool_)
         for action in range(self.n_actions):
             pairs = slice(action * n_points, (action + 1) * n_points)
-            given = self._prior.prior(points, np.full(n_points, action))
-            self.linear.prior[pairs] = np.column_stack(given)
+            given = np.column_stack(self._prior.prior(points, np.full(n_points, action)))
+            changed[action] = not np.array_equal(given, self.linear.prior[pairs])
+            self.linear.prior[pairs] = given
         self._renew_targets()
-        return np.flatnonzero(self.known)
+        return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, has_prior = self.mdp, self._prior is not None
