@@ -77,7 +77,7 @@ def compare(
     controls: bool = True,
     threshold: float | None = None,
     n_jobs: int | None = 1,
-    progress_bar: bool = False,
+    progress_bar: bool | None = None,
     output: str | os.PathLike[str] | None = None,
     **learner: Any,
 ) -> CompareResult:
@@ -110,7 +110,7 @@ def compare(
         return of their last episodes
     :param n_jobs: runs at a time, each in a process of its own; 1: one after the other in this process; None: one a core.
         Results do not depend on it.
-    :param progress_bar: show how many runs are complete
+    :param progress_bar: show which runs are complete; None: in a terminal or notebook
     :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from there
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
@@ -126,6 +126,8 @@ def compare(
     steps = as_count("steps", steps)
     check_count("n_jobs", n_jobs, none_allowed=True)
     check_boolean("controls", controls)
+    if progress_bar is not None:
+        check_boolean("progress_bar", progress_bar)
     if threshold is not None:
         check_finite("threshold", threshold)
     check_learner(learner)
@@ -146,8 +148,9 @@ def compare(
             warnings.warn(f"there is no control ({error}): controls=False leaves it out without a warning", stacklevel=2)
     first = {method: replace(run, in_use=settings_of(in_use[method])) for method, run in first.items()}
     runs = [replace(run, seed=seed, is_shown=seed == numbers[0]) for run in first.values() for seed in numbers]
-    console = Console(stderr=True) if progress_bar else None
-    results = run_missing(runs, output=folder, backend=Backend(n_jobs=n_jobs), console=console)
+    console = Console(stderr=True)
+    shown = console.is_terminal or console.is_jupyter if progress_bar is None else progress_bar
+    results = run_missing(runs, output=folder, backend=Backend(n_jobs=n_jobs), console=console if shown else None)
     check_all_succeeded(results)
     for result in results:
         if not result.steps:

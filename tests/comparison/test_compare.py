@@ -264,6 +264,7 @@ GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, **LEARNER)
         (dict(n_jobs=0), "n_jobs must be a whole number"),
         (dict(threshold=np.inf), "threshold must be a finite number"),
         (dict(controls="no"), "controls must be"),
+        (dict(progress_bar="yes"), "progress_bar must be"),
         (dict(model_breadth=-1), "none: model_breadth must be"),
     ],
 )
@@ -290,6 +291,18 @@ def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):
 def test_arguments_that_the_learner_does_not_have_are_refused_with_one_that_it_has(wrong, message):
     with pytest.raises(TypeError, match=message):
         compare(**GOOD, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("terminal", "asked", "shown"), [("", None, False), ("1", None, True), ("", True, True), ("1", False, False)]
+)
+def test_progress_is_shown_in_a_terminal_or_if_asked_for(terminal, asked, shown, monkeypatch, capsys):
+    # Rich takes any output for a terminal where this is set.
+    monkeypatch.setenv("FORCE_COLOR", terminal)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        compare(**GOOD, controls=False, progress_bar=asked)
+    assert bool(capsys.readouterr().err) == shown
 
 
 def test_runs_that_cannot_begin_or_end_are_named():
