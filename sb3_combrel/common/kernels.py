@@ -8,44 +8,6 @@ from sb3_combrel.common.periodic import difference
 
 
 @inlined
-def insert_by_weight(indices, weights, start, length, total, index, weight, min_fraction):
-    """Put an instance into a list sorted by falling weight, then cut the list where ``min_fraction`` ends it.
-
-    An instance is kept while its weight is at least ``min_fraction`` of the sum of the weights before it. That sum
-    only grows, so an instance cut once would be cut for ever: the list needs no memory of what it dropped. Of equal
-    weights that of the instance in the lower slot comes first.
-
-    :param total: sum of the weights so far
-    :return: new length, sum of the kept weights
-    """
-    k = start + length
-    while k > start and (weights[k - 1] < weight or (weights[k - 1] == weight and indices[k - 1] > index)):
-        weights[k] = weights[k - 1]
-        indices[k] = indices[k - 1]
-        k -= 1
-    weights[k] = weight
-    indices[k] = index
-    last = weights[start + length]
-    if length == 0 or last > min_fraction * (total + weight - last) * (1 + 1e-12):
-        return length + 1, total + weight
-    return cut_by_fraction(weights, start, length + 1, min_fraction)
-
-
-@inlined
-def cut_by_fraction(weights, start, length, min_fraction):
-    """How many of the sorted weights ``min_fraction`` keeps, and their sum."""
-    total = 0.0
-    kept = 0
-    while kept < length:
-        w = weights[start + kept]
-        if kept > 0 and w < min_fraction * total:
-            break
-        total += w
-        kept += 1
-    return kept, total
-
-
-@inlined
 def any_periodic(periodic):
     """Whether a variable is periodic, for :func:`squared_distance`: asked once for many distances."""
     found = False
@@ -106,47 +68,8 @@ def measure_blocks(instances, action, at):
     return n_blocks
 
 
-@inlined
-def near_instances(instances, action, state, kernel, indices, weights):
-    """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
-
-    :param kernel: (breadth, min_weight, min_fraction)
-    :param indices: int32, receives them, at least ``list_room(min_fraction)`` long; ``weights``: exp(-d^2 / breadth^2)
-    """
-    breadth, min_weight, min_fraction = kernel
-    scale = -1.0 / (breadth * breadth)
-    farthest = np.log(min_weight) / scale
-    start = np.int64(0)
-    length = np.int64(0)
-    total = 0.0
-    count = instances.size[action]
-    wraps = any_periodic(instances.periodic)
-    for block in range(measure_blocks(instances, action, state)):
-        if instances.gap[block] > farthest:
-            continue
-        for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
-            if distance > farthest:
-                continue
-            w = np.exp(distance * scale)
-            if w < min_weight:
-                continue
-            length, total = insert_by_weight(indices, weights, start, length, total, i, w, min_fraction)
-            farthest = farthest_to_enter(weights[length - 1], total, min_weight, min_fraction, scale)
-    total = 0.0
-    for k in range(length):
-        total += weights[k]
-    return length, total
-
-
-@inlined
-def farthest_to_enter(last, total, min_weight, min_fraction, scale):
-    """The squared distance beyond which no instance enters a list, ``last`` being its least weight."""
-    return np.log(max(min_weight, min(last, min_fraction * total))) / scale * (1 + 1e-12)
-
-
 def list_room(min_fraction: float) -> int:
-    """Entries that a list needs while one is inserted: 1 + 1/min_fraction equal ones are kept, and one is cut."""
+    """The most instances that a list may have: 1 + 1/min_fraction equal ones are kept."""
     return int(np.floor(1.0 / min_fraction)) + 3
 
 
@@ -191,3 +114,24 @@ def nearest_instances(instances, action, state, farthest, items, distances):
             if length == room:
                 farthest = distances[room - 1]
     return length
+
+
+@inlined
+def near_instances(instances, action, state, kernel, indices, weights):
+    """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
+
+    One is kept while its weight is at least ``min_fraction`` of the sum of those before it.
+
+    :param kernel: (breadth, min_weight, min_fraction)
+    :param indices: int32, receives them, ``list_room(min_fraction)`` long; ``weights``: exp(-d^2 / breadth^2)
+    """
+    breadth, min_weight, min_fraction = kernel
+    scale = -1.0 / (breadth * breadth)
+    near = nearest_instances(instances, action, state, np.log(min_weight) / scale, indices, weights)
+    total = 0.0
+    for k in range(near):
+        weights[k] = np.exp(weights[k] * scale)
+        if k > 0 and weights[k] < min_fraction * total:
+            return k, total
+        total += weights[k]
+    return near, total
