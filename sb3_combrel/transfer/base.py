@@ -164,7 +164,7 @@ class Transfer(ABC):
     def prior_version(self) -> int:
         """Return a number that grows whenever what :meth:`prior` returns may have changed.
 
-        All pairs of the sample and all of the target's own instances are then asked for again: not at every step.
+        All pairs of the sample are then asked for again: not at every step.
         """
         return 0
 

@@ -273,6 +273,19 @@ def test_strength_is_the_mean_of_the_posterior_of_as_how_many_own_instances_it_c
     np.testing.assert_array_equal(restored.get_state(), evidence.get_state())
 
 
+def test_a_source_that_an_episode_has_contradicted_weighs_less_at_its_end_and_nothing_changes_without_evidence():
+    transfer, (states, actions) = bound(TIMBREL(noise_source(0), TWO, use="prior")), inside(300, 4, 5)
+    transitions = f.walk(TWO, 330)
+    show(transfer, tuple(array[:270] for array in transitions))
+    transfer.end_episode(True)
+    version, before = transfer.prior_version(), transfer.prior(states, actions).weight.mean()
+    assert show(transfer, tuple(array[270:330] for array in transitions), own_error=0.001) == [version] * 60
+    transfer.end_episode(True)
+    assert transfer.prior_version() == version + 1 and transfer.prior(states, actions).weight.mean() < 0.05 * before
+    transfer.end_episode(True)
+    assert transfer.prior_version() == version + 1
+
+
 @pytest.mark.parametrize(
     ("rewards", "expected", "explained"),
     [

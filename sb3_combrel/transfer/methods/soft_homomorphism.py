@@ -142,6 +142,9 @@ class SoftHomomorphism(Transfer):
     def end_episode(self, truncated: bool) -> None:
         if truncated and self._n_observed <= self.max_transitions:
             self._transitions.note_time_limit()
+        if self._evidence.has_changed():
+            self._evidence.renew()
+            self._version += 1
 
     def _fit(self) -> None:
         """Fit the mixture to the recorded transitions."""

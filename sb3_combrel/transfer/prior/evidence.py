@@ -38,6 +38,8 @@ class PriorEvidence:
         self.likelihood = np.zeros((*shape, len(STRENGTHS)))
         # Sums of logarithms of own squared errors, and of how many.
         self._own_errors, self._n_own = np.zeros(shape), np.zeros(shape[0])
+        # The hypothesis of the largest posterior, by number, as last renewed.
+        self._likeliest = np.zeros(shape)
         #: Sums of the errors of rewards: of the source's, and of the mean of those before.
         self.reward_errors = np.zeros(2)
         self._rewards = np.zeros(2)
@@ -84,8 +86,18 @@ class PriorEvidence:
 
     def renew(self) -> None:
         """Renew :attr:`strength`."""
-        posterior = PROBABILITIES * np.exp(self.likelihood - self.likelihood.max(axis=2, keepdims=True))
+        posterior = self._posterior()
         self.strength = posterior @ STRENGTHS / posterior.sum(axis=2)
+        self._likeliest = posterior.argmax(axis=2).astype(np.float64)
+
+    def _posterior(self) -> np.ndarray:
+        """Of the hypotheses, up to a factor."""
+        posterior: np.ndarray = PROBABILITIES * np.exp(self.likelihood - self.likelihood.max(axis=2, keepdims=True))
+        return posterior
+
+    def has_changed(self) -> bool:
+        """Whether other hypotheses are the likeliest than when :attr:`strength` was renewed."""
+        return bool((self._posterior().argmax(axis=2) != self._likeliest).any())
 
     def weights(self, coverage: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """As how many own instances the source counts where its data have the weight ``coverage``, shape (n, n_variables)."""
@@ -97,7 +109,8 @@ class PriorEvidence:
         return bool(source <= mean + SMALLEST_ERROR * self._rewards[0])
 
     def _parts(self) -> tuple[np.ndarray, ...]:
-        return self.strength, self.likelihood, self._own_errors, self._n_own, self.reward_errors, self._rewards
+        errors = self._own_errors, self._n_own, self.reward_errors, self._rewards
+        return self.strength, self.likelihood, self._likeliest, *errors
 
     def get_state(self) -> np.ndarray:
         """What was learned, float64, for :meth:`set_state`."""

@@ -204,6 +204,9 @@ class SourcePrior:
             return
         if truncated and self.n_observed <= self.max_transitions:
             self.transitions.note_time_limit()
+        if self.evidence.has_changed():
+            # An agent that a source has led astray for an episode is not to be led there again.
+            self._renew_evidence()
         episode = self._episodes.pop(self.environment, [])
         # What follows a time limit may cost more than was gained until then.
         complete = not truncated or all(reward >= 0.0 for _, reward, _ in episode)
@@ -220,11 +223,14 @@ class SourcePrior:
                 self._set_choice(choice)
                 self._replay()
                 self.version += 1
+        self._renew_evidence()
+        self.history.note(self)
+
+    def _renew_evidence(self) -> None:
         if self.choice is not None:
             self.evidence.renew()
             self.explains = self._explains()
             self.version += 1
-        self.history.note(self)
 
     def _set_choice(self, choice: Choice) -> None:
         self.choice = choice
