@@ -25,8 +25,11 @@ def test_the_command_writes_a_row_a_run_and_does_not_repeat_what_is_there(tmp_pa
     rivals.rivals(["MountainCar-v0", "MountainCarContinuous-v0"], WITHOUT_SBX, **arguments)
     table = pd.read_csv(arguments["table"])
     assert list(table["algorithm"]) == 2 * WITHOUT_SBX and set(table["seed"]) == {1} and not table["reached"].any()
-    assert (table["steps"] == 96).all() and (table["seconds"] > 0.0).all() and (table["wall_seconds"] > 0.0).all()
-    assert ((table["first_use_seconds"] > 0.0) == (table["algorithm"] == "FittedRMax")).all()
+    assert (table["steps"] == 96).all()
+    for column in ("seconds", "wall_seconds"):  # 96 steps of a rival may round to 0.00 s; six runs do not
+        assert (table[column] >= 0.0).all() and table[column].sum() > 0.0
+    first_use = table.groupby(table["algorithm"] == "FittedRMax")["first_use_seconds"].sum()
+    assert first_use[True] > 0.0 and first_use[False] == 0.0
     rivals.rivals(["MountainCar-v0", "MountainCarContinuous-v0"], WITHOUT_SBX, **arguments)
     assert pd.read_csv(arguments["table"]).equals(table)
 
