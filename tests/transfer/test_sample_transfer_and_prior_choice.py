@@ -22,6 +22,7 @@ from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.methods.sample_transfer import candidate_compliances, draw_instances
 from sb3_combrel.transfer.prior import prior_choice
+from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
 
@@ -247,6 +248,23 @@ def test_an_action_that_was_never_taken_has_no_source_action():
     assert copies.uses(*choice).complete.tolist() == [True, True, True, False, True]
     single = prior_choice.choose_mapping(copies, fresh, np.ones((len(copies), 5, 3), dtype=bool))
     assert (single.copies[3], single.actions[3]) == (-1, -1)
+
+
+def test_an_action_that_the_sources_instances_lack_moves_nothing():
+    """Its evidence is 0: often more than that of all others, if the target moves as none of them."""
+    source, (_, copies, _, (states, actions, effects)) = f.oscillator_source(), f.measured(2, 200)
+    rows = np.flatnonzero(source.actions > 0)
+    arrays = ("states", "actions", "rewards", "next_states", "terminated")
+    lacking = replace(source, **{name: getattr(source, name)[rows] for name in arrays})
+    without = Copies([lacking], copies.source, copies.state, copies.sign, copies.breadth, copies.threshold)
+    sums = CopySums.zero(len(copies), 3, 5, 4)
+    for state, action, effect in zip(states, actions.tolist(), -3.0 * effects, strict=True):
+        without.measure(state, action, effect, sums)
+    assert (sums.gain.sum(axis=3).argmax(axis=2) == 0).any()
+    found, evidence = prior_choice.best_actions(without, sums)
+    assert set(found.ravel().tolist()) == {1, 2}
+    np.testing.assert_array_equal(evidence, sums.gain.sum(axis=3)[:, :, 1:].max(axis=2))
+    assert (prior_choice.choose_factored(without, sums).actions > 0).all()
 
 
 def test_one_mapping_for_each_action_is_the_best_that_is_allowed():

@@ -82,6 +82,18 @@ def test_where_the_source_has_no_data_everything_may_be_beyond():
     assert (found[low] <= 3.0 + best_return(POINTS[low], goal=border - 0.1) + 1.6).all()
 
 
+def test_an_action_that_no_instance_has_taken_is_left_out_of_the_sources_plan():
+    """It would be worth ``max_value`` everywhere."""
+    source = line_source()
+    with_idle = replace(source, n_actions=3, action_names=("down", "up", "idle"))
+    numbered_on = replace(source, n_actions=3, actions=source.actions + 1, action_names=("idle", "down", "up"))
+    expected = value_bound([source], task(1), [[0]]).through(all_of(0))
+    np.testing.assert_array_equal(value_bound([with_idle], task(1), [[0]]).through(all_of(0)), expected)
+    of_two = value_bound([with_idle, numbered_on], task(2), [[0, -1], [-1, 0]], source=[0, 1])
+    assert of_two.through(all_of(0)) is not None
+    assert of_two.through(all_of(0, 1)) is None, "one of the second source's is idle, of which nothing is known"
+
+
 def test_of_several_copies_the_one_that_is_worth_least_bounds_the_target():
     target = task(2)
     of_two = value_bound([line_source(), line_source(goal=0.6)], target, [[0, -1], [-1, 0]], source=[0, 1])

@@ -74,6 +74,8 @@ class Copies:
         self._plain_table = tuple(self.table)
         #: Number of actions of the source that has most.
         self.most_actions = int(self.table.n_actions.max())
+        #: Actions that some instance of each copy's source has taken, bool, shape (n_copies, most_actions).
+        self.taken = np.array([np.isin(np.arange(self.most_actions), each.actions) for each in sources])[source]
         self._scratch = np.empty(n_variables), np.empty(n_variables), np.empty(state.shape[1])
 
     def __len__(self) -> int:

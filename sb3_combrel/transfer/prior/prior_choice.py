@@ -36,12 +36,14 @@ Chooser = Callable[[CopySums], Choice]
 def best_actions(copies: Copies, sums: CopySums, allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find the source action with most evidence for each copy and target action, each on its own.
 
+    Of an action that no instance of the source has taken nothing is known.
+
     :param allowed: bool, shape (n_copies, n_target_actions, most source actions): what may be chosen; None: everything
     :return: the actions, int64, shape (n_copies, n_target_actions), -1 for none; and the evidence, -inf for none
     """
     gain = sums.gain.sum(axis=3)
-    exists = np.broadcast_to(np.arange(copies.most_actions) < copies.table.n_actions[:, None, None], gain.shape)
-    gain = np.where(exists if allowed is None else exists & allowed, gain, -np.inf)
+    taken = copies.taken[:, None]
+    gain = np.where(taken if allowed is None else taken & allowed, gain, -np.inf)
     best = np.where(sums.n == 0.0, -np.inf, gain.max(axis=2))
     return np.where(best == -np.inf, -1, gain.argmax(axis=2)), best
 

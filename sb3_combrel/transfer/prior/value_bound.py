@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,7 +27,8 @@ class ValueBound:
     reinforcement learning with transferred knowledge", EWRL 2012.
 
     The source's values are those of Fitted R-Max's planning with its local linear model: where it has no data to speak of (a
-    weight below ``LEAST_WEIGHT``), a pair is worth ``max_value``. A target of several copies ends when all of them have ended:
+    weight below ``LEAST_WEIGHT``), a pair is worth ``max_value``. Actions that no instance has taken are left out: they would
+    be worth that everywhere, and so would every state. A target of several copies ends when all of them have ended:
     if every step costs the same, the least of their values bounds it. Otherwise nothing is said of several.
 
     A bound is contradicted by one thing only: a return to go that exceeds it, see :meth:`excess`.
@@ -47,10 +49,12 @@ class ValueBound:
     def through(self, choice: Choice) -> np.ndarray | None:
         """Bound the values of all states of the target's sample, shape (n_points,).
 
-        None if nothing bounds them: if actions are taken for those of different copies, no copy has all variables of its
-        source, or several copies do not cost the same at every step.
+        None if nothing bounds them: if actions are taken for those of different copies or for some that the source's instances
+        lack, no copy has all variables of its source, or several copies do not cost the same at every step.
         """
         used = choice.copies[0][choice.copies[0] >= 0].tolist()
+        if not self._copies.taken[choice.copies, choice.actions][(choice.copies >= 0) & (choice.actions >= 0)].all():
+            return None
         if not (choice.copies == choice.copies[0]).all() or (len(used) > 1 and not self._costs_are_alike(used)):
             return None
         bounds = [self._bound(copy) for copy in used if self._is_whole(copy)]
@@ -104,6 +108,8 @@ class ValueBound:
     def _plan(self, number: int) -> Planner:
         """Plan in a source, from above: values are upper bounds after any number of sweeps."""
         source, breadth = self._copies.sources[number], self._copies.breadth
+        taken, actions = np.unique(source.actions, return_inverse=True)
+        source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
         model = SourceModel(stacked_instances([source]), breadth)
         mdp = source_mdp(source, model, self._gamma, breadth, LEAST_WEIGHT)
         highest = self._max_value
