@@ -9,6 +9,7 @@
 # make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make learner the learner on all tasks, as in docs/results/learner.md (an hour)
+# make transfer  the suite's transfer methods and sources, as in docs/results/transfer.md (two hours)
 # make suite   tasks, settings and transfer methods of your choice; SUITE_ARGS="--tasks MountainCar4D --seeds 0-2"
 # make tutorials   execute all cells of tutorials/, and renew the outputs and figures in them
 # make doc     the documentation as HTML, in docs/_build; any warning is an error
@@ -41,7 +42,7 @@ endif
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo doc figures dashboard learner suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
+.PHONY: demo doc figures dashboard learner transfer suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -92,6 +93,19 @@ LEARNER_TASKS := MountainCar4D-60 MountainCar2D MountainCar2D-noisy MountainCar-
 	MountainCar6D PointRobot2D PointRobot3D PointRobot3D-exact PointRobot3D-random
 learner: $(VENV)/.installed-demo
 	$(BIN)/python -m sb3_combrel.experiments.suite.command --output learner --first-seed 21000 --tasks $(LEARNER_TASKS) $(SUITE_ARGS)
+
+# A later call goes on with what is there; see docs/results/protocol.md.
+TRANSFERRED := $(BIN)/python -m sb3_combrel.experiments.suite.command --evaluation-episodes 20 --first-seed 22000
+COMPARED := default COMBREL:transfer=COMBREL random:transfer=random oracle:transfer=oracle
+MISLEADING := noise-small noise noise-large shuffled mirrored wrong-goal wrong-rewards scaled-rewards few other-domain
+RECORDED := uniform scripted random last-policy never-neutral noisy 3000 10000
+of = $(foreach name,$(1),from-$(name):transfer=COMBREL@$(name))
+transfer: $(VENV)/.installed-demo
+	$(TRANSFERRED) --output transfer/4d --tasks MountainCar4D --seeds 0-29 --variants $(COMPARED) $(call of,$(MISLEADING))
+	$(TRANSFERRED) --output transfer/recorded --tasks MountainCar4D --seeds 0-9 --variants $(call of,$(RECORDED))
+	$(TRANSFERRED) --output transfer/6d --tasks MountainCar6D --seeds 0-9 --variants $(COMPARED)
+	$(TRANSFERRED) --output transfer/cart-pole --tasks CartPole-long --seeds 0-19 --variants $(COMPARED)
+	$(TRANSFERRED) --output transfer/arm --tasks ICubArm --seeds 0-9 --variants default COMBREL:transfer=COMBREL random:transfer=random
 
 # A later call goes on with what is there.
 suite: $(VENV)/.installed-demo
