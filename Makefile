@@ -99,13 +99,14 @@ TRANSFERRED := $(BIN)/python -m sb3_combrel.experiments.suite.command --evaluati
 COMPARED := default COMBREL:transfer=COMBREL random:transfer=random oracle:transfer=oracle
 MISLEADING := noise-small noise noise-large shuffled mirrored wrong-goal wrong-rewards scaled-rewards few other-domain
 RECORDED := uniform scripted random last-policy never-neutral noisy 3000 10000
+ON_THE_ARM := default COMBREL:transfer=COMBREL random:transfer=random own-dynamics:transfer=own-dynamics
 of = $(foreach name,$(1),from-$(name):transfer=COMBREL@$(name))
 transfer: $(VENV)/.installed-demo
 	$(TRANSFERRED) --output transfer/4d --tasks MountainCar4D --seeds 0-29 --variants $(COMPARED) $(call of,$(MISLEADING))
 	$(TRANSFERRED) --output transfer/recorded --tasks MountainCar4D --seeds 0-9 --variants $(call of,$(RECORDED))
 	$(TRANSFERRED) --output transfer/6d --tasks MountainCar6D --seeds 0-9 --variants $(COMPARED)
 	$(TRANSFERRED) --output transfer/cart-pole --tasks CartPole-long --seeds 0-19 --variants $(COMPARED)
-	$(TRANSFERRED) --output transfer/arm --tasks ICubArm --seeds 0-9 --variants default COMBREL:transfer=COMBREL random:transfer=random
+	$(TRANSFERRED) --output transfer/arm --tasks ICubArm --seeds 0-19 --test mann-whitney --variants $(ON_THE_ARM)
 
 # A later call goes on with what is there.
 suite: $(VENV)/.installed-demo

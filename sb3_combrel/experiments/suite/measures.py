@@ -50,6 +50,16 @@ def steps_until_always(limit: int) -> Measure:
     return Measure(f"steps_until_always_{limit}", lambda episodes: settled_after(episodes.steps, limit))
 
 
+def steps_until_first_end() -> Measure:
+    """Measure after how many steps of learning a terminal state ended an episode for the first time; inf if none did."""
+
+    def steps(episodes: Episodes) -> float:
+        ended = np.flatnonzero(episodes.terminated)
+        return float(episodes.steps[: ended[0] + 1].sum()) if len(ended) else np.inf
+
+    return Measure("steps_until_first_end", steps)
+
+
 def steps_until_median(limit: int, window: int = 5) -> Measure:
     """Measure after how many steps of learning the median of ``window`` episodes is at most ``limit``; inf if it never is."""
 

@@ -18,6 +18,7 @@ from sb3_combrel.experiments.suite.measures import (
     mean_steps_in,
     steps_in,
     steps_until_always,
+    steps_until_first_end,
     steps_until_median,
 )
 from sb3_combrel.experiments.tasks import cart_pole, icub_arm, mountain_car
@@ -121,6 +122,7 @@ _FIRST_EPISODE = mean_return_in(1, 1)
 _FIRST_3 = mean_return_in(1, 3)
 _TORSO_SETTLED = steps_until_always(27)
 _NEAR_50 = steps_until_median(50)
+_FIRST_HIT = steps_until_first_end()
 # 475 is Gymnasium's own threshold.
 _FALLEN = 474.0
 # A pendulum that never swings up has about -1000 or less; no return of dm_control's tasks is a failure of its own.
@@ -168,7 +170,7 @@ _ALL = (
             f"ICubArm{suffix}",
             partial(make_env, f"combrel/ICubArmStrike{noisy}-v0"),
             n_steps=10_000,
-            measures=(_NEAR_50,),
+            measures=(_NEAR_50, _FIRST_HIT),
             headline=_NEAR_50.name,
             source=TORSO,
         )

@@ -12,7 +12,7 @@ from functools import partial
 
 from sb3_combrel import COMBREL, MASTER, TIMBREL, FactoredMapping, InterTaskMapping, MappingExperts, SourceInstances
 from sb3_combrel.experiments.suite.tasks import CAR_2D, CART_POLE, TORSO, Source, Task
-from sb3_combrel.experiments.tasks import cart_pole
+from sb3_combrel.experiments.tasks import cart_pole, icub_arm
 from sb3_combrel.experiments.tasks.car_sources import RECORDINGS, q_learning
 from sb3_combrel.experiments.tasks.misleading_sources import MISLEADING
 from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
@@ -23,14 +23,20 @@ def _misled(change: Callable[[SourceInstances], SourceInstances]) -> Callable[[S
     return lambda source, task: COMBREL(change(source))
 
 
+def _identity(source: SourceInstances) -> InterTaskMapping:
+    return InterTaskMapping(range(source.n_variables), range(source.n_actions))
+
+
 #: The car in two dimensions, recorded by other means or at greater length, by the transfer method's name.
 RECORDED: dict[str, Source] = {
     **{f"COMBREL@{name}": Source(f"{CAR_2D.name}-{name}", record) for name, record in RECORDINGS.items()},
     **{f"COMBREL@{n}": Source(f"{CAR_2D.name}-{n}", partial(q_learning, n=n)) for n in (3_000, 10_000)},
 }
-OTHER_DOMAIN = "COMBREL@other-domain"
+OTHER_DOMAIN, OWN_DYNAMICS = "COMBREL@other-domain", "own-dynamics"
 #: By the name of a task's own source: the source of another domain.
 OTHER_DOMAINS: dict[str, Source] = {CAR_2D.name: TORSO, TORSO.name: CAR_2D, CART_POLE.name: CAR_2D}
+#: By task: how it moves itself, everywhere, without ends: what the best source of dynamics could tell.
+DYNAMICS: dict[str, Source] = {"ICubArm": Source("icub_arm_dynamics", icub_arm.record_dynamics)}
 
 #: The mapping that a person would choose with ``use="prior"``, by task.
 ORACLES: dict[str, FactoredMapping] = {
@@ -58,6 +64,7 @@ TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
     "random": lambda source, task: TIMBREL(source, "random", mappings="factored", use="prior"),
     "oracle": lambda source, task: TIMBREL(source, ORACLES[task], use="prior"),
     "oracle-instances": lambda source, task: TIMBREL(source, INSTANCE_ORACLES[task], use="instances"),
+    OWN_DYNAMICS: lambda source, task: TIMBREL(source, _identity(source), use="prior", transfer_terminals=False),
     **dict.fromkeys((*RECORDED, OTHER_DOMAIN), lambda source, task: COMBREL(source)),
     **{f"COMBREL@{name}": _misled(change) for name, change in MISLEADING.items()},
 }
@@ -74,6 +81,10 @@ def source_for(name: str, task: Task) -> Source:
         if task.source.name != CAR_2D.name:
             raise ValueError(f"transfer={name}: {CAR_2D.name} is recorded so, and {task.name} learns from {task.source.name}")
         return RECORDED[name]
+    if name == OWN_DYNAMICS:
+        if task.name not in DYNAMICS:
+            raise ValueError(f"transfer={name}: recorded for {', '.join(DYNAMICS)}, got the task {task.name}")
+        return DYNAMICS[task.name]
     if name != OTHER_DOMAIN:
         return task.source
     if task.source.name not in OTHER_DOMAINS:

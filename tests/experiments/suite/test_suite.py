@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from sb3_combrel import SourceInstances
+from sb3_combrel import InterTaskMapping, SourceInstances
 from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.suite import command as suite
 from sb3_combrel.experiments.suite import measures
@@ -21,6 +21,7 @@ from sb3_combrel.experiments.suite.report import cells_of, columns_of, format_nu
 from sb3_combrel.experiments.suite.runs import Variant
 from sb3_combrel.experiments.suite.tasks import TASKS, NoisyActions, Source, Task, tasks_of
 from sb3_combrel.experiments.suite.transfers import INSTANCE_ORACLES, ORACLES, RECORDED, TRANSFERS, check_transfer, source_for
+from sb3_combrel.experiments.tasks import icub_arm
 from sb3_combrel.experiments.tasks.point_robot import make_point_robot
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.episodes import Episodes
@@ -83,6 +84,7 @@ def test_a_variant_with_transfer_learns_a_source_once_for_each_seed(tmp_path):
     # Neither the right mapping nor a source of another domain is known for a task of our own.
     unknown = {"oracle": "nobody knows the mapping of robot", "oracle-instances": "nobody knows the mapping of robot"}
     unknown["COMBREL@other-domain"] = "robot no source of another domain"
+    unknown["own-dynamics"] = "recorded for ICubArm, got the task robot"
     unknown |= dict.fromkeys(RECORDED, "mountain_car_2d is recorded so, and robot learns from robot_2d")
     for name in TRANSFERS:
         if name not in unknown:
@@ -96,6 +98,11 @@ def test_a_variant_with_transfer_learns_a_source_once_for_each_seed(tmp_path):
     assert other == {"MountainCar6D": "icub_torso", "ICubArm-noisy": "mountain_car_2d"}
     assert source_for("COMBREL@uniform", TASKS["MountainCar6D"]).name == "mountain_car_2d-uniform"
     assert len(source_for("COMBREL@3000", TASKS["MountainCar4D"]).learn(7)) == 3000
+    moves = icub_arm.record_dynamics(seed=3, n=100)
+    assert moves.n_variables == 4 and not moves.terminated.any() and set(moves.rewards) == {-1.0}
+    assert len(np.unique(moves.actions)) == moves.n_actions == 8 and len(np.unique(moves.states[:, 0])) == 100
+    prior = TRANSFERS["own-dynamics"](moves, "ICubArm")
+    assert prior.mapping == InterTaskMapping(range(4), range(8)) and not prior.transfer_terminals
     with pytest.raises(ValueError, match="transfer must be one of"):
         run(tmp_path, tasks=[task], variants=[Variant("other", {}, "OTHER")])
 
@@ -186,6 +193,9 @@ def test_measures_of_hand_made_episodes():
     # The medians of five: 40, 30, 27, 26, 25.
     assert measures.steps_until_median(30).of(episodes) == sum(steps[:6])
     assert measures.steps_until_median(24).of(episodes) == np.inf
+    hit = Episodes.from_rows([(400, -400.0, False), (30, -30.0, False), (7, 93.0, True), (9, 91.0, True)])
+    assert measures.steps_until_first_end().of(hit) == 437
+    assert measures.steps_until_first_end().of(hit.last(4)._replace(terminated=np.zeros(4, dtype=bool))) == np.inf
     none = Episodes.from_rows([])
     assert measures.steps_until_always(27).of(none) == np.inf and measures.steps_until_median(27).of(none) == np.inf
 
