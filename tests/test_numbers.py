@@ -86,7 +86,7 @@ def figure_of(file, base, query, figure):
     values, others = (each.eval(column).to_numpy(dtype=float) for each in (rows, rows_of(file, base, than or query)))
     if name in ("saved", "costs"):
         more = values.mean() / others.mean() - 1
-        return f"{more if name == 'costs' else -more:{form or '.0%'}}"
+        return f"{more if name == 'costs' else 0.0 - more:{form or '.0%'}}"
     if name in TESTS:
         p = p_value_of_difference(others, values, name)
         return f"{p:.2f}" if p >= 0.1 else f"{p:.{2 if p >= 0.001 else 1}g}"
