@@ -17,7 +17,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.optimism import RewardRange
 from sb3_combrel.fitted_rmax.promises import Promises
-from sb3_combrel.fitted_rmax.search import Search
+from sb3_combrel.fitted_rmax.search import worth_after_visits
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
@@ -68,7 +68,7 @@ class FittedRMaxAgent:
         transfers = transfer is not None and transfer.informs_model
         self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
         warn_if_long(self.workload, self.grid)
-        self.rewards, self.search = RewardRange(settings.gamma, settings.max_value), Search()
+        self.rewards = RewardRange(settings.gamma, settings.max_value)
         self.n_sweeps = 0
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
@@ -111,8 +111,7 @@ class FittedRMaxAgent:
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        breadth = self.search.breadth(self.model_settings.model_breadth, self.task.n_variables)
-        self.model = self.model_class(self.mdp, replace(self.model_settings, model_breadth=breadth), self._model_transfer)
+        self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
         self._prior_version = -1
@@ -174,8 +173,6 @@ class FittedRMaxAgent:
         chosen = self.promises.choose(environment, state, float(self._q.q.max()), best, self.rng)
         if not prediction.modelled[chosen]:
             self.n_optimistic_actions += 1
-        if prediction.weight[chosen] < self.model.exploration_threshold:
-            self.search.met_unknown.add(environment)
         return chosen
 
     def _exploit(self, state: np.ndarray) -> int:
@@ -195,7 +192,9 @@ class FittedRMaxAgent:
             return int(self._prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
 
     def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
-        """Compute the action values at an exact state; optimistic actions have ``max_value``, or what a prior bounds it by.
+        """Compute the action values at an exact state.
+
+        Optimistic actions have ``max_value``, or what a prior bounds it by; less where one has been and found nothing.
 
         :param state: unit coordinates, shape (n_variables,)
         :param values: at the grid points; by default the planner's, optimistic ones
@@ -211,7 +210,7 @@ class FittedRMaxAgent:
         return prediction
 
     def _value_function(self, values: np.ndarray) -> ValueFunction:
-        return ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.upper)
+        return ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.worth)
 
     def update(
         self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
@@ -226,9 +225,6 @@ class FittedRMaxAgent:
         with self._lock:
             self.rewards.note(reward, terminated)
             self._widen(reward)
-            if self.search.n_halvings and self.rewards.differ:
-                self.search.n_halvings = 0
-                self._use_other_kernel()
             if self.transfer is not None:
                 self.transfer.environment = environment
             self.promises.pay(environment, reward, self.mdp.gamma)
@@ -276,11 +272,6 @@ class FittedRMaxAgent:
             if self.transfer is not None:
                 self.transfer.environment = environment
                 self.transfer.end_episode(truncated)
-            # A point of the grid that is not known draws the agent on, though one episode may be too short to get there.
-            goes_on = self.rewards.differ or not self.model.known.all()
-            if self.model.narrows and self.search.end_episode(environment, goes_on):
-                self._use_other_kernel()
-                return
             self._outdated.append(self.model.end_episode())
             self._plan(SWEEPS_AT_EPISODE_END)
 
@@ -309,19 +300,6 @@ class FittedRMaxAgent:
             )
             self._plan(SWEEPS_AT_EPISODE_END)
 
-    def _use_other_kernel(self) -> None:
-        """Compute the model anew with the breadth that the search asks for; what a transfer method has found stays."""
-        transitions, lowest = self.model.transitions(), self.planner.bounds[0]
-        self._build()
-        self._widen(min(0.0, lowest) / LONGEST_PLAN)
-        if self.transfer is not None and self.transfer.use == "prior":
-            self.planner.set_upper(self.transfer.value_bound())
-        for transition in transitions:
-            self.model.add(*transition)
-        # What is not known may be modelled with transferred instances.
-        self._outdated = [self.model.outdated(), np.flatnonzero(~self.model.known)]
-        self._plan(SWEEPS_AT_EPISODE_END)
-
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""
         with self._lock:
@@ -338,9 +316,18 @@ class FittedRMaxAgent:
         for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
             self.model.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
         self._outdated.clear()
+        self._search()
         self.n_sweeps += self.planner.sweep(max_sweeps)
         if began is not None:
             self.planning_seconds += perf_counter() - began
+
+    def _search(self) -> None:
+        """Let places be worth what they are after the visits to them, as long as nothing has been found."""
+        if not self.model.searches or self.rewards.differ or self.model.n_instances == 0:
+            self.planner.search(None)
+            return
+        visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)
+        self.planner.search(worth_after_visits(self.planner.upper, visits, self.rewards.lowest, self.mdp.gamma))
 
     def _follow_rewards(self) -> None:
         """Plan with other optimism, or another discount, if what rewards have shown asks for it."""
@@ -384,7 +371,6 @@ class FittedRMaxAgent:
                 "lowest_value": np.array([self.planner.bounds[0]]),
                 "rewards": self.rewards.get_state(),
                 "promises": self.promises.rows(),
-                **self.search.get_state(),
             }
 
     def set_state(self, state: dict[str, np.ndarray], scaling: StateScaling | None = None) -> None:
@@ -392,7 +378,6 @@ class FittedRMaxAgent:
         with self._lock:
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling)
             self.rewards.set_state(state["rewards"])
-            self.search.set_state(state)
             self._bind()
             self._build()
             if self.transfer is not None:
@@ -403,6 +388,7 @@ class FittedRMaxAgent:
             if self.transfer is not None and self.transfer.use == "prior":
                 self.planner.set_upper(self.transfer.value_bound())
             self.planner.restore(state["values"])
+            self._search()
             self.promises.restore(state["promises"])
 
     def statistics(self) -> dict[str, float]:

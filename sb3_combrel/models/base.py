@@ -72,8 +72,8 @@ class Model(ABC):
 
     #: Whether what a transfer method predicts may join the fits to the target's own instances (``use="prior"``).
     takes_prior: ClassVar[bool] = False
-    #: Whether its kernel narrows while a search for what is rewarded finds nothing (see ``fitted_rmax.search``).
-    narrows: ClassVar[bool] = False
+    #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.search``).
+    searches: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp, self.grid, self.n_actions = mdp, mdp.grid, mdp.n_actions

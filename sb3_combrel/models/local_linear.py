@@ -45,7 +45,7 @@ class LocalLinear(GridModel):
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
-    takes_prior = narrows = True
+    takes_prior = searches = True
     _known_by_less = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):

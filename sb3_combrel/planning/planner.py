@@ -16,22 +16,23 @@ def value_of_row(values, to, weight, length, reward, point, action):
 
 
 @compiled
-def sweep(values, mdp, upper, lowest, downwards):
+def sweep(values, mdp, upper, worth, lowest, searching, downwards):
     """V(point) = max over a of Q(point, a), Fitted R-Max's backup, at all grid points; the largest change.
 
     :param values: updated in place
-    :param upper: upper bound of each value, and the value of a point while an action is optimistic
+    :param upper: upper bound of each value
+    :param worth: value of an optimistic action at each point; while the agent is searching, of being there
     """
-    to, weight, length, reward, _, n_optimistic = mdp
+    to, weight, length, reward, modelled, n_optimistic = mdp
     n_points = len(values)
     largest = 0.0
     for step in range(n_points):
         point = n_points - 1 - step if downwards else step
-        best = upper[point]
-        if n_optimistic[point] == 0:
-            best = lowest
+        best = worth[point] if searching or n_optimistic[point] > 0 else lowest
+        if best < upper[point]:
             for action in range(reward.shape[1]):
-                best = max(best, value_of_row(values, to, weight, length, reward, point, action))
+                if modelled[action * n_points + point]:
+                    best = max(best, value_of_row(values, to, weight, length, reward, point, action))
             best = min(best, upper[point])
         largest = max(largest, abs(best - values[point]))
         values[point] = best
@@ -72,8 +73,10 @@ class Planner:
         self.mdp = mdp
         self.tolerance = float(tolerance)
         self.bounds = (float(min_value), float(max_value))
-        #: Upper bound of the value of each grid point, and its value while an action is optimistic.
+        #: Upper bound of the value of each grid point.
         self.upper = np.full(mdp.grid.n_points, float(max_value))
+        #: What an optimistic action is worth at each: its upper bound, or less while the agent is searching.
+        self.worth, self._searching = self.upper, False
         #: Whether the values of some grid points are bounded by less than ``max_value``.
         self.is_bounded = False
         self.values = self.upper.copy()
@@ -81,7 +84,8 @@ class Planner:
     def sweep(self, max_sweeps: int) -> int:
         """Back up all points, up and down the grid in turn, until little changes; the sweeps that this took."""
         for n in range(max_sweeps):
-            if _sweep.call(self.values, self.mdp.plain, self.upper, self.bounds[0], n % 2 == 1) <= self.tolerance:
+            arrays = self.values, self.mdp.plain, self.upper, self.worth
+            if _sweep.call(*arrays, self.bounds[0], self._searching, n % 2 == 1) <= self.tolerance:
                 return n + 1
         return max_sweeps
 
@@ -92,6 +96,14 @@ class Planner:
             if _cautious_sweep.call(values, self.mdp.plain, self.upper, self.bounds[0], n % 2 == 1) <= self.tolerance:
                 break
         return values
+
+    def search(self, worth: np.ndarray | None) -> None:
+        """Give points a worth of their own, which the agent may go there for.
+
+        :param worth: shape (n_points,), no more than the upper bounds; None: none, optimistic actions have the upper bounds
+        """
+        self._searching = worth is not None
+        self.worth = self.upper if worth is None else np.maximum(worth, self.bounds[0])
 
     def set_max_value(self, max_value: float) -> None:
         """Change the value of what is optimistic; the others follow by sweeps."""

@@ -40,7 +40,7 @@ class ValueFunction(NamedTuple):
     grid: tuple[Any, ...]  # GridArrays as a plain tuple (see ``common.compiled``)
     gamma: float
     bounds: tuple[float, float]  # min_value, max_value
-    upper: np.ndarray  # float64, (n_points,): value of an optimistic action at the grid points
+    worth: np.ndarray  # float64, (n_points,): value of an optimistic action at the grid points
 
 
 @inlined
@@ -61,12 +61,12 @@ def moves(state, effect, grid, position):
 
 @inlined
 def optimistic_value(state, function, grid, scratch):
-    """The value of an action without a model at ``state``: exactly ``max_value`` where that is the bound all around."""
+    """The value of an action without a model at ``state``: exactly ``max_value`` where it is that all around."""
     position, corner_index, corner_weight = scratch
     grid_coordinates(state, grid, position)
     value = function.bounds[1]
     for c in range(corners_of(position, grid, corner_index, corner_weight)):
-        value += corner_weight[c] * (function.upper[corner_index[c]] - function.bounds[1])
+        value += corner_weight[c] * (function.worth[corner_index[c]] - function.bounds[1])
     return value
 
 

@@ -1,13 +1,16 @@
-"""A search in which all is known and nothing has been found goes on with a kernel of half the volume."""
+"""As long as nothing has been found, each visit to a place makes it less worth going there."""
 
 import copy
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sb3_combrel import FittedRMax
-from sb3_combrel.fitted_rmax.search import Search
+from sb3_combrel.fitted_rmax import agent as agents
+from sb3_combrel.fitted_rmax.search import worth_after_visits
 
 LIMIT, NEEDLE, RADIUS = 60, np.array([0.5, 0.55]), 0.03
 
@@ -34,52 +37,60 @@ class Haystack(gym.Env):
 
 
 def searcher(needle=NEEDLE, **arguments):
-    return FittedRMax(Haystack(needle), seed=0, model_breadth=0.6, resolution=4, **arguments)
+    return FittedRMax(Haystack(needle), **dict(seed=0) | arguments)
 
 
-def halvings_and_ends(model, steps=2_000):
-    learned = model.learn(steps)
-    return learned.agent.search.n_halvings, learned.agent.rewards.n_ended
+NOWHERE = np.array([5.0, 5.0])
 
 
-def test_what_a_broad_kernel_misses_is_found_by_a_narrower_one_which_is_broad_again_then(monkeypatch):
-    halvings, ends = halvings_and_ends(searcher())
-    assert halvings == 0 and ends > 50
-    monkeypatch.setattr(Search, "end_episode", lambda *_: False)
-    assert halvings_and_ends(searcher()) == (0, 0), "without it this search finds nothing, and the test tests nothing"
+@given(
+    st.lists(st.tuples(st.floats(-50.0, 50.0), st.integers(0, 40)), min_size=1, max_size=5),
+    st.sampled_from([-1.0, -0.3, 0.0, 2.0]),
+    st.sampled_from([1.0, 0.99, 0.5]),
+)
+def test_worth_is_that_of_a_place_so_many_steps_further_away(places, reward, gamma):
+    expected = []
+    for worth, visits in places:
+        for _ in range(visits):
+            worth = reward + gamma * worth
+        expected.append(worth)
+    worth, visits = np.array(places, dtype=float).T
+    np.testing.assert_allclose(worth_after_visits(worth, visits, reward, gamma), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_where_there_is_nothing_the_kernel_goes_on_narrowing_and_with_one_of_its_own_it_does_not():
-    model = searcher(needle=np.array([5.0, 5.0])).learn(600)
-    halvings = model.agent.search.n_halvings
-    assert halvings >= 2
-    assert model.agent.model.settings.model_breadth == pytest.approx(0.6 * 0.5 ** (halvings / 2))
-    average = searcher(needle=np.array([5.0, 5.0]), degree=0).learn(300)
-    assert average.agent.search.n_halvings == 0, "the paper's kernel average is what it is"
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_smaller_than_the_kernel_is_found(seed, monkeypatch):
+    found = searcher(seed=seed).learn(2_000).agent
+    assert found.rewards.n_ended > 10
+    assert found.planner.worth is found.planner.upper, "once something is found, R-Max's optimism is as it was"
+    monkeypatch.setattr(agents, "worth_after_visits", lambda worth, *_: worth)
+    assert searcher(seed=seed).learn(2_000).agent.rewards.n_ended == 0, "found without it too: the test tests nothing"
+
+
+def test_all_places_are_visited_again_and_again_where_there_is_nothing():
+    model = searcher(needle=NOWHERE).learn(1_500)
+    visits = model.agent.model.own_weight.reshape(4, -1).sum(axis=0)
+    assert visits.min() > 0.2 * visits.mean()
+    expected = np.maximum(worth_after_visits(model.agent.planner.upper, visits, -1.0, 0.99), model.agent.planner.bounds[0])
+    np.testing.assert_array_equal(model.agent.planner.worth, expected)
+    # The value of a place is no less than its own worth, nor than that of any other less the steps to it.
+    assert (model.agent.planner.values >= expected - 1e-6).all()
+
+
+def test_the_papers_kernel_average_is_what_it_is():
+    average = searcher(needle=NOWHERE, degree=0).learn(300).agent
+    assert average.planner.worth is average.planner.upper
 
 
 def test_a_search_that_is_saved_goes_on_as_the_one_that_was_not(tmp_path):
-    model = searcher(needle=np.array([5.0, 5.0]))
-    while model.agent.search.n_halvings == 0:
-        model.learn(17, reset_num_timesteps=False)
+    model = searcher(needle=NOWHERE).learn(217)
     assert not model._last_episode_starts[0]
     model.save(tmp_path / "search")
     loaded = FittedRMax.load(tmp_path / "search", env=copy.deepcopy(model.get_env()), force_reset=False)
+    np.testing.assert_array_equal(loaded.agent.planner.worth, model.agent.planner.worth)
     for each in (model, loaded):
         each.learn(200, reset_num_timesteps=False)
     one, other = (each.agent.get_state() for each in (model, loaded))
-    assert one.keys() == other.keys() and one["n_halvings"] > 1
+    assert one.keys() == other.keys()
     for name, array in one.items():
         np.testing.assert_array_equal(array, other[name], err_msg=name)
-
-
-def test_an_episode_that_met_something_unknown_or_began_under_a_broader_kernel_halves_nothing():
-    search = Search()
-    search.met_unknown = {0, 1}
-    assert not search.end_episode(0, goes_on=False) and search.met_unknown == {1}
-    assert not search.end_episode(0, goes_on=True) and search.n_halvings == 0
-    assert search.end_episode(0, goes_on=False) and search.breadth(0.4, 4) == pytest.approx(0.4 * 0.5**0.25)
-    again = Search()
-    again.met_unknown = {0, 3}
-    again.set_state(search.get_state())
-    assert again.n_halvings == 1 and again.met_unknown == set()

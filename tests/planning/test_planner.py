@@ -121,6 +121,30 @@ def test_values_are_bounded_by_what_is_given_and_optimistic_ones_are_that(seed, 
         np.testing.assert_array_equal(planner.values[optimistic > 0], planner.upper[optimistic > 0])
 
 
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(st.integers(0, 10**6), st.integers(0, 60), st.sampled_from([1.0, 0.9]))
+def test_while_searching_each_point_has_the_worth_it_is_given_and_what_the_ways_to_others_leave_of_theirs(seed, n, gamma):
+    planner = planned(((3,), 1), seed, n, gamma, max_value=0.0, noise=False)
+    worth = -np.random.default_rng(seed).uniform(0.0, 2.0 * -MIN_VALUE, planner.mdp.grid.n_points)
+    planner.search(worth)
+    planner.sweep(MANY)
+    arrays, n_points = planner.mdp.arrays, len(worth)
+    own = np.maximum(worth, MIN_VALUE)
+    expected = own.copy()
+    for _ in range(1_000):
+        for point in range(n_points):
+            for action in range(N_ACTIONS):
+                if arrays.modelled[action * n_points + point]:
+                    ways = range(arrays.length[point, action])
+                    after = sum(arrays.weight[point, action, k] * expected[arrays.to[point, action, k]] for k in ways)
+                    expected[point] = min(0.0, max(expected[point], arrays.reward[point, action] + after))
+    np.testing.assert_allclose(planner.values, expected, atol=1e-6)
+    assert n < 20 or (planner.values > own).any(), "a problem without interest"
+    planner.search(None)
+    planner.sweep(MANY)
+    np.testing.assert_allclose(planner.values, values_of_rows(planner), atol=1e-6)
+
+
 @pytest.mark.parametrize("upper", [np.zeros(3), np.zeros((11, 1)), 0.0, np.full(11, np.nan)])
 def test_bounds_that_are_not_one_number_a_point_are_refused(upper):
     planner = planned(n=0)
