@@ -6,6 +6,8 @@ import re
 import shutil
 from pathlib import Path
 
+import pandas as pd
+
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.experiments.paper.domains import SETTINGS
 
@@ -14,6 +16,8 @@ from sb3_combrel.experiments.paper.domains import SETTINGS
 COPIED = {Path("reproduction") / setting: ("*.md", "*.csv", "*.png") for setting in SETTINGS}
 COPIED[Path("benchmark")] = ("benchmark.md", "*.csv", "*.png")
 COPIED[Path("learner")] = ("*.md", "tables_*.csv", "runs.csv")
+#: The folders below it are those of ``make transfer``, whose runs are one file.
+JOINED = Path("transfer")
 DOCS = Path("docs/results")
 #: Pages with marks.
 PAGES = (Path("docs/results.md"), Path("docs/benchmark.md"), Path("docs/results/learner.md"))
@@ -30,6 +34,7 @@ def main(folder: Path = Path()) -> None:
     for output, patterns in COPIED.items():
         made = copy(folder / output, folder / DOCS / output.name, patterns)
         print(f"{output}: {len(made)} files copied to {DOCS / output.name}")
+    print(f"{JOINED}: runs of {join(folder / JOINED, folder / DOCS / 'transfer.csv')} folders joined")
     for page in PAGES:
         print(f"{page}: {fill_in(folder / page)} filled in")
 
@@ -41,6 +46,20 @@ def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
         docs.mkdir(parents=True, exist_ok=True)
         made.append(Path(shutil.copyfile(file, docs / file.name)))
     return made
+
+
+def join(output: Path, file: Path) -> int:
+    """Write the runs of all folders below one to a file; runs that it has of other tasks stay. Return how many folders.
+
+    :param output: with a ``runs.csv`` in each of its folders
+    """
+    made = [pd.read_csv(runs, dtype=str, keep_default_na=False) for runs in sorted(output.glob("*/runs.csv"))]
+    if made:
+        new = pd.concat(made)
+        before = pd.read_csv(file, dtype=str, keep_default_na=False) if file.exists() else new.iloc[:0]
+        joined = pd.concat([before[~before["task"].isin(new["task"])], new]).fillna("")
+        write_whole(file, joined.to_csv(index=False, lineterminator="\n").encode())
+    return len(made)
 
 
 def fill_in(page: Path) -> int:

@@ -52,3 +52,15 @@ def test_results_are_copied_but_runs_are_not(tmp_path):
     expected |= {f"learner/{name}" for name in ("table6.md", "benchmark.md", "runs.csv", "tables_1.csv")}
     assert made == expected | {"learner.md"}, "a page that is filled in"
     assert (docs / "best" / "icub.csv").read_text() == "reproduction/best icub.csv"
+
+
+def test_runs_of_transfer_are_joined_and_those_of_tasks_that_were_not_run_stay(tmp_path):
+    file, output = tmp_path / "transfer.csv", tmp_path / "transfer"
+    assert pages.join(output, file) == 0 and not file.exists()
+    file.write_text("run,task,steps,settings\na,Arm,10,{}\nb,Car,20,{}\n")
+    for folder, text in (("4d", "run,task,steps\nc,Car,1.50\n"), ("6d", "run,task,steps,first\nd,Big,7,3\n")):
+        (output / folder).mkdir(parents=True)
+        (output / folder / "runs.csv").write_text(text)
+    for _ in range(2):
+        assert pages.join(output, file) == 2
+        assert file.read_text() == "run,task,steps,settings,first\na,Arm,10,{},\nc,Car,1.50,,\nd,Big,7,,3\n"
