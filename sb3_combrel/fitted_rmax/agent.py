@@ -114,6 +114,9 @@ class FittedRMaxAgent:
         self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
+        # Transferred instances tell what is where; a prior does so by its bound on values.
+        told = self._model_transfer is not None and self._model_transfer.use != "prior"
+        self._searches = self.model.searches and not told
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
@@ -323,7 +326,7 @@ class FittedRMaxAgent:
 
     def _search(self) -> None:
         """Let places be worth what they are after the visits to them, as long as nothing has been found."""
-        if not self.model.searches or self.rewards.differ or self.model.n_instances == 0:
+        if not self._searches or self.rewards.differ or self.model.n_instances == 0:
             self.planner.search(None)
             return
         visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)

@@ -20,13 +20,14 @@ class Stay:
     discount: float = 1.0
     n_steps: int = 0
     held: int = -1  # the action that is held until the cell is left; -1 for none
+    away: int = 0  # steps in a row elsewhere: of two places to and fro between which it stays, one is in another cell
 
 
 class Promises:
     """Leads the agent away from where interpolated values promise what nobody can have.
 
     A row of the plan leaves its cell of the grid within ``MAX_MODEL_STEPS`` steps. An agent that has not moved by a cell in
-    so many steps has either been paid for staying, or its value has risen by what the steps have cost; if more than a part
+    so many steps, or was elsewhere for single ones only, has either been paid for staying, or its value has risen by what the steps have cost; if more than a part
     of that is missing (``KEPT``), values between the grid points are too high here, and the agent would stay for ever. It
     then holds an action, drawn at random, until the cell is left, and another after as many steps more.
 
@@ -45,10 +46,12 @@ class Promises:
         :param state: unit coordinates, shape (n_variables,); ``value``: the largest of its action values
         """
         stay = self.stays.get(environment)
-        if stay is None or self._has_left(state, stay.state):
+        if stay is not None:
+            stay.away = stay.away + 1 if self._has_left(state, stay.state) else 0
+        if stay is None or stay.away > 1 or (stay.away == 1 and stay.held >= 0):
             self.stays[environment] = Stay(state.copy(), value)
             return best
-        if stay.n_steps >= MAX_MODEL_STEPS:
+        if stay.n_steps >= MAX_MODEL_STEPS and stay.away == 0:
             missing = stay.value - stay.paid - stay.discount * value
             broken = stay.held >= 0 or missing > KEPT * abs(stay.paid)
             held = int(rng.integers(self._n_actions)) if broken else -1
@@ -73,14 +76,14 @@ class Promises:
         return bool((apart * self._grid.cells >= 1.0).any())
 
     def rows(self) -> np.ndarray:
-        """The stays, float64, shape (n_environments, n_variables + 6), for :meth:`restore`."""
+        """The stays, float64, shape (n_environments, n_variables + 7), for :meth:`restore`."""
         rows = [[environment, *stay.state, *astuple(stay)[1:]] for environment, stay in self.stays.items()]
-        return np.array(rows, dtype=np.float64).reshape(-1, len(self._grid.cells) + 6)
+        return np.array(rows, dtype=np.float64).reshape(-1, len(self._grid.cells) + 7)
 
     def restore(self, rows: np.ndarray) -> None:
         """Take over what :meth:`rows` returned, whatever a file says."""
         self.stays.clear()
         for row in rows:
-            environment, state, (value, paid, discount, n_steps, held) = int(row[0]), row[1:-5].copy(), row[-5:].tolist()
+            environment, state, (value, paid, discount, n_steps, held, away) = int(row[0]), row[1:-6].copy(), row[-6:].tolist()
             action = int(np.clip(held, -1, self._n_actions - 1))
-            self.stays[environment] = Stay(state, value, paid, discount, int(n_steps), action)
+            self.stays[environment] = Stay(state, value, paid, discount, int(n_steps), action, int(away))

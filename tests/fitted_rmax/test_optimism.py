@@ -94,8 +94,12 @@ def test_an_agent_follows_the_rewards_that_it_sees():
     ]:
         agent.update(here, 0, reward, there, terminated)
         assert agent.planner.bounds[1] == pytest.approx(max_value) and agent.mdp.gamma == gamma
-        assert agent.q_values(here)[1] == pytest.approx(max_value), "the action that nobody has tried"
-        optimum.add(agent.q_values(here)[1])
+        untried = agent.q_values(here)[1]
+        if agent.rewards.differ:
+            assert untried == pytest.approx(max_value), "the action that nobody has tried"
+            optimum.add(untried)
+        else:
+            assert max_value - 1.0 < untried < max_value, "where one has been and found nothing"
     assert len(optimum) == 3
 
 

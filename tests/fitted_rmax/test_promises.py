@@ -66,10 +66,18 @@ def test_it_ends_as_soon_as_the_cell_is_left(seed, cells, variable):
 
 
 def test_around_a_periodic_variable_the_way_is_short():
-    ends = np.array([0.01, 0.4]), np.array([0.99, 0.4])
-    near = stay(-30.0, -1.0, states=lambda k: ends[k % 2], periodic=[True, False])
+    ends = [np.array([at, 0.4]) for at in (0.01, 0.02, 0.99, 0.98)]
+    near = stay(-30.0, -1.0, states=lambda k: ends[k % 4], periodic=[True, False])
     assert (near[MAX_MODEL_STEPS:] != BEST).any(), "it has stayed"
-    assert (stay(-30.0, -1.0, states=lambda k: ends[k % 2]) == BEST).all(), "it goes from end to end"
+    assert (stay(-30.0, -1.0, states=lambda k: ends[k % 4]) == BEST).all(), "it goes from end to end"
+
+
+def test_to_and_fro_is_a_stay_and_a_longer_way_is_none():
+    places = [HERE, HERE + 2.0 * CELL, HERE + 4.0 * CELL]
+    actions = stay(-30.0, -1.0, states=lambda k: places[k % 2])
+    held = np.flatnonzero(actions != BEST)
+    assert held.size > 0 and held[0] >= MAX_MODEL_STEPS and (np.diff(held) > 1).all(), "until the cell is left"
+    assert (stay(-30.0, -1.0, states=lambda k: places[k % 3]) == BEST).all()
 
 
 def test_each_environment_has_its_own_stay_and_an_episode_ends_it():
