@@ -26,10 +26,11 @@ class Stay:
 class Promises:
     """Leads the agent away from where interpolated values promise what nobody can have.
 
-    A row of the plan leaves its cell of the grid within ``MAX_MODEL_STEPS`` steps. An agent that has not moved by a cell in
-    so many steps, or was elsewhere for single ones only, has either been paid for staying, or its value has risen by what the steps have cost; if more than a part
-    of that is missing (``KEPT``), values between the grid points are too high here, and the agent would stay for ever. It
-    then holds an action, drawn at random, until the cell is left, and another after as many steps more.
+    A row of the plan leaves its cell of the grid within ``MAX_MODEL_STEPS`` steps. An agent that has not moved by a cell in so
+    many steps, or was elsewhere for single ones only, has either been paid for staying, or its value has risen by what the
+    steps have cost; if more than a part of that is missing (``KEPT``), values between the grid points are too high here, and
+    the agent would stay for ever. It then holds an action, drawn at random, until the cell is left, and another after as many
+    steps more.
 
     :param grid: of the plan
     :param n_actions: number of actions
