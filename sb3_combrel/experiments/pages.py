@@ -49,7 +49,7 @@ def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
 
 
 def join(output: Path, file: Path) -> int:
-    """Write the runs of all folders below one to a file; runs that it has of other tasks stay. Return how many folders.
+    """Write the runs of all folders below one to a file, in place of all that it has of their tasks; return how many folders.
 
     :param output: with a ``runs.csv`` in each of its folders
     """

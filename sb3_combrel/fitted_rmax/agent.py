@@ -327,10 +327,10 @@ class FittedRMaxAgent:
     def _search(self) -> None:
         """Let places be worth what they are after the visits to them, as long as nothing has been found."""
         if not self._searches or self.rewards.differ or self.model.n_instances == 0:
-            self.planner.search(None)
+            self.planner.set_worth(None)
             return
         visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)
-        self.planner.search(worth_after_visits(self.planner.upper, visits, self.rewards.lowest, self.mdp.gamma))
+        self.planner.set_worth(worth_after_visits(self.planner.upper, visits, self.rewards.lowest, self.mdp.gamma))
 
     def _follow_rewards(self) -> None:
         """Plan with other optimism, or another discount, if what rewards have shown asks for it."""

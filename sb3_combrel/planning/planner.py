@@ -76,16 +76,16 @@ class Planner:
         #: Upper bound of the value of each grid point.
         self.upper = np.full(mdp.grid.n_points, float(max_value))
         #: What an optimistic action is worth at each: its upper bound, or less while the agent is searching.
-        self.worth, self._searching = self.upper, False
+        self.worth = self.upper
         #: Whether the values of some grid points are bounded by less than ``max_value``.
         self.is_bounded = False
         self.values = self.upper.copy()
 
     def sweep(self, max_sweeps: int) -> int:
         """Back up all points, up and down the grid in turn, until little changes; the sweeps that this took."""
+        arrays, searching = (self.values, self.mdp.plain, self.upper, self.worth), self.worth is not self.upper
         for n in range(max_sweeps):
-            arrays = self.values, self.mdp.plain, self.upper, self.worth
-            if _sweep.call(*arrays, self.bounds[0], self._searching, n % 2 == 1) <= self.tolerance:
+            if _sweep.call(*arrays, self.bounds[0], searching, n % 2 == 1) <= self.tolerance:
                 return n + 1
         return max_sweeps
 
@@ -97,12 +97,11 @@ class Planner:
                 break
         return values
 
-    def search(self, worth: np.ndarray | None) -> None:
+    def set_worth(self, worth: np.ndarray | None) -> None:
         """Give points a worth of their own, which the agent may go there for.
 
         :param worth: shape (n_points,), no more than the upper bounds; None: none, optimistic actions have the upper bounds
         """
-        self._searching = worth is not None
         self.worth = self.upper if worth is None else np.maximum(worth, self.bounds[0])
 
     def set_max_value(self, max_value: float) -> None:

@@ -61,7 +61,7 @@ def moves(state, effect, grid, position):
 
 @inlined
 def optimistic_value(state, function, grid, scratch):
-    """The value of an action without a model at ``state``: exactly ``max_value`` where it is that all around."""
+    """The value of an action without a model at ``state``: exactly ``max_value`` where all around are worth that."""
     position, corner_index, corner_weight = scratch
     grid_coordinates(state, grid, position)
     value = function.bounds[1]

@@ -73,7 +73,6 @@ def test_all_places_are_visited_again_and_again_where_there_is_nothing():
     assert visits.min() > 0.2 * visits.mean()
     expected = np.maximum(worth_after_visits(model.agent.planner.upper, visits, -1.0, 0.99), model.agent.planner.bounds[0])
     np.testing.assert_array_equal(model.agent.planner.worth, expected)
-    # The value of a place is no less than its own worth, nor than that of any other less the steps to it.
     assert (model.agent.planner.values >= expected - 1e-6).all()
 
 

@@ -126,7 +126,7 @@ def test_values_are_bounded_by_what_is_given_and_optimistic_ones_are_that(seed, 
 def test_while_searching_each_point_has_the_worth_it_is_given_and_what_the_ways_to_others_leave_of_theirs(seed, n, gamma):
     planner = planned(((3,), 1), seed, n, gamma, max_value=0.0, noise=False)
     worth = -np.random.default_rng(seed).uniform(0.0, 2.0 * -MIN_VALUE, planner.mdp.grid.n_points)
-    planner.search(worth)
+    planner.set_worth(worth)
     planner.sweep(MANY)
     arrays, n_points = planner.mdp.arrays, len(worth)
     own = np.maximum(worth, MIN_VALUE)
@@ -140,7 +140,7 @@ def test_while_searching_each_point_has_the_worth_it_is_given_and_what_the_ways_
                     expected[point] = min(0.0, max(expected[point], arrays.reward[point, action] + after))
     np.testing.assert_allclose(planner.values, expected, atol=1e-6)
     assert n < 20 or (planner.values > own).any(), "a problem without interest"
-    planner.search(None)
+    planner.set_worth(None)
     planner.sweep(MANY)
     np.testing.assert_allclose(planner.values, values_of_rows(planner), atol=1e-6)
 
