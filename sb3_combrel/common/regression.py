@@ -95,7 +95,7 @@ def sum_of_products(a, b, p, q, groups):
 
 
 @inlined
-def write_instances(at, action, length, instances, target, scale, fit):
+def write_instances(at, action, length, instances, scale, fit):
     """Write what is fitted, and zeros up to a whole group; how many groups these are."""
     d = len(at)
     per_unit = np.sqrt(-scale)
@@ -118,7 +118,7 @@ def write_instances(at, action, length, instances, target, scale, fit):
         for j in range(d):
             place = difference(instances.state[action, i, j], at[j], instances.periodic[j]) * per_unit
             z[j + 1, g, lane], weighted[j + 1, g, lane] = place, weight * place
-            number[j, g, lane] = target[action, i, j]
+            number[j, g, lane] = instances.effect[action, i, j]
         number[d, g, lane] = reward_going_on if instances.terminated[action, i] else instances.reward[action, i]
     return groups
 
@@ -136,18 +136,16 @@ def write_ranges(length, fit):
 
 
 @inner
-def fit_around(at, action, length, instances, target, kernel, fit):
+def fit_around(at, action, length, instances, kernel, fit):
     """Fit the numbers of ``action`` around ``at`` to the instances in ``fit.item``, of which there is at least one.
 
     Of an instance that ended an episode the reward does not count: what an end pays is known by where it is.
-
-    :param target: float64, (n_actions, capacity, n_variables): the effects to be fitted, or what a prior leaves of them
     """
     d = len(at)
     scale = kernel_scale(fit, length, kernel)
     per_unit = np.sqrt(-scale)
     factor, solution = fit.factor, fit.solution
-    groups = write_instances(at, action, length, instances, target, scale, fit)
+    groups = write_instances(at, action, length, instances, scale, fit)
     write_ranges(length, fit)
     for p in range(d + 1):
         for q in range(p + 1):
@@ -182,24 +180,25 @@ def leverage_of(fit, length, kernel):
 
 
 @inner
-def join_prior(weights, kernel, length, fit):
-    """Let a fit to residuals know that a prior says of each effect that they are 0, as so many instances at its very state.
+def join_prior(prior, kernel, length, fit):
+    """Let a fit know what a prior says of each effect, as so many instances at its very state.
 
-    With a weight p and a leverage h the mean y becomes y / (1 + p h), and the slopes change with it as a further instance at
-    the state would change them (the formula of Sherman and Morrison).
+    With a weight p and a leverage h the mean y becomes that of s, of weight p, and of y, of weight 1 / h; and the slopes
+    change with it as a further instance at the state would change them (the formula of Sherman and Morrison).
 
-    :param weights: float64, shape (n_variables,)
+    :param prior: what it says of each effect, s, and the weights p, float64, shape (2 * n_variables,)
     """
-    d = len(weights)
+    d = len(prior) // 2
     leverage = leverage_of(fit, length, kernel)
     for v in range(d):
-        p = weights[v]
+        p = prior[d + v]
         if p > 0.0:
-            moved = p * leverage / (1.0 + p * leverage) * fit.solution[0, v] / fit.solution[0, d + 1]
+            pull = p * leverage / (1.0 + p * leverage)
+            moved = pull * (fit.solution[0, v] - prior[v]) / fit.solution[0, d + 1]
             for j in range(d + 1):
                 fit.solution[j, v] -= moved * fit.solution[j, d + 1]
-            fit.low[v] = min(fit.low[v], 0.0)
-            fit.high[v] = max(fit.high[v], 0.0)
+            fit.low[v] = min(fit.low[v], prior[v])
+            fit.high[v] = max(fit.high[v], prior[v])
 
 
 @inlined

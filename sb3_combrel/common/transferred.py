@@ -43,10 +43,9 @@ class TransferredInstances(NamedTuple):
 class PriorPredictions(NamedTuple):
     """What a source predicts of n state-action pairs of the target (see ``Transfer.prior``). Unit coordinates of the target.
 
-    Effects are the mean that the target's own instances are fitted to; what is known, ends and rewards are the target's own.
+    Effects join the fits to the target's own instances; what is known, ends and rewards are the target's own.
 
-    :param effect: float64, shape (n, n_variables): expected displacement, what it predicts times how probable the source is;
-        0 for variables of which it says nothing
+    :param effect: float64, shape (n, n_variables): predicted displacement; 0 for variables of which it says nothing
     :param weight: float64, the same: as how many own instances at the very state it counts, at least 0
     """
 

@@ -70,7 +70,7 @@ class Model(ABC):
     :param transfer: where to get instances for pairs that are not known
     """
 
-    #: Whether a transfer method may give the mean that the target's own instances are fitted to (``use="prior"``).
+    #: Whether what a transfer method predicts may join the fits to the target's own instances (``use="prior"``).
     takes_prior: ClassVar[bool] = False
     #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.search``).
     searches: ClassVar[bool] = False

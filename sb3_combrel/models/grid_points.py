@@ -106,7 +106,7 @@ def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predi
 def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch):
     """Note an instance at all pairs of an action that it concerns; how many are to be fitted, in ``scratch.pair``.
 
-    :param instance: (state; effect less the prior's, and reward, shape (d + 1,); what differences of these are measured by)
+    :param instance: (state; effect and reward, shape (d + 1,); what differences of these are measured by)
     :param first_pair: of the action; plain tuples for ``pairs``, ``grid`` and ``scratch``
     :param widest: squared distance beyond which no pair is concerned
     :param why: CAME, WENT, or ENDED: then the state is where an episode ended

@@ -25,7 +25,6 @@ ROUNDING = 1e-9
 class LinearArrays(NamedTuple):
     """What the local linear model has besides instances and pairs."""
 
-    target: np.ndarray  # float64, (n_actions, capacity, n_variables): effect of each instance less the prior's
     prior: np.ndarray  # float64, (n_pairs, 2 * n_variables): effects that a prior predicts, and their weights; 0 without one
     last: np.ndarray  # float64, (n_variables,): the exact state that was asked for last
     radius: np.ndarray  # float64, (n_actions,): how far from it a full list of near instances reaches; infinite without one
@@ -93,14 +92,12 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
         linear.radius[action] = np.sqrt(fit.distance[length - 1]) if length == kernel.n_neighbors else np.inf
         weight = known_weight(fit, length, kernel)
         if length > 0:
-            fit_around(state, action, length, instances, linear.target, kernel, fit)
-            join_prior(prior[action, d:], kernel, length, fit)
+            fit_around(state, action, length, instances, kernel, fit)
+            join_prior(prior[action], kernel, length, fit)
         scratch.away[:] = 0.0
         moved = 0.0
         for v in range(d):
-            effect = prior[action, v]
-            if length > 0:
-                effect += number_at(fit, v, scratch.away)
+            effect = number_at(fit, v, scratch.away) if length > 0 else prior[action, v]
             prediction.effect[action, 0, v] = effect
             scratch.to[v] = state[v] + effect
             moved += effect * effect
@@ -127,7 +124,7 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     length = find_nearest(state, action, kernel.reach, instances, fit)
     if length == 0:
         return 0.0
-    fit_around(state, action, length, instances, instances.effect, kernel, fit)
+    fit_around(state, action, length, instances, kernel, fit)
     scratch.away[:] = 0.0
     for v in range(len(state)):
         effect[v] = number_at(fit, v, scratch.away)
@@ -146,31 +143,13 @@ def weigh(instances, grid, kernel, pairs, fit, at, found):
 
 
 @inlined
-def prior_change(linear, pair, k, grid, at, away):
-    """By how much the prior's effect ``k`` changes from a pair's point to ``away`` from there, linear between grid points."""
-    change = 0.0
-    for j in range(len(at)):
-        if away[j] == 0.0:
-            continue
-        side = 1 if away[j] > 0.0 else -1
-        if not grid.periodic[j] and not 0 <= at[j] + side < grid.shape[j]:
-            side = -side
-        steps = ((at[j] + side) % grid.shape[j]) - at[j]
-        beside = pair + steps * grid.strides[j]
-        change += (linear.prior[beside, k] - linear.prior[pair, k]) * side * grid.cells[j] * away[j]
-    return change
-
-
-@inlined
-def take_step(pair, linear, fit, grid, at, has_prior, scratch):
+def take_step(fit, grid, at, scratch):
     """Write the effect of the next step to ``scratch.step``, within the grid; the part of it until the cell is left."""
     away, step = scratch.away, scratch.step
     inside = 1.0
     moved = False
     for k in range(len(at)):
         effect = number_at(fit, k, away)
-        if has_prior:
-            effect += linear.prior[pair, k] + prior_change(linear, pair, k, grid, at, away)
         cells = away[k] * grid.cells[k]
         after = cells + effect * grid.cells[k]
         if not grid.periodic[k]:
@@ -184,20 +163,20 @@ def take_step(pair, linear, fit, grid, at, has_prior, scratch):
 
 
 @inlined
-def follow(pair, action, length, linear, experience, kernel, fit, grid, at, planned, scratch):
-    """Follow a pair's model, the action held, until a variable has changed by a cell of the grid, or the episode ends.
+def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
+    """Follow a fit around a grid point, the action held, until a variable has changed by a cell, or the episode ends.
 
-    :param at: grid coordinates of the point; ``planned``: (gamma, whether there is a prior, most steps)
+    :param at: grid coordinates of the point; ``planned``: (gamma, most steps)
     :return: discounted reward, probability that the episode goes on, discount; ``scratch.away`` receives the displacement
     """
     d = len(at)
-    gamma, has_prior, max_steps = planned
+    gamma, max_steps = planned
     away = scratch.away
     away[:] = 0.0
     total, goes_on, discount = 0.0, 1.0, 1.0
     around = distances_around(scratch.at, action, length, experience, fit)
     for n in range(max_steps):
-        inside = take_step(pair, linear, fit, grid, at, has_prior, scratch)
+        inside = take_step(fit, grid, at, scratch)
         reward = number_at(fit, d, away)
         moved = 0.0
         for k in range(d):
@@ -267,16 +246,14 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
             total = total_weight(weight, transferred, done) if joined else weight
             reward, discount, n_touched = 0.0, gamma, np.int64(0)
             if length > 0:
-                fit_around(scratch.at, action, length, instances, linear.target, kernel, fit)
+                fit_around(scratch.at, action, length, instances, kernel, fit)
                 if has_prior:
-                    join_prior(linear.prior[pair, len(scratch.at) :], kernel, length, fit)
+                    join_prior(linear.prior[pair], kernel, length, fit)
                 for p in range(pairs.fit.shape[1]):
                     for v in range(pairs.fit.shape[2]):
                         pairs.fit[pair, p, v] = fit.solution[p, v]
-                how = gamma, has_prior, 1 if joined else MAX_MODEL_STEPS
-                reward, goes_on, discount = follow(
-                    pair, action, length, linear, experience, kernel, fit, grid, row_scratch.at, how, scratch
-                )
+                how = gamma, 1 if joined else MAX_MODEL_STEPS
+                reward, goes_on, discount = follow(action, length, experience, kernel, fit, grid, row_scratch.at, how, scratch)
                 if goes_on < 1.0:
                     # Near an end every arrival matters.
                     pairs.surprise[pair] = np.inf

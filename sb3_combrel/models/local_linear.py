@@ -38,9 +38,9 @@ class LocalLinear(GridModel):
     A row of the finite MDP leads from a grid point to where its action, held until the cell is left, leads by the pair's
     fit: values interpolated once a cell are nearer to the truth than those interpolated once a step (Munos & Moore 2002).
 
-    With a prior (a transfer method with ``use="prior"``), fits are made to what the prior's effects leave over, and the prior
-    counts as an instance at the very state that agrees with it, of the weight that it has there. Its effects and weights are
-    those at the grid points, interpolated between them. What is known, rewards and ends are by the own instances alone.
+    A prior (a transfer method with ``use="prior"``) counts as an instance at the very state, of the weight that it has there.
+    Its effects and weights are those at the grid points, interpolated between them. What is known, rewards and ends are by the
+    own instances alone.
 
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
@@ -53,14 +53,8 @@ class LocalLinear(GridModel):
         super().__init__(mdp, settings, transfer)
         self._prior = transfer if transfer is not None and transfer.use == "prior" else None
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
-        self._set_linear(
-            LinearArrays(
-                target=self.instances.effect,
-                prior=np.zeros((n_pairs, 2 * d)),
-                last=np.zeros(d),
-                radius=np.full(self.n_actions, np.inf),
-            )
-        )
+        self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
+        self._plain_linear = tuple(self.linear)
         self._fit = tuple(LocalFit.empty(n_near, d))
         self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2))))
         self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
@@ -68,35 +62,11 @@ class LocalLinear(GridModel):
         self._no_prior = np.zeros((self.n_actions, 2 * d))
         self._all_actions = np.arange(self.n_actions)
 
-    def _set_linear(self, linear: LinearArrays) -> None:
-        self.linear, self._plain_linear = linear, tuple(linear)
-
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
         slot, removed = super()._slot_for(state, action)
         if slot < self.instances.size[action]:
             self.linear.radius[action] = np.inf
         return slot, removed
-
-    def _numbers_of(self, action: int, slot: int) -> np.ndarray:
-        if self._prior is not None:
-            found = self._interpolated_prior(self.instances.state[action, slot][None], np.array([action]))[0]
-            self.linear.target[action, slot] = self.instances.effect[action, slot] - found[: self.grid.n_variables]
-        return np.append(self.linear.target[action, slot], self.instances.reward[action, slot])
-
-    def _renew_arrivals(self) -> None:
-        super()._renew_arrivals()
-        if hasattr(self, "linear"):
-            self._renew_targets()
-
-    def _renew_targets(self) -> None:
-        """Compute what the prior leaves over of each instance's effect."""
-        effect = self.instances.effect
-        target = effect if self._prior is None else effect.copy()
-        if self._prior is not None:
-            for action, size in enumerate(self.instances.size.tolist()):
-                states = self.instances.state[action, :size]
-                target[action, :size] -= self._interpolated_prior(states, np.full(size, action))[:, : self.grid.n_variables]
-        self._set_linear(self.linear._replace(target=target))
 
     def _prior_at(self, state: np.ndarray) -> np.ndarray:
         """What the prior says of all actions at a state, as in ``LinearArrays``."""
@@ -124,7 +94,6 @@ class LocalLinear(GridModel):
             given = np.column_stack(self._prior.prior(points, np.full(n_points, action)))
             changed[action] = not np.array_equal(given, self.linear.prior[pairs])
             self.linear.prior[pairs] = given
-        self._renew_targets()
         return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:

@@ -33,7 +33,6 @@ LAYOUT: dict[str, dict[str, list[object]]] = {
         "steps per second": _chart("time/fps"),
     },
     "Evidence": {
-        "how probable the source is, against none": _chart("transfer/source_probability"),
         "as how many own instances the source counts": _chart("transfer/prior_strength"),
         "the same by target action": _chart("evidence/.*"),
         "prediction error (no change: 1)": _chart("transfer/prediction_error"),

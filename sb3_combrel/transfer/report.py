@@ -70,7 +70,6 @@ class EvidencePoint:
     error: float  #: mean squared error of the mapping in use over that of "no change", on all steps until then
     exceeded: float  #: by how much returns had exceeded the source's values
     bounds_values: bool  #: whether the source's values bounded what is unknown
-    probability: float  #: how probable the source was, against none
     strengths: tuple[float, ...]  #: by target action: as how many of the target's own instances the source counted
     mappings: tuple[str, ...]  #: by target action: what it was taken for, as in :class:`MappingReport`
 
@@ -94,7 +93,6 @@ class TransferReport:
     contradictions: tuple[Contradiction, ...] = ()  #: where they were worse on average, the worst first
     ends: tuple[int, int] = (0, 0)  #: episode ends where the source predicts them, and ends predicted or not, wrongly
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
-    probability: float = np.nan  #: with ``use="prior"``, how probable the source is, against none, by the target's transitions
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
     source_actions: tuple[str, ...] = ()  #: with ``use="instances"``, the names of the source actions of all sources
@@ -134,9 +132,6 @@ class TransferReport:
             share = 100 * self.n_rested / max(self.n_steps, 1)
             rested = f"{self.n_rested:,} of {self.n_steps:,} steps ({share:.0f} %)"
             lines.append(f"{rested} rested on the source: transferred instances predicted it.")
-        if np.isfinite(self.probability):
-            odds = f"the source {self.probability:.2f}, no source {1.0 - self.probability:.2f}"
-            lines.append(f"How probable, by the target's own steps: {odds}.")
         if self.bounds_values:
             more = self.statistics.get("transfer/bound_exceeded", 0.0)
             raised = f", and {more:.3g} more, by which returns exceeded it" if more > 0.0 else ""

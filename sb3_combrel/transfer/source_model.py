@@ -47,7 +47,7 @@ def predict_source(instances, kernel, fit, away, action, state, effect):
         reward += weight * instances.reward[action, i]
         if instances.terminated[action, i]:
             end += weight
-    fit_around(state, action, length, instances, instances.effect, kernel, fit)
+    fit_around(state, action, length, instances, kernel, fit)
     for v in range(len(state)):
         effect[v] = number_at(fit, v, away)
     return reward / outcomes, end / outcomes, known_weight(fit, length, kernel) / (1.0 + beyond_data(fit))

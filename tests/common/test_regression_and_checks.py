@@ -22,7 +22,7 @@ def fit_and_predict(at, instances, kernel, fit, away, found):
     """Fit around a state; how many instances, their weight, and the numbers predicted ``away`` from there."""
     n = nearest_instances(instances, 0, at, kernel.reach, fit.item, fit.distance)
     if n > 0:
-        fit_around(at, 0, n, instances, instances.effect, kernel, fit)
+        fit_around(at, 0, n, instances, kernel, fit)
         for v in range(len(found)):
             found[v] = number_at(fit, v, away)
     return n, known_weight(fit, n, kernel)
@@ -56,7 +56,7 @@ def test_a_fit_is_that_of_least_squares_to_the_nearest_instances_within_reach(pr
         np.testing.assert_allclose(squared[fit.item[:length]], squared[nearest], rtol=1e-12)
         numbers = np.column_stack([instances.effect[0], instances.reward[0]])[nearest]
         some = apart[nearest], squared[nearest], numbers, instances.terminated[0, nearest]
-        expected = Fit(*some, breadth, n_neighbors, prior=np.zeros(d))
+        expected = Fit(*some, breadth, n_neighbors, prior=np.zeros((2, d)))
         np.testing.assert_allclose(found, expected.at(away), rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(fit.solution[0, :-1], expected.mean, rtol=1e-8, atol=1e-9)
 

@@ -45,7 +45,7 @@ class Fit:
         :param away: shape (n, d): where they are, seen from the state; ``squared``: their squared distances
         :param numbers: shape (n, d + 1)
         :param breadth: of the broad kernel
-        :param prior: shape (d,): as how many further instances at the state, with effects of 0, it counts
+        :param prior: effects, shape (d,), and as how many instances at the state they count, the same
         """
         broad = breadth
         if len(squared) == n_neighbors:
@@ -62,11 +62,11 @@ class Fit:
         leverage = np.linalg.inv((design.T * weights) @ design + penalty)[0, 0]
         # In instances at the state; that of the nearest alone bounds it, by the broad kernel.
         sure = min(leverage * math.exp(squared[0] / breadth**2), math.exp(squared[0] / broad**2))
-        for v in np.flatnonzero(prior):
+        for v in np.flatnonzero(prior[1]):
             # An instance of such a weight moves the mean to that of the prior and of own instances worth 1 / sure.
-            pull = prior[v] / (prior[v] + 1.0 / sure)
+            pull = prior[1][v] / (prior[1][v] + 1.0 / sure)
             all_weights = np.append(weights, pull / (1.0 - pull) / leverage)
-            z, more = np.vstack([away, np.zeros(len(prior))]) / breadth, np.append(numbers[:, v], 0.0)
+            z, more = np.vstack([away, np.zeros(away.shape[1])]) / breadth, np.append(numbers[:, v], prior[0][v])
             [self.mean[v]], [*slopes] = ridge_regression(all_weights, z, more[:, None])
             self.slopes[:, v] = np.ravel(slopes) / breadth
             self.low[v], self.high[v] = more.min(), more.max()
@@ -92,7 +92,6 @@ class NaiveLocalLinear:
         self.reach = -math.log(kernel["min_weight"]) * self.breadth**2
         self.threshold, self.max_instances = threshold, max_instances
         self.prior = (lambda state, action: (np.zeros(self.d), np.zeros(self.d))) if prior is None else prior
-        self.has_prior = prior is not None
         self.transitions = []
 
     @property
@@ -141,9 +140,9 @@ class NaiveLocalLinear:
             return None, 0.0
         squared, instances = np.array([q for q, _ in near]), [i for _, i in near]
         away = np.array([apart(i.state, at, self.grid.periodic) for i in instances])
-        numbers = [np.append(i.effect - self.prior_at(i.state, action)[0], i.reward) for i in instances]
+        numbers = [np.append(i.effect, i.reward) for i in instances]
         ended = np.array([i.terminated for i in instances])
-        prior = self.prior_at(at, action)[1]
+        prior = self.prior_at(at, action)
         fit = Fit(away, squared, np.array(numbers), ended, self.breadth, self.n_neighbors, prior)
         return fit, np.exp(-squared / self.breadth**2).sum()
 
@@ -172,7 +171,7 @@ class NaiveLocalLinear:
         effect, reward = self.prior_at(state, action)[0], 0.0
         if fit is not None:
             *of_fit, reward = fit.at(np.zeros(self.d))
-            effect = effect + of_fit
+            effect = np.array(of_fit)
         return Predicted(effect, *self.outcome(state, effect, reward, self.now), weight)
 
     def weight_of(self, action, point, now):
@@ -188,7 +187,6 @@ class NaiveLocalLinear:
         away, total, goes_on, discount = np.zeros(self.d), 0.0, 1.0, 1.0
         for n in range(MAX_STEPS):
             *effect, reward = fit.at(away)
-            effect = effect + self.prior(at, action)[0] + self.prior_change(action, point, away)
             after = self.within_grid(point, away + effect)
             stays = (np.abs(after - away) * cells <= 1e-6).all()
             # The part of the step that leaves the cell.
@@ -209,17 +207,3 @@ class NaiveLocalLinear:
         coordinates, last = np.array(self.grid.coordinates[point], dtype=float), np.array(self.grid.shape) - 1.0
         cells, periodic = np.array(self.grid.cells, dtype=float), np.array(self.grid.periodic)
         return np.where(periodic, away, np.clip(away, -coordinates / cells, (last - coordinates) / cells))
-
-    def prior_change(self, action, point, away):
-        """By how much the prior's effect changes, linear between the pair and those beside it."""
-        change = np.zeros(self.d)
-        for j in np.flatnonzero(away) if self.has_prior else ():
-            side = 1 if away[j] > 0.0 else -1
-            beside = list(self.grid.coordinates[point])
-            if not self.grid.periodic[j] and not 0 <= beside[j] + side < self.grid.shape[j]:
-                side = -side
-            beside[j] = (beside[j] + side) % self.grid.shape[j]
-            other = self.grid.number[tuple(beside)]
-            slope = self.prior(self.points[other], action)[0] - self.prior(self.points[point], action)[0]
-            change += slope * side * self.grid.cells[j] * away[j]
-        return change

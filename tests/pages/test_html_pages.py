@@ -169,9 +169,9 @@ def test_a_variable_is_drawn_beside_its_own_velocity(names, pair):
 
 
 POINTS = (
-    EvidencePoint(10, np.nan, 0.0, False, 0.5, (0.5, 0.5), ("nothing", "nothing")),
-    EvidencePoint(20, 0.4, 0.0, True, 0.5, (2.0, 1.0), ("left", "right")),
-    EvidencePoint(50, 0.3, 1.0, True, 0.5, (3.0, 1.0), ("left", "left")),
+    EvidencePoint(10, np.nan, 0.0, False, (0.5, 0.5), ("nothing", "nothing")),
+    EvidencePoint(20, 0.4, 0.0, True, (2.0, 1.0), ("left", "right")),
+    EvidencePoint(50, 0.3, 1.0, True, (3.0, 1.0), ("left", "left")),
 )
 
 
@@ -190,8 +190,7 @@ def test_of_many_mappings_those_in_use_for_long_have_their_colours_and_the_other
     # The k-th is in use for k + 1 steps, the last at the end.
     steps = np.cumsum([10, *range(1, len(names) + 1)])
     points = [
-        EvidencePoint(int(at), 0.5, 0.0, False, 0.5, (1.0,), (name,))
-        for at, name in zip(steps, [*names, names[-1]], strict=True)
+        EvidencePoint(int(at), 0.5, 0.0, False, (1.0,), (name,)) for at, name in zip(steps, [*names, names[-1]], strict=True)
     ]
     figure = evidence_figure(points, ("a",), mapping_colours(names), 6.0)
     colours = [to_hex(bar.get_facecolor()).upper() for bar in figure.axes[0].patches]
@@ -202,14 +201,14 @@ def test_of_many_mappings_those_in_use_for_long_have_their_colours_and_the_other
 def test_long_names_are_shortened_and_leave_room_for_the_curves(recwarn):
     assert shortened("abcdefghij", 10) == "abcdefghij" and shortened("abcdefghijk", 6) == "ab…ijk"
     names = [f"a_very_long_name_of_an_action_with_number_{k}" for k in range(9)]
-    point = EvidencePoint(10, 0.5, 0.0, False, 0.5, (1.0,) * 9, tuple(f"mapping {k} " + "of much " * 20 for k in range(9)))
+    point = EvidencePoint(10, 0.5, 0.0, False, (1.0,) * 9, tuple(f"mapping {k} " + "of much " * 20 for k in range(9)))
     figure = evidence_figure([point, replace(point, step=20)], names, mapping_colours(point.mappings), 4.2)
     data_address(figure)
     assert all(axes.get_position().width > 0.4 for axes in figure.axes) and not recwarn.list
 
 
 def test_evidence_of_runs_is_averaged_where_they_have_some():
-    later = [EvidencePoint(20, 0.8, 0.0, False, 0.5, (4.0, 4.0), ("left", "left"))]
+    later = [EvidencePoint(20, 0.8, 0.0, False, (4.0, 4.0), ("left", "left"))]
     figure = mean_evidence_figure({"m": [POINTS, later]}, {"m": "#000000"}, 6.0)
     mean = figure.axes[0].get_lines()[-1]
     assert mean.get_xdata().tolist() == [10, 20, 50] and mean.get_ydata().tolist() == [0.5, (1.5 + 4.0) / 2, (2.0 + 4.0) / 2]

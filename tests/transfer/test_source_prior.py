@@ -64,9 +64,7 @@ def test_before_any_transition_a_mapping_that_is_given_or_drawn_predicts_and_one
     states, actions = inside(300, 4, 5)
     given, chosen = (bound(COMBREL(f.oscillator_source(), each, use="prior")) for each in (TWO, "factored"))
     drawn = bound(TIMBREL(f.oscillator_source(), "random", mappings="factored", use="prior"))
-    # Half of it: a source and none are as probable beforehand.
-    expected = 0.5 * f.target_effects(TWO, states, actions)
-    np.testing.assert_allclose(given.prior(states, actions).effect, expected, atol=1e-3)
+    np.testing.assert_allclose(given.prior(states, actions).effect, f.target_effects(TWO, states, actions), atol=1e-3)
     # As much as one own instance where it has many data, and never more.
     weight = given.prior(states, actions).weight
     assert (weight > 0.35).all() and (weight < 1.0).all()
@@ -246,30 +244,15 @@ def test_predictions_are_those_of_a_weighted_regression(seed, d, n, breadth, n_n
 # How much a source's effects weigh.
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 40))
-def test_probability_and_strength_are_those_of_the_posteriors(seed, d, n):
+def test_strength_is_the_mean_of_the_posterior_of_as_how_many_own_instances_it_counts(seed, d, n):
     rng = np.random.default_rng(seed)
     evidence, actions = PriorEvidence(2, d), rng.integers(2, size=n)
     effects, predicted, own = rng.normal(size=(3, n, d)) * np.array([1.0, 0.1, 1.0])[:, None, None]
-    leverage, weights, has = np.maximum(0.0, rng.normal(size=n)), rng.gamma(1.0, size=n), rng.random(d) < 0.7
+    leverage, weights = np.maximum(0.0, rng.normal(size=n)), rng.gamma(1.0, size=n)
     for i in range(n):
-        evidence.note(int(actions[i]), effects[i], predicted[i], (own[i], leverage[i]), (-1.0, -1.0), weights[i], has)
-    assert evidence.probability == 0.5 and (evidence.strength == STRENGTHS @ PROBABILITIES).all()
+        evidence.note(int(actions[i]), effects[i], predicted[i], (own[i], leverage[i]), (-1.0, -1.0), weights[i])
+    np.testing.assert_array_equal(evidence.strength, STRENGTHS @ PROBABILITIES)
     evidence.renew()
-
-    def joined(i, v, strength):
-        """The mean of so many instances at the state, and of own ones that are worth 1 / leverage of them."""
-        p = strength * has[v] * weights[i] / (1.0 + weights[i])
-        return (p * predicted[i, v] + own[i, v] / leverage[i]) / (p + 1.0 / leverage[i])
-
-    log_odds = 0.0
-    for v in range(d):
-        for i in range(n):
-            scale, part = np.abs(effects[: i + 1, v]).mean(), has[v] * weights[i] / (1.0 + weights[i])
-            with_source = joined(i, v, 1.0) if leverage[i] > 0.0 else part * predicted[i, v]
-            none = own[i, v] if leverage[i] > 0.0 else 0.0
-            log_odds += stats.t.logpdf((effects[i, v] - with_source) / scale, df=1)
-            log_odds -= stats.t.logpdf((effects[i, v] - none) / scale, df=1)
-    np.testing.assert_allclose(evidence.probability, 1.0 / (1.0 + np.exp(-log_odds)), rtol=1e-6, atol=1e-12)
     for a in range(2):
         for v in range(d):
             rows = [i for i in range(n) if actions[i] == a and leverage[i] > 0.0]
@@ -277,7 +260,10 @@ def test_probability_and_strength_are_those_of_the_posteriors(seed, d, n):
             density = np.zeros(len(STRENGTHS))
             for k, i in enumerate(rows):
                 scale = np.exp(0.5 * np.mean(np.log(squared[: k + 1])))
-                density += stats.t.logpdf((effects[i, v] - joined(i, v, STRENGTHS)) / scale, df=1)
+                # The mean of so many instances at the state, and of own ones that are worth 1 / leverage of them.
+                p = STRENGTHS * weights[i] / (1.0 + weights[i])
+                mean = (p * predicted[i, v] + own[i, v] / leverage[i]) / (p + 1.0 / leverage[i])
+                density += stats.t.logpdf((effects[i, v] - mean) / scale, df=1)
             posterior = PROBABILITIES * np.exp(density - density.max())
             np.testing.assert_allclose(evidence.strength[a, v], posterior @ STRENGTHS / posterior.sum(), rtol=1e-6)
     found = evidence.weights(weights, actions)
@@ -285,23 +271,6 @@ def test_probability_and_strength_are_those_of_the_posteriors(seed, d, n):
     restored = PriorEvidence(2, d)
     restored.set_state(evidence.get_state())
     np.testing.assert_array_equal(restored.get_state(), evidence.get_state())
-
-
-def probability_after(transitions):
-    """Of a source of one variable; each transition is (effect, predicted effect, own prediction, its leverage)."""
-    evidence, known = PriorEvidence(1, 1), np.ones(1, dtype=bool)
-    for effect, predicted, own, leverage in transitions:
-        given = np.array([effect]), np.array([predicted]), (np.array([own]), leverage)
-        evidence.note(0, *given, (-1.0, -1.0), 9.0, known)
-    evidence.renew()
-    return evidence.probability
-
-
-def test_a_source_is_as_probable_as_none_where_own_fits_are_exact_and_one_place_does_not_decide():
-    assert probability_after([(0.1, 0.099, 0.1, 0.5)] * 500) > 0.45, "nearly exact"
-    wall = [((0.1, 0.1, 0.1, 0.5), (0.0, 0.1, 0.0, 1.0 / k)) for k in range(1, 500)]
-    assert probability_after(sum(wall[:10], ())) > 0.1 and probability_after(sum(wall, ())) > 0.1
-    assert probability_after([(0.1, -0.1, 0.1, 1.0)] * 100) < 1e-6
 
 
 def test_a_source_that_an_episode_has_contradicted_weighs_less_at_its_end_and_nothing_changes_without_evidence():
@@ -331,16 +300,17 @@ def test_a_source_that_an_episode_has_contradicted_weighs_less_at_its_end_and_no
 def test_rewards_that_are_another_function_are_noticed(rewards, expected, explained):
     evidence, effect = PriorEvidence(1, 1), np.array([0.1])
     for pair in zip(rewards, expected, strict=True):
-        evidence.note(0, effect, effect, None, pair, 100.0, np.ones(1, dtype=bool))
+        evidence.note(0, effect, effect, None, pair, 100.0)
     assert evidence.explains_rewards() == explained
 
 
 def strength_after(n, predicted, own_error, **wall):
     """After so many transitions with an effect of 0.1; ``wall``: transitions besides, that nobody foresaw."""
-    evidence, own, known = PriorEvidence(1, 1), np.array([0.1 + own_error]), np.ones(1, dtype=bool)
-    for effect in [0.1] * n + [0.0] * wall.get("n_walls", 0):
-        given = np.array([effect]), np.array([predicted]), (own, 1.0)
-        evidence.note(0, *given, (-1.0, -1.0), 100.0, known)
+    evidence = PriorEvidence(1, 1)
+    for _ in range(n):
+        evidence.note(0, np.array([0.1]), np.array([predicted]), (np.array([0.1 + own_error]), 1.0), (-1.0, -1.0), 100.0)
+    for _ in range(wall.get("n_walls", 0)):
+        evidence.note(0, np.array([0.0]), np.array([predicted]), (np.array([0.1 + own_error]), 1.0), (-1.0, -1.0), 100.0)
     evidence.renew()
     return evidence.strength[0, 0]
 

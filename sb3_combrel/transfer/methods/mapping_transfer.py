@@ -68,8 +68,8 @@ class MappingTransfer(Transfer):
     :param bandwidths: (start, outcome, reward) bandwidths of compliance and relevance, delta_sa, delta_s' and delta_r of Eq.
         2; None: from the data, that of starts in proportion to how many variables a mapping compares
     :param use: "instances": translated instances fill what the target's own lack; "prior": the source's own local linear
-        model, seen through the mappings, is the prior of the target's (``FittedRMax(degree=1)``): its mean, and further
-        instances. :class:`~sb3_combrel.transfer.prior.evidence.PriorEvidence` says how much it weighs.
+        model, seen through the mappings, is the prior of the target's (``FittedRMax(degree=1)``), whose fits it joins as
+        further instances. :class:`~sb3_combrel.transfer.prior.evidence.PriorEvidence` says how much it weighs.
         ``breadth``, ``breadth_decay``, relevance and its arguments have no meaning then
     :param source_breadth: with ``use="prior"``: kernel breadth of the source's own model, in unit coordinates of the source
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target

@@ -121,7 +121,7 @@ class SoftHomomorphism(Transfer):
         if self._logits is None:
             return PriorPredictions.nothing(len(actions), self._bound_task.n_variables)
         effect, _, weight = self._mixture.predict(states, actions)
-        return PriorPredictions(self._evidence.probability * effect, self._evidence.weights(weight, actions))
+        return PriorPredictions(effect, self._evidence.weights(weight, actions))
 
     def note_prediction(self, effect: np.ndarray, leverage: float) -> None:
         self._own = effect, leverage
@@ -134,8 +134,7 @@ class SoftHomomorphism(Transfer):
         if self._logits is not None:
             [expected], [mean_reward], [weight] = self._mixture.predict(state[None], np.array([action]))
             self._squares += ((expected - effect) ** 2).sum(), effect @ effect
-            rewards, has = (reward, float(mean_reward)), np.ones(len(effect), dtype=np.bool_)
-            self._evidence.note(action, effect, expected, self._own, rewards, float(weight), has)
+            self._evidence.note(action, effect, expected, self._own, (reward, float(mean_reward)), float(weight))
         if self._fit_due <= self._n_observed <= self.max_transitions:
             self._fit_due = RENEWAL_GROWTH * self._n_observed
             self._fit()
@@ -228,7 +227,6 @@ class SoftHomomorphism(Transfer):
         of_mapping = soft.probabilities(self._logits, self._readings)[0] if self._logits else np.full((1, 1), np.nan)
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
-            "transfer/source_probability": float(self._evidence.probability),
             "transfer/prior_strength": self._evidence.mean_strength(),
             "transfer/mapping_probability": float(of_mapping.max(axis=1).mean()),
             "transfer/steps_to_find_mapping": self._steps_to_find,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import expit
 
 # Errors of a step that are smaller than this part of a variable's range tell nothing.
 SMALLEST_ERROR = 1e-4
-# As how many own instances a source may count; 0: as none, beforehand as probable as all others.
+# As how many own instances a source may count; 0: the learner without the source, beforehand as probable as all others.
 STRENGTHS = np.array([0.0, *4.0 ** np.arange(-4, 2)])
 PROBABILITIES = np.array([0.5, *np.full(len(STRENGTHS) - 1, 0.5 / (len(STRENGTHS) - 1))])
 #: What the target's own instances alone predict, shape (n_variables,), and the leverage of their fit, 0 for nothing.
@@ -18,17 +17,14 @@ FIRST_RENEWAL, RENEWAL_GROWTH = 10, 2**0.5
 
 
 class PriorEvidence:
-    """Evidence for a source: whether the learner predicts the target better with it, and as how many own instances it counts.
+    """Evidence for a source, by target action and variable: whether the learner predicts the target better with it.
 
-    A hypothesis predicts a transition before it is seen: with an own prediction of leverage h, from a fit to own instances
-    alone, and with data of the source of weight w, the source's effect has the part p h / (1 + p h), where p is w / (1 + w)
-    times as how many own instances the source counts (see ``join_prior``). Likelihoods are Student's t with one degree of
-    freedom. What was predicted through a mapping no longer in use counts as well: it says how well mappings are chosen.
-
-    :attr:`probability` compares the source, counted as one instance, with none, over all actions and variables; the scale of a
-    variable is the mean size of its effects so far, so that the target's own fits, once they are exact, do not make a source
-    improbable that is nearly so. :attr:`strength` is the mean of the posterior over ``STRENGTHS``, of each action and variable
-    on its own; its scale is the geometric mean of the own errors so far.
+    Hypotheses are that the source counts as so many own instances, ``STRENGTHS``; "no source" is one of them. Each predicts a
+    transition before it is seen: with an own prediction of leverage h, from a fit to own instances alone, and with data of the
+    source of weight w, the source's effect has the part p h / (1 + p h), where p is the strength times w / (1 + w) (see
+    ``join_prior``). The likelihood is Student's t with one degree of freedom, whose scale is the geometric mean of the own
+    errors so far. :attr:`strength` is the mean of the posterior. What was predicted through a mapping that is no longer in use
+    counts as well: it says how well mappings are chosen.
 
     :param n_actions: target actions
     :param n_variables: target variables
@@ -40,11 +36,6 @@ class PriorEvidence:
         shape = self.strength.shape
         #: Logarithms of the likelihoods, up to what all hypotheses have in common, shape (n_actions, n_variables, n).
         self.likelihood = np.zeros((*shape, len(STRENGTHS)))
-        #: The posterior of the source against none, as last renewed, shape (); both are as probable beforehand.
-        self.probability = np.full((), 0.5)
-        self._log_odds = np.zeros(())
-        # Sums of the sizes of effects, and of how many.
-        self._sizes = np.zeros(n_variables + 1)
         # Sums of logarithms of own squared errors, and of how many.
         self._own_errors, self._n_own = np.zeros(shape), np.zeros(shape[0])
         # The hypothesis of the largest posterior, by number, as last renewed.
@@ -61,7 +52,6 @@ class PriorEvidence:
         own: OwnPrediction | None,
         rewards: tuple[float, float],
         weight: float,
-        has: np.ndarray,
     ) -> None:
         """Take in a transition.
 
@@ -69,16 +59,14 @@ class PriorEvidence:
         :param own: by the learner without it, and its leverage, 0 where it predicts nothing; None for the same
         :param rewards: the reward, and what the source predicts
         :param weight: of the source's data there
-        :param has: the variables of which the source says something, bool, shape (n_variables,)
         """
         part = weight / (1.0 + weight)
-        self._compare(effect, predicted, own, part, has)
         if own is not None and own[1] > 0.0:
             error = effect - own[0]
             self._own_errors[action] += np.log(error * error + SMALLEST_ERROR**2)
             self._n_own[action] += 1.0
             squared_scale = np.exp(self._own_errors[action] / self._n_own[action])[:, None]
-            pull = STRENGTHS * (part * own[1] * has)[:, None]
+            pull = STRENGTHS * part * own[1]
             errors = error[:, None] - pull / (1.0 + pull) * (predicted - own[0])[:, None]
             self.likelihood[action] -= np.log1p(errors * errors / squared_scale)
         reward, expected = rewards
@@ -86,18 +74,6 @@ class PriorEvidence:
         if n > 0.0:
             self.reward_errors += part * abs(reward - expected), part * abs(reward - total / n)
         self._rewards += 1.0, reward
-
-    def _compare(
-        self, effect: np.ndarray, predicted: np.ndarray, own: OwnPrediction | None, part: float, has: np.ndarray
-    ) -> None:
-        """Compare the source with none; where the learner predicts nothing, none says that nothing changes."""
-        self._sizes += np.append(np.abs(effect), 1.0)
-        squared_scale = np.maximum(SMALLEST_ERROR, self._sizes[:-1] / self._sizes[-1]) ** 2
-        alone, pull = np.zeros(len(effect)), part
-        if own is not None and own[1] > 0.0:
-            alone, pull = own[0], part * own[1] / (1.0 + part * own[1])
-        joined = alone + pull * has * (predicted - alone)
-        self._log_odds += np.log(((effect - alone) ** 2 + squared_scale) / ((effect - joined) ** 2 + squared_scale)).sum()
 
     def mean_strength(self) -> float:
         """The mean of :attr:`strength`."""
@@ -109,8 +85,7 @@ class PriorEvidence:
             return np.asarray(np.exp(np.log(self.strength).mean(axis=1)))
 
     def renew(self) -> None:
-        """Renew :attr:`probability` and :attr:`strength`."""
-        self.probability[()] = expit(self._log_odds)
+        """Renew :attr:`strength`."""
         posterior = self._posterior()
         self.strength = posterior @ STRENGTHS / posterior.sum(axis=2)
         self._likeliest = posterior.argmax(axis=2).astype(np.float64)
@@ -135,7 +110,7 @@ class PriorEvidence:
 
     def _parts(self) -> tuple[np.ndarray, ...]:
         errors = self._own_errors, self._n_own, self.reward_errors, self._rewards
-        return self.probability, self._log_odds, self._sizes, self.strength, self.likelihood, self._likeliest, *errors
+        return self.strength, self.likelihood, self._likeliest, *errors
 
     def get_state(self) -> np.ndarray:
         """What was learned, float64, for :meth:`set_state`."""

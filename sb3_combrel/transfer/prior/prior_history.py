@@ -11,13 +11,12 @@ from sb3_combrel.transfer.report import EvidencePoint
 if TYPE_CHECKING:
     from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
-# Columns before those of the target actions: steps, error (-1 for none: saved models have no NaN), excess, whether bounded,
-# probability.
-N_FIRST = 5
+# Columns before those of the target actions: steps, error (-1 for none: saved models have no NaN), excess, whether bounded.
+N_FIRST = 4
 
 
 class PriorHistory:
-    """Rows of steps, error, excess, whether values are bounded, probability, and by target action strength and candidate.
+    """Rows of steps, error, excess, whether values are bounded, and by target action the strength and the candidate.
 
     Renewals come ever more rarely, so the rows stay few.
 
@@ -42,12 +41,11 @@ class PriorHistory:
 
     def _row(self, prior: SourcePrior) -> np.ndarray:
         error = prior.error()
-        bounded, probability = prior.value_bound() is not None, float(prior.evidence.probability)
-        first = prior.n_observed, -1.0 if np.isnan(error) else error, prior.excess, bounded, probability
+        first = prior.n_observed, -1.0 if np.isnan(error) else error, prior.excess, prior.value_bound() is not None
         return np.concatenate([first, prior.evidence.strength_of_actions(), prior.choices_by_action()], dtype=np.float64)
 
     def _point(self, prior: SourcePrior, row: np.ndarray) -> EvidencePoint:
-        step, error, exceeded, bounded, probability = row[:N_FIRST].tolist()
+        step, error, exceeded, bounded = row[:N_FIRST].tolist()
         strengths, candidates = row[N_FIRST:].reshape(2, self._n_actions)
         describe = prior.candidates.describe_moves
         return EvidencePoint(
@@ -55,13 +53,12 @@ class PriorHistory:
             error=np.nan if error < 0.0 else error,
             exceeded=exceeded,
             bounds_values=bool(bounded),
-            probability=probability,
             strengths=tuple(strengths.tolist()),
             mappings=tuple("nothing" if number < 0 else describe(int(number)) for number in candidates),
         )
 
     def get_state(self) -> np.ndarray:
-        """Return the rows, float64, shape (n, 5 + 2 * n_actions)."""
+        """Return the rows, float64, shape (n, 4 + 2 * n_actions)."""
         return np.array(self._rows, dtype=np.float64).reshape(-1, N_FIRST + 2 * self._n_actions)
 
     def set_state(self, rows: np.ndarray) -> None:

@@ -68,7 +68,6 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         error=prior.error(),
         next_best=next_best[0],
         next_best_error=next_best[1],
-        probability=float(prior.evidence.probability),
         bounds_values=prior.value_bound() is not None,
         statistics=statistics,
         history=prior.history.points(prior),

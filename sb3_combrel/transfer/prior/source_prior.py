@@ -82,7 +82,7 @@ class SourcePrior:
         self.environment = 0
         # By environment: states, rewards and effects of the present episode.
         self._episodes: defaultdict[int, Episode] = defaultdict(list)
-        #: Whether the source may bound values, as last renewed; through a given mapping it does until it is shown not to.
+        #: Whether the mapping in use explains all target actions, as last renewed; a given one does until it is shown not to.
         self.explains = isinstance(choose, Choice)
         #: By how much a return that was seen exceeds what the source bounds it by.
         self.excess = 0.0
@@ -110,8 +110,7 @@ class SourcePrior:
         if self.choice is None:
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, _, coverage = self._raw(np.ascontiguousarray(states, dtype=np.float64), actions)
-        weight = np.where(self._has[actions], self.evidence.weights(coverage, actions), 0.0)
-        return PriorPredictions(self.evidence.probability * effect, weight)
+        return PriorPredictions(effect, np.where(self._in_copies()[actions], self.evidence.weights(coverage, actions), 0.0))
 
     def note_prediction(self, effect: np.ndarray, leverage: float) -> None:
         self._own = effect, leverage
@@ -167,8 +166,7 @@ class SourcePrior:
         predicted = self.copies.predict(self._used, self._work_space, np.ascontiguousarray(state)[None], actions)
         [predicted_effect], [expected], [weight] = predicted
         self._compare(state, action, effect, predicted_effect, float(weight))
-        rewards = reward, float(expected)
-        self.evidence.note(action, effect, predicted_effect, self._own, rewards, float(weight), self._has[action])
+        self.evidence.note(action, effect, predicted_effect, self._own, (reward, float(expected)), float(weight))
         self.candidates.note_use(action, self._moved(action))
         if not recorded:
             self.copies.measure_used(self._used, action, effect, predicted, self.sums)
@@ -188,10 +186,18 @@ class SourcePrior:
         return self._value_bound.through(self.choice)
 
     def _explains(self) -> bool:
-        """Whether all target actions have a mapping, and effects and rewards are not more probable without the source."""
+        """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
+
+        What was chosen must be worth, in nats, what it was chosen from.
+        """
         assert self.choice is not None
+        found = np.zeros(self.task.n_actions)
+        for a, copy, used, _ in self._moves():
+            found[a] += self.sums.gain[copy, a, used].sum()
+            if self.choose is not None:
+                found[a] -= np.log(self.copies.table.n_actions[copy])
         chosen = bool((self.choice.actions[self.choice.copies >= 0] >= 0).all())
-        return chosen and bool(self.evidence.probability >= 0.5) and self.evidence.explains_rewards()
+        return chosen and bool((found >= 0.0).all()) and self.evidence.explains_rewards()
 
     def end_episode(self, truncated: bool) -> None:
         if self.n_observed == 0:
@@ -230,7 +236,6 @@ class SourcePrior:
     def _set_choice(self, choice: Choice) -> None:
         self.choice = choice
         self._used = self.copies.uses(*choice)
-        self._has = self._in_copies()
         self._work_space = self.copies.work_space(self._used)
         self._stored.clear()
 
@@ -274,7 +279,6 @@ class SourcePrior:
     def statistics(self) -> dict[str, float]:
         return {
             "transfer/prediction_error": self.error(),
-            "transfer/source_probability": float(self.evidence.probability),
             "transfer/prior_strength": self.evidence.mean_strength(),
             "transfer/values_bounded": float(self.value_bound() is not None),
             "transfer/bound_exceeded": self.excess,
