@@ -13,13 +13,15 @@ class Believed(BaseCallback):
 
     def __init__(self):
         super().__init__()
-        self.seen = {}
+        self.seen, self.ended = {}, set()
 
     def _on_step(self):
+        if self.locals["dones"].any():
+            self.ended.add(self.num_timesteps)
         prior = self.model.transfer.source_prior
         strengths = np.exp(np.log(prior.evidence.strength).mean(axis=1))
         numbers = [prior.candidates.describe_action(prior.choice, a) if prior.choice else "nothing" for a in range(2)]
-        self.seen[self.num_timesteps] = strengths.tolist(), numbers
+        self.seen[self.num_timesteps] = strengths.tolist(), numbers, prior.excess
         return True
 
 
@@ -27,18 +29,19 @@ class Believed(BaseCallback):
 def learnt():
     source = SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0)
     believed = Believed()
-    return walker(transfer=COMBREL(source, use="prior")).learn(300, believed), believed.seen
+    return walker(transfer=COMBREL(source, use="prior")).learn(300, believed), believed
 
 
 def test_between_two_points_nothing_changes(learnt):
-    model, seen = learnt
+    model, believed = learnt
     history = model.transfer.report().history
     steps = [point.step for point in history]
     assert steps[0] == 10 and steps[-1] == 300 and len(steps) < 15 and (np.diff(steps) > 0).all()
-    for step, (strengths, mappings) in seen.items():
-        if step > steps[0] and step not in steps:  # at an episode's end things change once more
+    for step, (strengths, mappings, excess) in believed.seen.items():
+        if step >= steps[0] and step not in believed.ended:  # what an episode's end changes was seen before it
             point = history[np.searchsorted(steps, step, side="right") - 1]
             assert point.strengths == pytest.approx(strengths) and list(point.mappings) == mappings
+            assert point.exceeded == excess
 
 
 def test_the_last_point_is_of_now(learnt):

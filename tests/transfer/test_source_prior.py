@@ -284,6 +284,10 @@ def test_a_source_that_an_episode_has_contradicted_weighs_less_at_its_end_and_no
     assert transfer.prior_version() == version + 1 and transfer.prior(states, actions).weight.mean() < 0.05 * before
     transfer.end_episode(True)
     assert transfer.prior_version() == version + 1
+    strengths = transfer.report().history[-1].strengths
+    show(transfer, tuple(array[:1] for array in transitions))
+    *_, earlier, of_end, now = transfer.report().history
+    assert earlier.step < of_end.step == 330 < now.step and of_end.strengths == strengths != earlier.strengths
 
 
 @pytest.mark.parametrize(

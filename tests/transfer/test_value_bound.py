@@ -175,6 +175,12 @@ def test_a_return_that_exceeds_the_bound_raises_it_by_as_much_everywhere():
         assert prior.excess == pytest.approx(excess, abs=2.1 if excess else 0.5)
         assert transfer.prior_version() == version + 1
     np.testing.assert_allclose(transfer.value_bound(), before + prior.excess)
+    steps = prior.n_observed
+    transfer.observe(np.array([0.3]), 0, -1.0, np.array([0.3 + STEP]), False)
+    assert [(point.step, point.exceeded) for point in transfer.report().history][-2:] == [
+        (steps, prior.excess),
+        (steps + 1, prior.excess),
+    ]
 
 
 def test_an_episode_that_a_time_limit_ends_exceeds_nothing_where_steps_cost():

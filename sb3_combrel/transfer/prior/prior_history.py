@@ -1,4 +1,4 @@
-"""The evidence for a source over time: one point whenever it is renewed, between which nothing of it changes."""
+"""The evidence for a source over time: one point whenever it is renewed or its bound is exceeded; in between it stays."""
 
 from __future__ import annotations
 

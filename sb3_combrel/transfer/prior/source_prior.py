@@ -202,12 +202,12 @@ class SourcePrior:
     def end_episode(self, truncated: bool) -> None:
         if self.n_observed == 0:
             return
+        version = self.version
         if truncated and self.n_observed <= self.max_transitions:
             self.transitions.note_time_limit()
         if self.evidence.has_changed():
             # An agent that a source has led astray for an episode is not to be led there again.
             self._renew_evidence()
-            self.history.note(self)
         episode = self._episodes.pop(self.environment, [])
         # What follows a time limit may cost more than was gained until then.
         complete = not truncated or all(reward >= 0.0 for _, reward, _ in episode)
@@ -215,6 +215,8 @@ class SourcePrior:
             excess = self._value_bound.excess(self.choice, episode)
             if excess > self.excess:
                 self.excess, self.version = excess, self.version + 1
+        if self.version > version:
+            self.history.note(self)
 
     def _renew(self, choose: bool) -> None:
         if choose and self.choose is not None:
