@@ -27,8 +27,8 @@ HISTORY = (
 
 
 def words_of(text):
-    """Words of a page without its code, outputs and comments; those of tables count."""
-    return prose(text).split()
+    """Words and numbers of a page without its code, outputs and comments; those of tables count, the lines between do not."""
+    return [each for each in prose(text).split() if re.search(r"\w", each)]
 
 
 def history_in(text):
@@ -54,7 +54,7 @@ def test_a_page_says_what_holds_and_no_history(page):
 def test_words_of_prose_and_tables_count_and_those_of_code_outputs_and_comments_do_not():
     text = "# One two\n\nthree\n\n| four | 5 |\n\n```python\nsix = 6\n```\n\n"
     text += "<!-- output -->\n```text\n7\n```\n<!-- end of output -->\n"
-    assert len(words_of(text + "<!-- numbers: eight\n-->\n")) == len("# One two three | four | 5 |".split())
+    assert len(words_of(text + "<!-- numbers: eight\n-->\n")) == len("One two three four 5".split())
 
 
 @pytest.mark.parametrize(

@@ -107,10 +107,8 @@ class RivalJob(Job):
         return int(self.learner.get("n_envs", 1))
 
     def make_learner(self, envs: VecEnv) -> Any:
-        """Make the model, of Stable-Baselines3's kind, which has learnt nothing yet."""
-        if self.method == FITTED_RMAX:
-            return FittedRMax(envs, seed=self.seed)
-        return class_of(self.method)(env=envs, seed=self.seed, **arguments_of(self.learner))
+        """Make the model."""
+        return learner_of(self.method, envs, self.seed, self.learner)
 
     def carry_out(self) -> Result:
         """Learn, and take the time without that of the evaluations."""
@@ -148,6 +146,16 @@ def clocks() -> np.ndarray:
     return np.array([time.process_time(), time.perf_counter()])
 
 
+def learner_of(algorithm: str, env: Any, seed: int, hyperparameters: Mapping[str, Any]) -> Any:
+    """Make a model, of Stable-Baselines3's kind, which has learnt nothing yet.
+
+    :param hyperparameters: as RL-Zoo writes them; Fitted R-Max has none
+    """
+    if algorithm == FITTED_RMAX:
+        return FittedRMax(env, seed=seed)
+    return class_of(algorithm)(env=env, seed=seed, **arguments_of(hyperparameters))
+
+
 def class_of(name: str) -> Any:
     """Return the class of a rival."""
     if name == CROSSQ:
@@ -155,6 +163,10 @@ def class_of(name: str) -> Any:
 
         keep_compiled()
         return sbx.CrossQ
+    if name == "QRDQN":
+        import sb3_contrib
+
+        return sb3_contrib.QRDQN
     return {"DQN": DQN, "PPO": PPO}[name]
 
 

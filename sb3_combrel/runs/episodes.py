@@ -60,7 +60,7 @@ def play(model: Any, env: gym.Env, n_episodes: int, seed: int) -> Episodes:
         steps, total, terminated, truncated = 0, 0.0, False, False
         while not (terminated or truncated):
             action, _ = model.predict(observation, deterministic=True)
-            observation, reward, terminated, truncated, _ = env.step(int(action))
+            observation, reward, terminated, truncated, _ = env.step(int(action) if np.ndim(action) == 0 else action)
             steps, total = steps + 1, total + float(reward)
         rows.append((steps, total, bool(terminated)))
     return Episodes.from_rows(rows)
