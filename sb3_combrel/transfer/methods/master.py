@@ -19,7 +19,7 @@ from sb3_combrel.transfer.instances.selectors import FixedSelector, Ranges, Sele
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.prior.prior_choice import Choice
+from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.prior_sets import copies_of, is_factored
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
@@ -88,9 +88,13 @@ class MASTER(MappingTransfer):
         candidates = Candidates(self.source, self.mappings, task)
         check_action_mappings(candidates.sets)
         copies = copies_of(candidates, task, float(self.source_breadth))
-        choose = partial(choose_least_error, copies, candidates.sets)
+        choose = self._chooser(copies, candidates.sets)
         steps = {"max_transitions": self.n_random_steps, "first_renewal": self.n_random_steps}
         return SourcePrior(copies, task, choose, whole=True, transfer_terminals=self.transfer_terminals, **steps)
+
+    def _chooser(self, copies: Copies, sets: Sequence[MappingSet]) -> Chooser:
+        """What chooses for a prior. Another method that judges mappings by random transitions has another."""
+        return partial(choose_least_error, copies, sets)
 
     def action(self, state: np.ndarray) -> int | None:
         if self.mapping_steps() >= self.n_random_steps:
@@ -139,7 +143,12 @@ def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float,
 
 def choose_least_error(copies: Copies, sets: Sequence[MappingSet], sums: CopySums) -> Choice:
     """Choose the mapping with the least squared error of all sets, whose state mappings ``copies`` has in order."""
-    errors, first, found = squared_errors(copies, sums), 0, []
+    return choose_least(squared_errors(copies, sums), copies, sets)
+
+
+def choose_least(errors: np.ndarray, copies: Copies, sets: Sequence[MappingSet]) -> Choice:
+    """Choose the mapping for which errors, of the shape of :func:`squared_errors`, add up to least."""
+    first, found = 0, []
     for number, mappings in enumerate(sets):
         rows = slice(first, first + mappings.n_state_mappings)
         error, row, actions = least_error_member(errors[rows, :, : copies.sources[number].n_actions], mappings)
