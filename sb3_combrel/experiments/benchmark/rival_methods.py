@@ -1,7 +1,7 @@
 """Rivals that a reviewer would ask for, and a pair of theirs, as plug-ins of the benchmark.
 
-``sb3-combrel benchmark --methods none sb3_combrel.experiments.benchmark.rival_methods:GAME``, and so on with the others' names. Both
-methods find one mapping by random transitions of the target, as MASTER does, and then transfer as it does: they differ in
+``sb3-combrel benchmark --methods none sb3_combrel.experiments.benchmark.rival_methods:GAME``, and so on with the other names.
+Both methods find one mapping by random transitions of the target, as MASTER does, and then transfer as it does: they differ in
 how a mapping is found, and in nothing else.
 """
 
