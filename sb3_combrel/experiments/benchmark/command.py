@@ -46,7 +46,7 @@ def benchmark(
 ) -> list[Path]:
     """Carry out the runs of some methods on some pairs, unless they were carried out before, and report on them.
 
-    :param pairs: names of :data:`PAIRS`, files that define ``PAIR``, or "all" for all of the package
+    :param pairs: names of :data:`PAIRS`, files that define ``PAIR``, "package.module:Name", or "all" for all of the package
     :param methods: names of :data:`METHODS`, "package.module:Name" or "file.py:Name", or "all" for all of the package
     :param seeds: number of runs of each method on each pair
     :param first_seed: seed of the first
@@ -85,13 +85,14 @@ def pairs_of(names: Sequence[str]) -> list[Pair]:
             found += PAIRS.values()
         elif name in PAIRS:
             found.append(PAIRS[name])
-        elif name.endswith(".py"):
-            pair, digest = load_attribute("pairs", f"{name}:PAIR")
+        elif name.endswith(".py") or ":" in name:
+            text = name if ":" in name else f"{name}:PAIR"
+            pair, digest = load_attribute("pairs", text)
             if not isinstance(pair, Pair):
-                raise ValueError(f"pairs: PAIR of {name} must be a Pair, got {pair!r}")
+                raise ValueError(f"pairs: {text} must be a Pair, got {pair!r}")
             found.append(replace(pair, digest=digest))
         else:
-            own = "a pair of your own is the path of a file that ends in .py and defines PAIR"
+            own = 'a pair of your own is "path/to/file.py", which defines PAIR, or "package.module:Name"'
             raise ValueError(f"pairs must be of {', '.join(PAIRS)}, or all; {own}; got {name!r}{did_you_mean(name, PAIRS)}")
     return found
 

@@ -8,6 +8,7 @@ from helpers.naive_transfer import source_of, transitions_of
 
 from sb3_combrel import FittedRMax, MappingSet
 from sb3_combrel.experiments.benchmark import rival_methods as rivals
+from sb3_combrel.experiments.benchmark.command import pairs_of
 from sb3_combrel.experiments.benchmark.methods import method_of
 from sb3_combrel.experiments.benchmark.rival_methods import BellmanConsistent, EvolvedMapping, evolve, values_of
 from sb3_combrel.transfer.methods.master import squared_errors
@@ -99,3 +100,11 @@ def test_both_tasks_of_the_pair_have_the_same_forces():
     pair = rivals.PENDULUM_CART_POLE
     with pair.make_target() as env:
         assert env.action_space.n == 3 and env.observation_space.shape == (4,)
+
+
+def test_the_pair_is_found_by_name_and_another_object_is_refused():
+    module = "sb3_combrel.experiments.benchmark.rival_methods"
+    [found] = pairs_of([f"{module}:PENDULUM_CART_POLE"])
+    assert found.name == "pendulum-cart-pole" and found.digest
+    with pytest.raises(ValueError, match=f"pairs: {module}:GAME must be a Pair, got Method"):
+        pairs_of([f"{module}:GAME"])
