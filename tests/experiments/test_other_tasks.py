@@ -51,7 +51,8 @@ def test_returns_are_in_the_makers_unit_and_played_by_the_frozen_policy():
     assert TASKS["cartpole-balance"].unit == 2.0
 
 
-def test_the_command_writes_a_row_for_each_budget_and_does_not_repeat_what_is_there(tmp_path):
+def test_the_command_writes_a_row_for_each_budget_and_does_not_repeat_what_is_there(monkeypatch, tmp_path):
+    monkeypatch.setattr(other_tasks, "N_EPISODES", 1)
     arguments = {"seeds": [1], "budgets": [20, 40], "output": tmp_path / "runs", "table": tmp_path / "table.csv"}
     other_tasks.other_tasks(HERE[:1], ["FittedRMax", "DQN"], **arguments)
     table = pd.read_csv(arguments["table"])
