@@ -108,7 +108,7 @@ class Planner:
         """Change the value of what is optimistic; the others follow by sweeps."""
         before, self.bounds = self.bounds[1], (self.bounds[0], float(max_value))
         self.upper[:] = np.where(self.upper == before, max_value, np.minimum(self.upper, max_value))
-        self.restore(np.where(self.mdp.arrays.n_optimistic > 0, self.upper, self.values))
+        self._bound_values()
 
     def set_upper(self, upper: np.ndarray | None) -> None:
         """Bound the values of grid points, and so what is optimistic, by less than ``max_value``.
@@ -123,7 +123,12 @@ class Planner:
             )
         self.upper[:] = self.bounds[1] if upper is None else np.clip(upper, *self.bounds)
         self.is_bounded = bool((self.upper < self.bounds[1]).any())
-        self.restore(np.where(self.mdp.arrays.n_optimistic > 0, self.upper, self.values))
+        self._bound_values()
+
+    def _bound_values(self) -> None:
+        """Take over other upper bounds: optimistic points have them, unless the agent is searching, and are worth less."""
+        optimistic = (self.mdp.arrays.n_optimistic > 0) & (self.worth is self.upper)
+        self.restore(np.where(optimistic, self.upper, self.values))
 
     def restore(self, values: np.ndarray) -> None:
         """Replace the values by saved ones."""

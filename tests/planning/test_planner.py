@@ -140,6 +140,10 @@ def test_while_searching_each_point_has_the_worth_it_is_given_and_what_the_ways_
                     expected[point] = min(0.0, max(expected[point], arrays.reward[point, action] + after))
     np.testing.assert_allclose(planner.values, expected, atol=1e-6)
     assert n < 20 or (planner.values > own).any(), "a problem without interest"
+    # Bounds that come again do not undo what sweeps have found.
+    found = planner.values.copy()
+    planner.set_upper(None)
+    np.testing.assert_array_equal(planner.values, found)
     planner.set_worth(None)
     planner.sweep(MANY)
     np.testing.assert_allclose(planner.values, values_of_rows(planner), atol=1e-6)
