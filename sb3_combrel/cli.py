@@ -141,7 +141,7 @@ def benchmark(
 
     It can be stopped at any time; the same command continues from there. More in docs/benchmark.md.
 
-    :param pairs: names of pairs, or all; or files of your own that end in .py and define PAIR (docs/add_to_the_benchmark.md)
+    :param pairs: names of pairs, or all; or your own: path/to/file.py, which defines PAIR, or package.module:Name
     :param methods: names of methods, or all; or your own: package.module:Name or path/to/file.py:Name
     :param seeds: runs of each method on each pair
     :param first_seed: seed of the first

@@ -6,7 +6,6 @@ Run as ``python -m sb3_combrel.experiments.fine_tuning``; a later call does what
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,18 +16,14 @@ from typing import Any
 
 import gymnasium as gym
 import torch
-from rich.console import Console
 
-from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.experiments.benchmark.pairs import PAIRS, make_car, make_pendulum_of_three
-from sb3_combrel.experiments.other_tasks import ALIKE, BUDGETS, AtBudgets, table_of
-from sb3_combrel.experiments.rivals import learner_of, published
+from sb3_combrel.experiments.other_tasks import ALIKE, BUDGETS, BudgetJob, check_budgets, learn_all
+from sb3_combrel.experiments.rivals import check_names, learner_of, published
 from sb3_combrel.experiments.suite.tasks import CAP, SLIGHT_NOISE
 from sb3_combrel.experiments.tasks import cart_pole, icub_arm, mountain_car
 from sb3_combrel.experiments.tasks.point_robot import make_point_robot
-from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder
-from sb3_combrel.runs.job import Job, Result, Task, chosen_on_purpose, make_env
-from sb3_combrel.runs.runner import Backend, check_all_succeeded, run_missing
+from sb3_combrel.runs.job import Task, make_env
 
 #: The source's environment of each pair of the benchmark that has one source.
 SOURCES: dict[str, Callable[[], gym.Env]] = {
@@ -49,35 +44,26 @@ OUTPUT, TABLE = Path("fine_tuning"), Path("docs/results/fine_tuning.csv")
 
 
 @dataclass(frozen=True, kw_only=True)
-class FineTuningJob(Job):
+class FineTuningJob(BudgetJob):
     """DQN learns the target of a pair, ``group``, from nothing or from what it has learnt in the source.
 
     :param source: the source's environment
     :param source_steps: steps of learning there, if ``method`` is :data:`FINE_TUNED`
-    :param budgets: steps after which the frozen policy is evaluated in the target; the last one ends the run
     """
 
     source: Task
     source_steps: int
-    budgets: tuple[int, ...]
 
-    def carry_out(self) -> Result:
-        """Learn the source, if it is to be, and the target, whose time is taken without that of the evaluations."""
-        with chosen_on_purpose(), closing(self.make_env()) as env, closing(self.make_env()) as evaluation_env:
-            model, recorder, copied = learner_of("DQN", env, self.seed, self.learner), EpisodeRecorder(), 0
-            if self.method == FINE_TUNED:
-                with closing(make_env(self.source)) as source_env:
-                    source = learner_of("DQN", source_env, self.seed, self.learner)
-                    source.learn(self.source_steps, log_interval=None)
-                copied = warm_start(model.q_net, source.q_net)
-                model.q_net_target.load_state_dict(model.q_net.state_dict())
-            at_budgets = AtBudgets(evaluation_env, self.budgets, EVALUATION_SEED + self.seed)
-            start = time.process_time()
-            model.learn(max(self.budgets), [recorder, at_budgets], log_interval=None)
-            seconds = time.process_time() - start - at_budgets.spent
-        more = {"returns": {str(steps): mean for steps, mean in at_budgets.returns.items()}, "copied": copied}
-        episodes = (column.tolist() for column in recorder.episodes)
-        return self.result(*episodes, int(model.num_timesteps), more, seconds)
+    def make_learner(self, env: gym.Env) -> tuple[Any, dict[str, Any]]:
+        """Make the model, which has learnt the source first if it is to be fine-tuned."""
+        model, copied = learner_of(FROM_NOTHING, env, self.seed, self.learner), 0
+        if self.method == FINE_TUNED:
+            with closing(make_env(self.source)) as source_env:
+                source = learner_of(FROM_NOTHING, source_env, self.seed, self.learner)
+                source.learn(self.source_steps, log_interval=None)
+            copied = warm_start(model.q_net, source.q_net)
+            model.q_net_target.load_state_dict(model.q_net.state_dict())
+        return model, {"copied": copied}
 
 
 def warm_start(network: torch.nn.Module, learnt: torch.nn.Module) -> int:
@@ -93,14 +79,12 @@ def fine_tuning_jobs(
 ) -> list[FineTuningJob]:
     """Make the jobs, seed by seed.
 
-    :raises ValueError: if a name is unknown
+    :raises ValueError: if a name is unknown, or a budget is not positive
     :raises ModuleNotFoundError: if RL-Zoo is not installed
     """
-    unknown = [name for name in pairs if name not in SOURCES]
-    if unknown:
-        close = did_you_mean(unknown[0], SOURCES)
-        raise ValueError(f"pairs must be some of {', '.join(SOURCES)}, got {unknown[0]!r}{close}")
-    hyperparameters: dict[str, Any] = published("DQN", ALIKE["DQN"])
+    check_names("pairs", pairs, SOURCES)
+    check_budgets(budgets)
+    hyperparameters: dict[str, Any] = published(FROM_NOTHING, ALIKE[FROM_NOTHING])
     return [
         FineTuningJob(
             group=pair,
@@ -135,12 +119,7 @@ def fine_tuning(
     :param output: folder for the results; a later call goes on from there
     :param table: the CSV file
     """
-    wanted = fine_tuning_jobs(pairs, seeds, budgets, source_steps)
-    results = run_missing(wanted, output, Backend(n_jobs=jobs), Console())
-    check_all_succeeded(results)
-    rows = table_of(results)
-    rows.to_csv(table, index=False)
-    print(rows.pivot_table("mean_return", ["task", "algorithm"], "steps", sort=False).round(1))
+    learn_all(fine_tuning_jobs(pairs, seeds, budgets, source_steps), jobs, output, table)
 
 
 def main() -> None:

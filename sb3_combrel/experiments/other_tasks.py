@@ -23,8 +23,7 @@ from gymnasium.wrappers import TransformAction
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_combrel.common.suggestions import did_you_mean
-from sb3_combrel.experiments.rivals import CROSSQ, FITTED_RMAX, folder_of, learner_of, published
+from sb3_combrel.experiments.rivals import CROSSQ, FITTED_RMAX, check_names, folder_of, learner_of, published
 from sb3_combrel.experiments.tasks.bsuite_tasks import FACES, make_bsuite
 from sb3_combrel.experiments.tasks.dm_suite import make_dm_control
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, play
@@ -105,20 +104,28 @@ class AtBudgets(BaseCallback):
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetJob(Job):
-    """An algorithm, ``method``, that learns a task, ``group``, for the largest of ``budgets`` and is evaluated at each."""
+    """An algorithm, ``method``, that learns a task, ``group``, and is evaluated after some numbers of steps.
+
+    :param budgets: these; the last one ends the run
+    :param unit: what mean returns are multiplied by
+    """
 
     budgets: tuple[int, ...]
+    unit: float = 1.0
+
+    def make_learner(self, env: gym.Env) -> tuple[Any, dict[str, Any]]:
+        """Make the model that learns in an environment, and what the result says of how it begins."""
+        return learner_of(self.method, env, self.seed, self.learner), {}
 
     def carry_out(self) -> Result:
-        """Learn, and take the time without that of the evaluations."""
+        """Learn, and take the time without that of the evaluations, but with that of compiling."""
         with chosen_on_purpose(), closing(self.make_env()) as env, closing(self.make_env()) as evaluation_env:
-            model, recorder = learner_of(self.method, env, self.seed, self.learner), EpisodeRecorder()
+            (model, more), recorder = self.make_learner(env), EpisodeRecorder()
             at_budgets = AtBudgets(evaluation_env, self.budgets, EVALUATION_SEED + self.seed)
             start = time.process_time()
             model.learn(max(self.budgets), [recorder, at_budgets], log_interval=None)
             seconds = time.process_time() - start - at_budgets.spent
-        unit = TASKS[self.group].unit
-        more = {"returns": {str(budget): unit * mean for budget, mean in at_budgets.returns.items()}}
+        more |= {"returns": {str(steps): self.unit * mean for steps, mean in at_budgets.returns.items()}}
         episodes = (column.tolist() for column in recorder.episodes)
         return self.result(*episodes, int(model.num_timesteps), more, seconds)
 
@@ -126,6 +133,12 @@ class BudgetJob(Job):
 def made_for(task: str, algorithm: str) -> gym.Env:
     """Make a task of :data:`TASKS` for an algorithm."""
     return TASKS[task].made_for(algorithm)
+
+
+def check_budgets(budgets: Sequence[int]) -> None:
+    """:raises ValueError: if there is none, or one is not positive"""
+    if not budgets or min(budgets) < 1:
+        raise ValueError(f"budgets must be numbers of steps, at least 1, got {budgets!r}")
 
 
 def budget_jobs(
@@ -136,13 +149,9 @@ def budget_jobs(
     :raises ValueError: if a name is unknown, or a budget is not positive
     :raises ModuleNotFoundError: if a package is not installed
     """
-    for argument, names, known in (("tasks", tasks, tuple(TASKS)), ("algorithms", algorithms, ALGORITHMS)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            close = did_you_mean(unknown[0], known)
-            raise ValueError(f"{argument} must be some of {', '.join(known)}, got {unknown[0]!r}{close}")
-    if not budgets or min(budgets) < 1:
-        raise ValueError(f"budgets must be numbers of steps, at least 1, got {budgets!r}")
+    check_names("tasks", tasks, TASKS)
+    check_names("algorithms", algorithms, ALGORITHMS)
+    check_budgets(budgets)
     for package, needed in (("sbx", CROSSQ in algorithms), ("bsuite", any(name.startswith("bsuite-") for name in tasks))):
         if needed:
             folder_of(package, "the comparison")
@@ -158,6 +167,7 @@ def budget_jobs(
             n_steps=max(budgets),
             learner=hyperparameters[algorithm],
             budgets=tuple(budgets),
+            unit=TASKS[task].unit,
         )
         for seed, task, algorithm in product(seeds, tasks, algorithms)
         if algorithm != CROSSQ or TASKS[task].few_actions is not None
@@ -176,6 +186,15 @@ def table_of(results: Sequence[Result]) -> pd.DataFrame:
             for steps, mean in each.more["returns"].items()
         ]
     ).round(2)
+
+
+def learn_all(jobs: Sequence[BudgetJob], n_jobs: int, output: Path, table: Path) -> None:
+    """Carry out what is missing in a folder, write the table of all, and print mean returns."""
+    results = run_missing(jobs, output, Backend(n_jobs=n_jobs), Console())
+    check_all_succeeded(results)
+    rows = table_of(results)
+    rows.to_csv(table, index=False)
+    print(rows.pivot_table("mean_return", ["task", "algorithm"], "steps", sort=False).round(1))
 
 
 def other_tasks(
@@ -197,12 +216,7 @@ def other_tasks(
     :param output: folder for the results; a later call goes on from there
     :param table: the CSV file
     """
-    wanted = budget_jobs(tasks, algorithms, seeds, budgets)
-    results = run_missing(wanted, output, Backend(n_jobs=jobs), Console())
-    check_all_succeeded(results)
-    rows = table_of(results)
-    rows.to_csv(table, index=False)
-    print(rows.pivot_table("mean_return", ["task", "algorithm"], "steps", sort=False).round(1))
+    learn_all(budget_jobs(tasks, algorithms, seeds, budgets), jobs, output, table)
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ import importlib.util
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import product
@@ -215,17 +215,22 @@ def folder_of(package: str, user: str) -> Path:
     return Path(spec.origin).parent
 
 
+def check_names(argument: str, names: Sequence[str], known: Collection[str]) -> None:
+    """:raises ValueError: if a name is none of the known ones"""
+    for name in names:
+        if name not in known:
+            close = did_you_mean(name, known)
+            raise ValueError(f"{argument} must be some of {', '.join(known)}, got {name!r}{close}")
+
+
 def rival_jobs(tasks: Sequence[str], algorithms: Sequence[str], seeds: Sequence[int], max_steps: int) -> list[RivalJob]:
     """Make the jobs, seed by seed; CrossQ has none where actions are discrete.
 
     :raises ValueError: if a name is unknown
     :raises ModuleNotFoundError: if a package is not installed
     """
-    for argument, names, known in (("tasks", tasks, THRESHOLDS), ("algorithms", algorithms, EVERY)):
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            close = did_you_mean(unknown[0], known)
-            raise ValueError(f"{argument} must be some of {', '.join(known)}, got {unknown[0]!r}{close}")
+    check_names("tasks", tasks, THRESHOLDS)
+    check_names("algorithms", algorithms, EVERY)
     if CROSSQ in algorithms:
         folder_of("sbx", CROSSQ)
     runs = [run for run in product(tasks, algorithms) if run[1] != CROSSQ or run[0] in DISCRETISED]

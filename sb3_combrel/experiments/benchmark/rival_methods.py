@@ -28,7 +28,7 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
-#: Of the published search for Mountain Car: mappings of a generation, how many compete to be a parent, probability that two
+#: As in that project's search for Mountain Car: mappings of a generation, how many compete to be a parent, probability that two
 #: parents are crossed and that a part of a mapping mutates, and how many mappings are judged in all.
 POPULATION, TOURNAMENT, CROSSED, MUTATED, JUDGED = 10, 4, 0.8, 1 / 7, 240
 #: Without discounting the source's least and largest values are not bounded by its rewards.
@@ -47,11 +47,12 @@ class Member(NamedTuple):
 class EvolvedMapping(MASTER):
     """A genetic algorithm searches for the mapping that predicts random transitions of the target best.
 
-    Paper: Hua & Sheppard, "Genetic algorithms for mapping evolution" (GAME, IEEE CEC 2023): every target variable has a source
-    variable and every target action a source action; the fittest of some that are drawn are parents, each part of a child is
-    that of one of them, the fitter one more often, and may mutate; the best of a generation lives on. What differs: a mapping
-    is judged by what the source's model predicts of the target's transitions, where the paper judges what a target's model,
-    fitted beforehand, predicts of the source's; and Fitted R-Max learns in the target.
+    After M. Hua's project "Genetic algorithms for mapping evolution" (GAME, https://github.com/duyminh1998/GAME), as its code
+    has it: every target variable has a source variable and every target action a source action; the fittest of some that are
+    drawn are parents, each part of a child is that of one of them, the fitter one more often, and may mutate; the best of a
+    generation lives on. What differs: a mapping is judged by what the source's model predicts of the target's transitions,
+    where the project judges what a target's model, fitted beforehand, predicts of the source's; and Fitted R-Max learns in the
+    target.
     """
 
     mappings: MappingsLike = field(default="surjective", init=False)
@@ -146,7 +147,7 @@ def values_of(policy: SourcePolicy, states: np.ndarray) -> np.ndarray:
 GAME = Method(
     "GAME",
     "The mapping that a genetic algorithm finds by its prediction error on 100 random transitions, as a prior "
-    '(after Hua & Sheppard, "Genetic algorithms for mapping evolution", CEC 2023).',
+    '(after the project "Genetic algorithms for mapping evolution" of M. Hua).',
     lambda sources, pair: EvolvedMapping(the_one(sources, "GAME")),
     finds_mapping=True,
     compiled_steps=DEFAULT_RANDOM_STEPS + COMPILED_STEPS,
