@@ -36,6 +36,8 @@ def test_a_network_that_has_learnt_the_source_acts_otherwise_than_one_from_nothi
     assert copied == {"DQN": 0, "fine-tuned": 6}
 
 
-def test_unknown_pairs_are_refused():
+def test_unknown_pairs_and_budgets_are_refused():
     with pytest.raises(ValueError, match=r"pairs must be some of .*, got 'mountain-cars'; did you mean 'mountain-car'"):
         fine_tuning_jobs(["mountain-cars"], [1], [5], 20)
+    with pytest.raises(ValueError, match="budgets must be numbers of steps, at least 1, got"):
+        fine_tuning_jobs(["mountain-car"], [1], [0, 5], 20)

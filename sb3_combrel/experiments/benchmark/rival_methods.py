@@ -28,7 +28,7 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
-#: As in that project's search for Mountain Car: mappings of a generation, how many compete to be a parent, probability that two
+#: As in GAME's search for Mountain Car: mappings of a generation, how many compete to be a parent, the probability that two
 #: parents are crossed and that a part of a mapping mutates, and how many mappings are judged in all.
 POPULATION, TOURNAMENT, CROSSED, MUTATED, JUDGED = 10, 4, 0.8, 1 / 7, 240
 #: Without discounting the source's least and largest values are not bounded by its rewards.
