@@ -92,6 +92,32 @@ def insert_by_distance(items, distances, length, item, distance):
     return length + 1
 
 
+@inlined
+def scan_block(instances, action, block, state, farthest, length, items, distances):
+    """Put the instances of a block that are no farther than squared ``farthest`` into the list: its length, and farthest."""
+    wraps = any_periodic(instances.periodic)
+    for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
+        distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
+        if distance > farthest:
+            continue
+        length = insert_by_distance(items, distances, length, i, distance)
+        if length == len(items):
+            farthest = distances[length - 1]
+    return length, farthest
+
+
+@inlined
+def take_nearest_block(gap, n_blocks):
+    """The nearest block that has not been taken, -1 for none; its gap becomes NaN, which is near nothing."""
+    nearest, least = -1, np.inf
+    for block in range(n_blocks):
+        if gap[block] < least:
+            nearest, least = block, gap[block]
+    if nearest >= 0:
+        gap[nearest] = np.nan
+    return nearest
+
+
 @inner
 def nearest_instances(instances, action, state, farthest, items, distances):
     """The nearest instances of ``action``, nearest first, as many as ``items`` has room for; how many.
@@ -99,20 +125,17 @@ def nearest_instances(instances, action, state, farthest, items, distances):
     :param farthest: squared distance beyond which none counts
     :param items: int32, receives them; ``distances``: their squared distances
     """
-    count = instances.size[action]
-    room = len(items)
-    wraps = any_periodic(instances.periodic)
     length = np.int64(0)
-    for block in range(measure_blocks(instances, action, state)):
-        if instances.gap[block] > farthest * (1 + 1e-12):
-            continue
-        for i in range(block * BLOCK, min(count, (block + 1) * BLOCK)):
-            distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
-            if distance > farthest:
-                continue
-            length = insert_by_distance(items, distances, length, i, distance)
-            if length == room:
-                farthest = distances[room - 1]
+    n_blocks = measure_blocks(instances, action, state)
+    if farthest == np.inf:
+        # The nearest blocks first: then most of the others are too far.
+        for _ in range(0, len(items), BLOCK):
+            block = take_nearest_block(instances.gap, n_blocks)
+            if block >= 0:
+                length, farthest = scan_block(instances, action, block, state, farthest, length, items, distances)
+    for block in range(n_blocks):
+        if instances.gap[block] <= farthest * (1 + 1e-12):
+            length, farthest = scan_block(instances, action, block, state, farthest, length, items, distances)
     return length
 
 

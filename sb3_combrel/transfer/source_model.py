@@ -32,12 +32,22 @@ def source_arrays(plain):
 
 
 @inner
-def predict_source(instances, kernel, fit, away, action, state, effect):
-    """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
+def predict_effect(instances, kernel, fit, away, action, state, effect):
+    """Write to ``effect`` what a state and action lead to; instances near it, listed in ``fit``, and the weight, 0 without."""
     length = nearest_instances(instances, action, state, kernel.reach, fit.item, fit.distance)
     if length == 0:
         effect[:] = 0.0
-        return 0.0, 0.0, 0.0
+        return length, 0.0
+    fit_around(state, action, length, instances, kernel, fit)
+    for v in range(len(state)):
+        effect[v] = number_at(fit, v, away)
+    return length, known_weight(fit, length, kernel) / (1.0 + beyond_data(fit))
+
+
+@inner
+def predict_source(instances, kernel, fit, away, action, state, effect):
+    """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
+    length, founded = predict_effect(instances, kernel, fit, away, action, state, effect)
     outcomes, reward, end = 0.0, 0.0, 0.0
     for k in range(length):
         i = fit.item[k]
@@ -47,10 +57,7 @@ def predict_source(instances, kernel, fit, away, action, state, effect):
         reward += weight * instances.reward[action, i]
         if instances.terminated[action, i]:
             end += weight
-    fit_around(state, action, length, instances, kernel, fit)
-    for v in range(len(state)):
-        effect[v] = number_at(fit, v, away)
-    return reward / outcomes, end / outcomes, known_weight(fit, length, kernel) / (1.0 + beyond_data(fit))
+    return (reward / outcomes, end / outcomes, founded) if length > 0 else (0.0, 0.0, 0.0)
 
 
 @inlined

@@ -9,7 +9,7 @@ import numpy as np
 from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.transfer.prior.copy_predictions import CopyTable, Uses, see_state
 from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
-from sb3_combrel.transfer.source_model import predict_source, source_arrays
+from sb3_combrel.transfer.source_model import predict_effect, source_arrays
 
 
 class CopySums(NamedTuple):
@@ -76,7 +76,7 @@ def add_transition(source, table, transition, sums, scratch):
     for copy in range(len(table.first)):
         see_state(table, copy, state, at)
         for u in range(table.n_actions[copy]):
-            _, _, weight = predict_source(instances, kernel, fit, away, table.first[copy] + u, at, predicted)
+            _, weight = predict_effect(instances, kernel, fit, away, table.first[copy] + u, at, predicted)
             for v in range(len(state)):
                 k = table.variable[copy, v]
                 if k >= 0:
