@@ -96,7 +96,7 @@ class GridModel(Model):
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )
-        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._n_fitted)
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._n_fitted, self._has_prior)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
         self._plain_pairs, self._plain_kernel = tuple(self.pairs), tuple(self.kernel)
         # Where instances are transferred, what is not known is updated when its instances are twice as many.
@@ -119,10 +119,14 @@ class GridModel(Model):
         self._renew_arrivals()
 
     @property
+    def _has_prior(self) -> bool:
+        """Whether a transfer method is the prior of the fits."""
+        return self.takes_prior and self.transfer is not None and self.transfer.use == "prior"
+
+    @property
     def _giver(self) -> InstanceTransfer | None:
         """Where instances come from for pairs that are not known; a transfer method that is a prior gives none."""
-        transfer = self.transfer
-        return None if transfer is None or (self.takes_prior and transfer.use == "prior") else transfer
+        return None if self._has_prior else self.transfer
 
     @abstractmethod
     def _predict_own(self, state: np.ndarray) -> float:

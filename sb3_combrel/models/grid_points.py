@@ -17,20 +17,23 @@ class PairArrays(NamedTuple):
     """What a model has of each pair (pair ``action * n_points + point``)."""
 
     reach: np.ndarray  # float64, (n_pairs,): squared distance within which a new instance concerns the pair
-    n_new: np.ndarray  # int32, (n_pairs,): instances within that since the pair was last fitted
+    n_new: np.ndarray  # int32, (n_pairs,): instances that came or went within that since the pair was last fitted
     length: np.ndarray  # int32, (n_pairs,): instances that it was fitted to then
     fitted_at: np.ndarray  # int64, (n_pairs,): transitions there were then; 0: it never was
     weight: np.ndarray  # float64, (n_pairs,): of the instances, which decides whether the pair is known
     known: np.ndarray  # bool, (n_pairs,)
     # How much new instances may have changed of what is predicted, in parts of the mean effect; inf: it is fitted at once.
     surprise: np.ndarray  # float64, (n_pairs,)
-    fit: (
-        np.ndarray
-    )  # float64, (n_pairs, d + 1, d + 1): means and slopes of effects and reward; (n_pairs, 0, 0) for a model without
+    # Means and slopes of effects and reward; (n_pairs, 0, 0) for a model without.
+    fit: np.ndarray  # float64, (n_pairs, d + 1, d + 1)
+    # Where a prior joins the fits: those to the own instances alone, as ``LocalFit`` has solution, low and high.
+    own_fit: np.ndarray  # float64, (n_pairs, d + 1, d + 4); (n_pairs, 0, 3) without a prior
+    nearest: np.ndarray  # int32, (n_pairs,): the nearest of the instances of the own fit
 
     @classmethod
-    def empty(cls, n_pairs: int, reach: float, n_numbers: int) -> "PairArrays":
+    def empty(cls, n_pairs: int, reach: float, n_numbers: int, takes_prior: bool) -> "PairArrays":
         """Pairs none of which has been fitted; ``n_numbers``: d + 1, or 0 for a model without fits."""
+        n_own = n_numbers if takes_prior else 0
         return cls(
             reach=np.full(n_pairs, reach),
             n_new=np.zeros(n_pairs, dtype=np.int32),
@@ -40,6 +43,8 @@ class PairArrays(NamedTuple):
             known=np.zeros(n_pairs, dtype=np.bool_),
             surprise=np.zeros(n_pairs),
             fit=np.zeros((n_pairs, n_numbers, n_numbers)),
+            own_fit=np.zeros((n_pairs, n_own, n_own + 3)),
+            nearest=np.zeros(n_pairs, dtype=np.int32),
         )
 
 
@@ -89,6 +94,7 @@ def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predi
     if why == WENT:
         # Another one, farther away, may take its place.
         pairs.reach[pair] = widest
+        pairs.n_new[pair] += 1
         return True
     if why == ENDED:
         return pairs.known[pair]

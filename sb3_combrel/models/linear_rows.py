@@ -7,7 +7,7 @@ import numpy as np
 from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.kernels import nearest_instances, squared_distance
+from sb3_combrel.common.kernels import any_periodic, nearest_instances, squared_distance
 from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, join_prior, known_weight, leverage_of, number_at
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
@@ -200,13 +200,37 @@ def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
 
 
 @inlined
-def note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit):
+def note_fit(pair, length, weight, threshold, transitions, pairs):
     """Note that a pair is fitted to its instances; whether these suffice."""
-    full = length == kernel.n_neighbors
-    pairs.reach[pair] = fit.distance[length - 1] if full else kernel.reach
     pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
     pairs.weight[pair], pairs.known[pair], pairs.surprise[pair] = weight, weight >= threshold, 0.0
     return pairs.known[pair]
+
+
+@inlined
+def keep_own_fit(pair, pairs, fit):
+    """Keep a fit that a prior has not joined yet, for :func:`recall_own_fit`."""
+    kept, (n, columns) = pairs.own_fit[pair], fit.solution.shape
+    for p in range(n):
+        for v in range(columns):
+            kept[p, v] = fit.solution[p, v]
+        kept[p, columns], kept[p, columns + 1] = fit.low[p], fit.high[p]
+    pairs.nearest[pair] = fit.item[0]
+
+
+@inlined
+def recall_own_fit(pair, at, action, instances, pairs, fit):
+    """Put back what :func:`keep_own_fit` has kept, while no other instances are near the pair."""
+    kept, (n, columns) = pairs.own_fit[pair], fit.solution.shape
+    for p in range(n):
+        for v in range(columns):
+            fit.solution[p, v] = kept[p, v]
+        fit.low[p], fit.high[p] = kept[p, columns], kept[p, columns + 1]
+    fit.item[0] = pairs.nearest[pair]
+    wraps = any_periodic(instances.periodic)
+    # Of distances the first and the last are used, and the last one of a full list alone.
+    fit.distance[pairs.length[pair] - 1] = pairs.reach[pair]
+    fit.distance[0] = squared_distance(at, instances.state[action, fit.item[0]], instances.periodic, wraps)
 
 
 @compiled
@@ -237,17 +261,25 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         action = pair // n_points
         unit_coordinates_of(point, grid, scratch.at)
         coordinates_of(point, grid, row_scratch.at)
-        # Instances only come nearer, but for those that are removed (see grid_points.look_at).
-        length = find_nearest(scratch.at, action, pairs.reach[pair], instances, fit)
-        weight = known_weight(fit, length, kernel)
-        known = note_fit(pair, length, weight, threshold, transitions, pairs, kernel, fit)
+        length, weight = pairs.length[pair], pairs.weight[pair]
+        kept = has_prior and pairs.known[pair] and pairs.n_new[pair] == 0 and length > 0
+        if not kept:
+            # Instances only come nearer, but for those that are removed (see grid_points.look_at).
+            length = find_nearest(scratch.at, action, pairs.reach[pair], instances, fit)
+            weight = known_weight(fit, length, kernel)
+            pairs.reach[pair] = fit.distance[length - 1] if length == kernel.n_neighbors else kernel.reach
+        known = note_fit(pair, length, weight, threshold, transitions, pairs)
         joined = not known and transferred.length[done] > 0
         if known or joined:
             total = total_weight(weight, transferred, done) if joined else weight
             reward, discount, n_touched = 0.0, gamma, np.int64(0)
             if length > 0:
-                fit_around(scratch.at, action, length, instances, kernel, fit)
+                if kept:
+                    recall_own_fit(pair, scratch.at, action, instances, pairs, fit)
+                else:
+                    fit_around(scratch.at, action, length, instances, kernel, fit)
                 if has_prior:
+                    keep_own_fit(pair, pairs, fit)
                     join_prior(linear.prior[pair], kernel, length, fit)
                 for p in range(pairs.fit.shape[1]):
                     for v in range(pairs.fit.shape[2]):

@@ -51,7 +51,7 @@ class LocalLinear(GridModel):
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._n_fitted = mdp.grid.n_variables + 1
         super().__init__(mdp, settings, transfer)
-        self._prior = transfer if transfer is not None and transfer.use == "prior" else None
+        self._prior = transfer if self._has_prior else None
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
         self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
         self._plain_linear = tuple(self.linear)
@@ -97,8 +97,8 @@ class LocalLinear(GridModel):
         return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, has_prior = self.mdp, self._prior is not None
-        planned = mdp.gamma, self._rules[1], has_prior, self.n_added
+        mdp = self.mdp
+        planned = mdp.gamma, self._rules[1], self._has_prior, self.n_added
         model = self._plain_experience, self._plain_linear, self._plain_pairs, mdp.plain, self.grid.plain, self._plain_kernel
         scratch = mdp.plain_scratch, self._fit, self._scratch
         return int(_update_rows.call(*model, planned, pairs, transferred, *scratch))

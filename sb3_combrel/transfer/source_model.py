@@ -32,9 +32,12 @@ def source_arrays(plain):
 
 
 @inner
-def predict_effect(instances, kernel, fit, away, action, state, effect):
-    """Write to ``effect`` what a state and action lead to; instances near it, listed in ``fit``, and the weight, 0 without."""
-    length = nearest_instances(instances, action, state, kernel.reach, fit.item, fit.distance)
+def predict_effect(instances, kernel, fit, away, action, state, effect, farthest):
+    """Write to ``effect`` what a state and action lead to; instances near it, listed in ``fit``, and the weight, 0 without.
+
+    :param farthest: squared distance beyond which none of the nearest instances is, if that is known
+    """
+    length = nearest_instances(instances, action, state, min(kernel.reach, farthest), fit.item, fit.distance)
     if length == 0:
         effect[:] = 0.0
         return length, 0.0
@@ -47,7 +50,7 @@ def predict_effect(instances, kernel, fit, away, action, state, effect):
 @inner
 def predict_source(instances, kernel, fit, away, action, state, effect):
     """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
-    length, founded = predict_effect(instances, kernel, fit, away, action, state, effect)
+    length, founded = predict_effect(instances, kernel, fit, away, action, state, effect, np.inf)
     outcomes, reward, end = 0.0, 0.0, 0.0
     for k in range(length):
         i = fit.item[k]

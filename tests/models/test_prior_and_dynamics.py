@@ -67,6 +67,29 @@ def test_a_prior_is_asked_again_when_its_version_has_grown_and_only_then():
     assert len(model.renew_prior()) == 0
 
 
+@pytest.mark.parametrize("max_instances", [None, 8])
+def test_a_new_prior_joins_fits_that_were_kept_as_it_joins_those_made_anew(max_instances):
+    """``n_new`` says that none is kept."""
+    one, other = LinearDynamics(5, 2), LinearDynamics(6, 2)
+    models = []
+    for _ in range(2):
+        model = model_with_prior(StubPrior(one.effect), max_instances=max_instances)
+        for transition in one.transitions(np.random.default_rng(0).random((40, 2))):
+            model.update_rows(model.add(*transition))
+        models.append(model)
+    kept, anew = models
+    outdated = np.setdiff1d(np.flatnonzero(kept.known), kept.outdated())
+    assert len(outdated) > 4
+    for model in models:
+        model.mdp.gamma, model._prior.effect = 0.9, other.effect
+    anew.pairs.n_new[outdated] = 1
+    for model in models:
+        renew(model, model._prior)
+        model.update_rows(outdated)
+    assert (kept.pairs.own_fit[outdated] != 0.0).any()
+    linear_models.assert_same_to_the_last_bit(kept, anew)
+
+
 # What the local linear model makes of dynamics of a known kind: linear ones, and a wall.
 BROAD = dict(breadth=0.5, min_weight=0.05, n_neighbors=20, outcome_breadth=0.05, min_fraction=0.01)
 WALL, STRIDE = 0.6, 0.1

@@ -76,7 +76,14 @@ class Copies:
         self.most_actions = int(self.table.n_actions.max())
         #: Actions that some instance of each copy's source has taken, bool, shape (n_copies, most_actions).
         self.taken = np.array([np.isin(np.arange(self.most_actions), each.actions) for each in sources])[source]
-        self._scratch = np.empty(n_variables), np.empty(n_variables), np.empty(state.shape[1])
+        radius = np.full((len(source), self.most_actions), np.inf)
+        self._scratch = (
+            np.empty(n_variables),
+            np.empty(n_variables),
+            np.empty(state.shape[1]),
+            np.zeros(state.shape[1]),
+            radius,
+        )
 
     def __len__(self) -> int:
         return len(self.source)

@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.kernels import squared_distance
 from sb3_combrel.transfer.prior.copy_predictions import CopyTable, Uses, see_state
 from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
 from sb3_combrel.transfer.source_model import predict_effect, source_arrays
+
+# In parts of a distance.
+ROUNDING = 1e-9
 
 
 class CopySums(NamedTuple):
@@ -65,18 +69,26 @@ def add_prediction(sums, at, effect, predicted, scale, weight):
 def add_transition(source, table, transition, sums, scratch):
     """Add one target transition (state, action, effect) to the sums, for all copies and source actions; plain tuples.
 
-    :param scratch: work space: a state as a copy has it, and what the source predicts there, shape (n_source_variables,); and
-        shape (n_target_variables,)
+    :param scratch: work space: a state as a copy has it, and what the source predicts there, shape (n_source_variables,);
+        shape (n_target_variables,); the state of the transition before, and how far from it lists of near instances reached,
+        shape (n_copies, most source actions), infinite at first
     """
     instances, kernel, fit, away = source_arrays(source)
     table, sums = CopyTable(*table), CopySums(*sums)
     state, action, effect = transition
-    at, predicted, scale = scratch
+    at, predicted, scale, last, radius = scratch
     add_effect(sums, action, effect, scale)
+    moved = np.sqrt(squared_distance(state, last, instances.periodic, False))
+    for v in range(len(state)):
+        last[v] = state[v]
     for copy in range(len(table.first)):
         see_state(table, copy, state, at)
         for u in range(table.n_actions[copy]):
-            _, weight = predict_effect(instances, kernel, fit, away, table.first[copy] + u, at, predicted)
+            # No state has moved farther as a copy has it than in the target, and no list reaches farther than it did by more.
+            farthest = ((radius[copy, u] + moved) * (1.0 + ROUNDING)) ** 2
+            of_source = table.first[copy] + u
+            length, weight = predict_effect(instances, kernel, fit, away, of_source, at, predicted, farthest)
+            radius[copy, u] = np.sqrt(fit.distance[length - 1]) if length > 0 else np.inf
             for v in range(len(state)):
                 k = table.variable[copy, v]
                 if k >= 0:
