@@ -137,7 +137,7 @@ class CompareResult:
         smallest = smallest_p_value(len(measure.with_transfer), len(measure.without), len(self.measures))
         if not smallest < ALPHA:
             advice = f"take at least {fewest_runs(len(self.measures))} seeds, better 10."
-            return f"{method}: too few runs to tell ({figures}); so many runs cannot show a difference, {advice}"
+            return f"{method}: too few runs to tell ({figures}), {advice}"
         number = f"{len(self.measures)} comparison{'s' if len(self.measures) > 1 else ''}"
         tested = f"{figures} (p = {p_value_text(p_value)}, by Holm's correction for {number})"
         if p_value >= ALPHA:
