@@ -16,6 +16,7 @@ class Task:
     :param n_actions: number of actions
     :param state_names: names of the state variables, for display; by default s0, s1, ...
     :param action_names: names of the actions, for display; by default a0, a1, ...
+    :param bounds: raw <-> the unit coordinates in which variables correspond to those of other tasks; None: ``scaling``
     :raises ValueError: if there are names, but not one for each variable or action
     """
 
@@ -23,6 +24,7 @@ class Task:
     n_actions: int
     state_names: Sequence[str] = ()
     action_names: Sequence[str] = ()
+    bounds: StateScaling | None = None
 
     def __post_init__(self) -> None:
         for argument, n, letter in (("state_names", self.n_variables, "s"), ("action_names", self.n_actions, "a")):
@@ -36,3 +38,8 @@ class Task:
     def n_variables(self) -> int:
         """Number of state variables."""
         return self.scaling.n_variables
+
+    @property
+    def shared_scaling(self) -> StateScaling:
+        """Raw <-> the unit coordinates in which variables correspond to those of other tasks."""
+        return self.scaling if self.bounds is None else self.bounds

@@ -15,6 +15,7 @@ from sb3_combrel.common.constants import LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
+from sb3_combrel.fitted_rmax.correspondence import Correspondence, Giver
 from sb3_combrel.fitted_rmax.optimism import RewardRange
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.search import worth_after_visits
@@ -86,15 +87,16 @@ class FittedRMaxAgent:
         self._build()
 
     def _bind(self) -> None:
+        self.correspondence = Correspondence(self.task.scaling, self.task.shared_scaling)
         if self.transfer is not None:
             self.target = self._target_task()
             self.transfer.bind(self.target, self.rng)
 
     def _target_task(self) -> TargetTask:
         return TargetTask(
-            scaling=self.task.scaling,
+            scaling=self.task.shared_scaling,
             n_actions=self.task.n_actions,
-            sample_states=self.grid.points(),
+            sample_states=self.correspondence.states(self.grid.points()),
             exploration_threshold=self.model_settings.exploration_threshold,
             min_weight=self.model_settings.min_weight,
             min_fraction=self.model_settings.min_fraction,
@@ -111,7 +113,10 @@ class FittedRMaxAgent:
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        self.model = self.model_class(self.mdp, self.model_settings, self._model_transfer)
+        self._giver: Transfer | Giver | None = self._model_transfer
+        if self._model_transfer is not None and not self.correspondence.same:
+            self._giver = Giver(self._model_transfer, self.correspondence)
+        self.model = self.model_class(self.mdp, self.model_settings, self._giver)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
         # Transferred instances tell what is where; a prior does so by its bound on values.
@@ -156,7 +161,7 @@ class FittedRMaxAgent:
         """The action that the transfer method decides on; None if it leaves it to the agent."""
         assert self.transfer is not None
         self.transfer.environment = environment
-        action = self.transfer.action(state)
+        action = self.transfer.action(self.correspondence.states(state))
         is_number = isinstance(action, int | np.integer) and not isinstance(action, bool)
         if action is None or (is_number and 0 <= action < self.task.n_actions):
             return None if action is None else int(action)
@@ -167,8 +172,8 @@ class FittedRMaxAgent:
 
     def _explore(self, state: np.ndarray, environment: int) -> int:
         prediction, given = self.model.predict_at(state)
-        if given is not None and self.transfer is not None:
-            self.transfer.note_use(given)
+        if given is not None and self._giver is not None:
+            self._giver.note_use(given)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values))
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())
@@ -258,10 +263,12 @@ class FittedRMaxAgent:
     def _take_in(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         """Give a transition to the model and to the transfer method."""
         if self.transfer is not None and self.transfer.use == "prior":
-            self.transfer.note_prediction(*self.model.predict_alone(state, action))
+            effect, leverage = self.model.predict_alone(state, action)
+            self.transfer.note_prediction(self.correspondence.effects(effect), leverage)
         self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
         if self.transfer is not None:
-            self.transfer.observe(state, action, reward, next_state, terminated)
+            before, after = self.correspondence.states(state), self.correspondence.states(next_state)
+            self.transfer.observe(before, action, reward, after, terminated)
 
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """Plan on while no action is due.
@@ -278,14 +285,14 @@ class FittedRMaxAgent:
             self._outdated.append(self.model.end_episode())
             self._plan(SWEEPS_AT_EPISODE_END)
 
-    def rescale(self, scaling: StateScaling) -> None:
+    def rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
         """Compute all anew in other unit coordinates.
 
-        :param scaling: raw <-> unit coordinates from now on
+        :param scaling: raw <-> unit coordinates from now on; ``bounds``: as of :class:`~sb3_combrel.common.task.Task`
         """
         with self._lock:
             before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
-            self.task = replace(self.task, scaling=scaling)
+            self.task = replace(self.task, scaling=scaling, bounds=bounds)
             self._bind()
             self._build()
             self._widen(min(0.0, lowest) / LONGEST_PLAN)
@@ -376,10 +383,12 @@ class FittedRMaxAgent:
                 "promises": self.promises.rows(),
             }
 
-    def set_state(self, state: dict[str, np.ndarray], scaling: StateScaling | None = None) -> None:
+    def set_state(
+        self, state: dict[str, np.ndarray], scaling: StateScaling | None = None, bounds: StateScaling | None = None
+    ) -> None:
         """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``, in place of what was learned."""
         with self._lock:
-            self.task = self.task if scaling is None else replace(self.task, scaling=scaling)
+            self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds)
             self.rewards.set_state(state["rewards"])
             self._bind()
             self._build()

@@ -57,9 +57,9 @@ class FittedRMaxPolicy(BasePolicy):
         given = FittedRMaxSettings(**settings)
         n_variables = len(StateScaling.limits_of(observation_space, given.bounds)[0])
         periodic = flag_array(periodic_flags(given.periodic, n_variables), n_variables)
-        self.scales = FoundScales(observation_space, given.bounds, periodic, finer=transfer is None)
-        names = (() if given_names is None else given_names for given_names in (state_names, action_names))
-        task = Task(self.scales.scaling, int(action_space.n), *names)
+        self.scales = FoundScales(observation_space, given.bounds, periodic)
+        states, actions = (() if names is None else names for names in (state_names, action_names))
+        task = Task(self.scales.scaling, int(action_space.n), states, actions, self.scales.bounds)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
         self._renew_to_unit()
         self._first_action = int(action_space.start)
@@ -95,7 +95,7 @@ class FittedRMaxPolicy(BasePolicy):
             return False
         scaling = self.scales.renewed(episode_ended)
         if scaling is not None:
-            self.agent.rescale(scaling)
+            self.agent.rescale(scaling, self.scales.bounds)
             self._renew_to_unit()
         return scaling is not None
 
@@ -163,7 +163,7 @@ class FittedRMaxPolicy(BasePolicy):
         if not problems:
             arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
             self.scales.set_state(arrays.pop("scales"))
-            self.agent.set_state(arrays, self.scales.scaling)
+            self.agent.set_state(arrays, self.scales.scaling, self.scales.bounds)
             self._renew_to_unit()
 
 

@@ -22,23 +22,26 @@ class FoundScales:
     :param space: observation space
     :param bounds: of the user; None: to be found
     :param periodic: one bool for each state variable
-    :param finer: False: a variable that has bounds keeps them, as what a transfer method has found is about those
     :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, or the bounds do not fit it
     """
 
-    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray, finer: bool = True):
+    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray):
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
         self._found = ~periodic & (bounds is None)
-        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
+        self._unbounded = unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
         #: What the space allows, raw units.
         self.low = np.where(low > -LARGEST_BOUND, low, -np.inf)
         self.high = np.where(high < LARGEST_BOUND, high, np.inf)
         #: The least and the largest observation of each variable, raw units, shape (2, n_variables).
         self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
-        if not finer:
-            self._found &= unbounded
         self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
+
+    @property
+    def bounds(self) -> StateScaling:
+        """The user's or the space's bounds, and for a variable without any those in use."""
+        in_use = self.scaling
+        return StateScaling(np.where(self._unbounded, in_use.low, self.low), np.where(self._unbounded, in_use.high, self.high))
 
     def renewed(self, episode_ended: bool) -> StateScaling | None:
         """Return other scales if the observations ask for them, and None otherwise.

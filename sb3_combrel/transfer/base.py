@@ -32,7 +32,7 @@ FOR_THE_ALGORITHM = frozenset(
 class TargetTask:
     """The target task, as a transfer method sees it."""
 
-    scaling: StateScaling  #: raw <-> unit coordinates
+    scaling: StateScaling  #: raw <-> unit coordinates, by the bounds of the variables
     n_actions: int
     sample_states: np.ndarray  #: states that are planned with, unit coordinates, shape (n_points, n_variables)
     #: Weight that own and transferred instances of a state-action pair must reach together. It stays where the model lowers
@@ -61,7 +61,7 @@ class Transfer(ABC):
 
     It is asked where the target's own instances do not suffice. A transfer object given to an algorithm is a description: the
     algorithm binds a copy of it to its task. Only :meth:`transferred` and :meth:`observe` have to be written. States and
-    effects are in unit coordinates of the target.
+    effects are in unit coordinates of the target, ``task.scaling``.
     """
 
     task: TargetTask | None = None  #: the target task and the random number generator, from :meth:`bind` on

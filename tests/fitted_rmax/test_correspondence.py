@@ -1,0 +1,107 @@
+"""A learner that scales its variables by what is observed still sees what corresponds to them by their bounds."""
+
+import numpy as np
+import pytest
+from helpers.own_method import Mine
+from helpers.walk import STRIDE, Walk, same_parameters, walk_source
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
+from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.correspondence import Correspondence, Giver
+
+numbers = st.floats(-100.0, 100.0)
+ranges = st.floats(0.1, 100.0)
+
+
+def vectors(elements):
+    return arrays(np.float64, 3, elements=elements)
+
+
+@given(vectors(numbers), vectors(ranges), vectors(numbers), vectors(ranges), vectors(numbers), vectors(numbers))
+def test_states_and_effects_are_those_of_the_bounds(low, used, bound, width, state, effect):
+    scaling, bounds = StateScaling(low, low + used), StateScaling(bound, bound + width)
+    correspondence = Correspondence(scaling, bounds)
+    close = dict(rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(correspondence.states(scaling.to_unit(state)), bounds.to_unit(state), **close)
+    seen = correspondence.effects(effect / used)
+    np.testing.assert_allclose(seen, effect / width, **close)
+    np.testing.assert_allclose(correspondence.effects_of_learner(seen), effect / used, **close)
+
+
+def test_nothing_is_computed_where_the_coordinates_are_the_same():
+    same, state = StateScaling([0.0], [3.0]), np.array([0.1])
+    correspondence = Correspondence(same, StateScaling([0.0], [3.0]))
+    assert correspondence.states(state) is state and correspondence.effects(state) is state
+
+
+class WideWalk(Walk):
+    """The walk, with bounds that are far too wide."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = type(self.observation_space)(np.float32([-20.0, 0.0]), np.float32([20.0, 2.0]))
+
+
+def wide_source():
+    """Of the walk; its bounds are those of ``WideWalk``."""
+    narrow = walk_source()
+    return type(narrow)(
+        *(narrow.states, narrow.actions, narrow.rewards, narrow.next_states, narrow.terminated),
+        *([-20.0, 0.0], [20.0, 2.0], 2),
+    )
+
+
+def learnt(transfer, **kwargs):
+    return FittedRMax(WideWalk(), transfer=transfer, seed=0, resolution=3, **kwargs).learn(150)
+
+
+SAME = InterTaskMapping([0, 1], [0, 1])
+METHODS = {
+    "prior": lambda: TIMBREL(wide_source(), SAME, use="prior"),
+    "chosen": lambda: COMBREL(wide_source()),
+    "instances": lambda: TIMBREL(wide_source(), SAME, use="instances", breadth=0.01),
+}
+
+
+@pytest.mark.parametrize("make", METHODS.values(), ids=METHODS)
+def test_a_source_fits_a_target_whose_scales_are_finer_than_its_bounds(make, tmp_path):
+    model = learnt(make())
+    scaling, seen = model.policy.scaling, model.transfer.task.scaling
+    assert scaling.high[0] - scaling.low[0] < 4.0
+    np.testing.assert_array_equal((seen.low[0], seen.high[0]), (-20.0, 20.0))
+    assert model.transfer.region_errors.task is model.transfer.task
+    assert model.transfer.statistics()["transfer/prediction_error"] < 0.05
+    model.save(tmp_path / "wide")
+    assert same_parameters(model, FittedRMax.load(tmp_path / "wide"))
+
+
+def test_what_a_source_predicts_is_the_same_in_raw_units():
+    model = learnt(METHODS["prior"]())
+    units = np.column_stack([np.linspace(0.3, 0.6, 5), np.ones(5) / 2])
+    for action, effect in enumerate((-STRIDE, STRIDE)):
+        given = model.agent.model.transfer.prior(units, np.full(5, action))
+        scaling = model.policy.scaling
+        np.testing.assert_allclose(given.effect * (scaling.high - scaling.low), [[effect, 0.0]] * 5, atol=0.02)
+
+
+def test_transferred_instances_have_effects_of_the_learner():
+    model = learnt(METHODS["instances"]())
+    assert isinstance(model.agent.model.transfer, Giver)
+    given = model.agent.model.transfer.transferred(np.array([[0.5, 0.5]] * 2), np.arange(2), np.zeros(2))
+    scaling = model.policy.scaling
+    for row, effect in enumerate((-STRIDE, STRIDE)):
+        assert given.length[row] > 0
+        found = given.effect[row, : given.length[row], 0] * (scaling.high[0] - scaling.low[0])
+        np.testing.assert_allclose(found, effect, atol=1e-6)
+
+
+def test_a_method_that_returns_nonsense_is_named():
+    class Wrong(Mine):
+        def transferred(self, states, actions, own_weight):
+            return None
+
+    with pytest.raises(ValueError, match=r"Wrong must return TransferredInstances"):
+        learnt(Wrong())
