@@ -15,7 +15,7 @@ from sb3_combrel.common.constants import LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
-from sb3_combrel.fitted_rmax.correspondence import Correspondence, Giver
+from sb3_combrel.fitted_rmax.correspondence import Correspondence
 from sb3_combrel.fitted_rmax.optimism import RewardRange
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.search import worth_after_visits
@@ -113,9 +113,7 @@ class FittedRMaxAgent:
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        self._giver: Transfer | Giver | None = self._model_transfer
-        if self._model_transfer is not None and not self.correspondence.same:
-            self._giver = Giver(self._model_transfer, self.correspondence)
+        self._giver = None if self._model_transfer is None else self.correspondence.giver(self._model_transfer)
         self.model = self.model_class(self.mdp, self.model_settings, self._giver)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)

@@ -36,6 +36,10 @@ class Correspondence:
         """The other way around."""
         return np.asarray(effects / self._factor)
 
+    def giver(self, transfer: Transfer) -> Transfer | Giver:
+        """What the learner's model asks in place of a transfer method."""
+        return transfer if self.same else Giver(transfer, self)
+
 
 class Giver:
     """What a model asks of a transfer method, in the unit coordinates of the learner; see ``models.base.InstanceTransfer``."""
