@@ -113,8 +113,8 @@ class FittedRMaxAgent:
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        self._giver = None if self._model_transfer is None else self.correspondence.giver(self._model_transfer)
-        self.model = self.model_class(self.mdp, self.model_settings, self._giver)
+        asked = None if self._model_transfer is None else self.correspondence.of_learner(self._model_transfer)
+        self.model = self.model_class(self.mdp, self.model_settings, asked)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
         # Transferred instances tell what is where; a prior does so by its bound on values.
@@ -170,8 +170,8 @@ class FittedRMaxAgent:
 
     def _explore(self, state: np.ndarray, environment: int) -> int:
         prediction, given = self.model.predict_at(state)
-        if given is not None and self._giver is not None:
-            self._giver.note_use(given)
+        if given is not None and self.transfer is not None:
+            self.transfer.note_use(given)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values))
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())

@@ -36,37 +36,30 @@ class Correspondence:
         """The other way around."""
         return np.asarray(effects / self._factor)
 
-    def giver(self, transfer: Transfer) -> Transfer | Giver:
+    def of_learner(self, transfer: Transfer) -> Transfer | PriorOfLearner:
         """What the learner's model asks in place of a transfer method."""
-        return transfer if self.same else Giver(transfer, self)
+        return transfer if self.same else PriorOfLearner(transfer, self)
 
 
-class Giver:
-    """What a model asks of a transfer method, in the unit coordinates of the learner; see ``models.base.InstanceTransfer``."""
+class PriorOfLearner:
+    """A prior in the unit coordinates of the learner; see ``models.base.InstanceTransfer``.
+
+    Methods that transfer instances see no others: variables with bounds keep them then.
+    """
+
+    use = "prior"
 
     def __init__(self, transfer: Transfer, correspondence: Correspondence):
-        #: The method itself.
-        self.method = transfer
-        self.use = transfer.use
-        self._correspondence = correspondence
-
-    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return self._in_learner(self.method.transferred(self._correspondence.states(states), actions, own_weight))
-
-    def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return self._in_learner(self.method.transferred_to_sample(points, actions, own_weight))
-
-    def _in_learner(self, given: TransferredInstances) -> TransferredInstances:
-        if not isinstance(given, TransferredInstances):  # which the model refuses
-            return given
-        return given._replace(effect=self._correspondence.effects_of_learner(given.effect))
-
-    def note_use(self, given: TransferredInstances) -> None:
-        self.method.note_use(given._replace(effect=self._correspondence.effects(given.effect)))
+        self._transfer, self._correspondence = transfer, correspondence
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        given = self.method.prior(self._correspondence.states(states), actions)
+        given = self._transfer.prior(self._correspondence.states(states), actions)
         return given._replace(effect=self._correspondence.effects_of_learner(given.effect))
 
     def prior_version(self) -> int:
-        return self.method.prior_version()
+        return self._transfer.prior_version()
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        raise NotImplementedError("a prior transfers no instances")
+
+    transferred_to_sample = transferred

@@ -37,6 +37,10 @@ class FoundScales:
         self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
         self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
 
+    def keep_bounds(self) -> None:
+        """From now on a variable that has bounds keeps them."""
+        self._found &= self._unbounded
+
     @property
     def bounds(self) -> StateScaling:
         """The user's or the space's bounds, and for a variable without any those in use."""

@@ -201,7 +201,7 @@ class Model(ABC):
 
     def _check(self, given: TransferredInstances, own_weight: np.ndarray) -> None:
         threshold = self.settings.exploration_threshold
-        check_transferred(given, getattr(self.transfer, "method", self.transfer), own_weight, self.grid.n_variables, threshold)
+        check_transferred(given, self.transfer, own_weight, self.grid.n_variables, threshold)
 
 
 def join(own: Predictions, given: TransferredInstances, known: np.ndarray) -> tuple[Predictions, np.ndarray]:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from helpers.own_method import Mine
 from helpers.walk import STRIDE, Walk, same_parameters, walk_source
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.fitted_rmax.correspondence import Correspondence, Giver
+from sb3_combrel.fitted_rmax.correspondence import Correspondence
 
 numbers = st.floats(-100.0, 100.0)
 ranges = st.floats(0.1, 100.0)
@@ -62,7 +61,6 @@ SAME = InterTaskMapping([0, 1], [0, 1])
 METHODS = {
     "prior": lambda: TIMBREL(wide_source(), SAME, use="prior"),
     "chosen": lambda: COMBREL(wide_source()),
-    "instances": lambda: TIMBREL(wide_source(), SAME, use="instances", breadth=0.01),
 }
 
 
@@ -87,21 +85,7 @@ def test_what_a_source_predicts_is_the_same_in_raw_units():
         np.testing.assert_allclose(given.effect * (scaling.high - scaling.low), [[effect, 0.0]] * 5, atol=0.02)
 
 
-def test_transferred_instances_have_effects_of_the_learner():
-    model = learnt(METHODS["instances"]())
-    assert isinstance(model.agent.model.transfer, Giver)
-    given = model.agent.model.transfer.transferred(np.array([[0.5, 0.5]] * 2), np.arange(2), np.zeros(2))
-    scaling = model.policy.scaling
-    for row, effect in enumerate((-STRIDE, STRIDE)):
-        assert given.length[row] > 0
-        found = given.effect[row, : given.length[row], 0] * (scaling.high[0] - scaling.low[0])
-        np.testing.assert_allclose(found, effect, atol=1e-6)
-
-
-def test_a_method_that_returns_nonsense_is_named():
-    class Wrong(Mine):
-        def transferred(self, states, actions, own_weight):
-            return None
-
-    with pytest.raises(ValueError, match=r"Wrong must return TransferredInstances"):
-        learnt(Wrong())
+def test_with_transferred_instances_variables_keep_their_bounds():
+    model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
+    assert model.agent.correspondence.same
+    np.testing.assert_array_equal((model.policy.scaling.low[0], model.policy.scaling.high[0]), (-20.0, 20.0))
