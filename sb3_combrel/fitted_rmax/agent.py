@@ -250,9 +250,15 @@ class FittedRMaxAgent:
             self._take_in_all(transitions)
             self._plan(SWEEPS_AT_EPISODE_END)
 
-    def _take_in_all(self, transitions: Sequence[Transition]) -> None:
-        """Give transitions that came before to model and transfer method; all pairs that they change are outdated."""
+    def _take_in_all(self, transitions: Sequence[Transition], observed: bool = False) -> None:
+        """Give past transitions to model and transfer method; all pairs that they change are outdated.
+
+        :param observed: whether the transfer method knows them
+        """
         for state, action, reward, next_state, terminated in transitions:
+            if observed:
+                self.model.add(state, action, reward, next_state, terminated)
+                continue
             self._take_in(state, action, reward, next_state, terminated)
             if terminated and self.transfer is not None:
                 self.transfer.end_episode(truncated=False)
@@ -290,9 +296,14 @@ class FittedRMaxAgent:
         """
         with self._lock:
             before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
+            # What a transfer method has learned is about the bounds.
+            same = self.transfer is not None and bounds == self.task.shared_scaling
+            learned = self.transfer.get_state() if self.transfer is not None and same else {}
             self.task = replace(self.task, scaling=scaling, bounds=bounds)
             self._bind()
             self._build()
+            if self.transfer is not None and learned:
+                self.transfer.set_state(learned)
             self._widen(min(0.0, lowest) / LONGEST_PLAN)
             self._take_in_all(
                 [
@@ -304,7 +315,8 @@ class FittedRMaxAgent:
                         terminated,
                     )
                     for state, action, reward, next_state, terminated in transitions
-                ]
+                ],
+                observed=bool(learned),
             )
             self._plan(SWEEPS_AT_EPISODE_END)
 

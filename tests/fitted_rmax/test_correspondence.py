@@ -89,3 +89,16 @@ def test_with_transferred_instances_variables_keep_their_bounds():
     model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
     assert model.agent.correspondence.same
     np.testing.assert_array_equal((model.policy.scaling.low[0], model.policy.scaling.high[0]), (-20.0, 20.0))
+
+
+def test_what_was_learned_of_a_source_stays_when_the_learner_is_scaled_anew():
+    model = learnt(METHODS["chosen"]())
+    agent, transfer, bounds = model.agent, model.transfer, model.agent.task.shared_scaling
+    before, n_instances = transfer.get_state(), agent.model.n_instances
+    agent.rescale(StateScaling([-2.0, 0.0], [2.0, 2.0]), bounds)
+    assert agent.model.n_instances == n_instances
+    for name, array in transfer.get_state().items():
+        np.testing.assert_array_equal(array, before[name], err_msg=name)
+    states, actions = np.array([[0.5, 0.5]] * 2), np.arange(2)
+    given = agent.model.transfer.prior(states, actions)
+    np.testing.assert_allclose(given.effect[:, 0] * 4.0, [-STRIDE, STRIDE], atol=0.02)
