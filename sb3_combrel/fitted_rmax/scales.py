@@ -29,23 +29,26 @@ class FoundScales:
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
         self._found = ~periodic & (bounds is None)
-        self._unbounded = unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
+        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
         #: What the space allows, raw units.
         self.low = np.where(low > -LARGEST_BOUND, low, -np.inf)
         self.high = np.where(high < LARGEST_BOUND, high, np.inf)
         #: The least and the largest observation of each variable, raw units, shape (2, n_variables).
         self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
+        # Variables that correspond to others by the bounds in use, as they have none of their own.
+        self._by_use = unbounded.copy()
         self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
 
     def keep_bounds(self) -> None:
-        """From now on a variable that has bounds keeps them."""
-        self._found &= self._unbounded
+        """From now on a variable that has bounds keeps them, and all correspond to others by the bounds in use."""
+        self._found &= self._by_use
+        self._by_use[:] = True
 
     @property
     def bounds(self) -> StateScaling:
         """The user's or the space's bounds, and for a variable without any those in use."""
         in_use = self.scaling
-        return StateScaling(np.where(self._unbounded, in_use.low, self.low), np.where(self._unbounded, in_use.high, self.high))
+        return StateScaling(np.where(self._by_use, in_use.low, self.low), np.where(self._by_use, in_use.high, self.high))
 
     def renewed(self, episode_ended: bool) -> StateScaling | None:
         """Return other scales if the observations ask for them, and None otherwise.
