@@ -60,7 +60,7 @@ def measure_gaps_around(at, low, high, n_blocks, gap):
         gap[block] += outside * outside
 
 
-@inlined
+@inner
 def measure_blocks(instances, action, at):
     """Measure how far the blocks of an action's instances are; how many blocks there are."""
     n_blocks = (instances.size[action] + BLOCK - 1) // BLOCK

@@ -100,7 +100,7 @@ def reach_of(nearest, outcome_breadth):
     return nearest + NEGLIGIBLE * min(outcome_breadth, nearest + ROUNDING)
 
 
-@inlined
+@inner
 def distance_of_nearest(state, nearest, of_end, outcome_breadth, arrivals, hint):
     """The squared distance of the nearest arrival, or of one that is so near that no end decides.
 
