@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from sb3_combrel.common.files import write_whole
+from sb3_combrel.experiments.numbers import fill_numbers
 from sb3_combrel.experiments.paper.domains import SETTINGS
 
 #: What is copied of the folders that ``reproduce``, ``benchmark`` and ``make learner`` write. Single runs, sources and SVG
@@ -19,8 +20,8 @@ COPIED[Path("learner")] = ("*.md", "tables_*.csv", "runs.csv")
 #: The folders below it are those of ``make transfer``, whose runs are one file.
 JOINED = Path("transfer")
 DOCS = Path("docs/results")
-#: Pages with marks.
-PAGES = (Path("docs/results.md"), Path("docs/benchmark.md"), Path("docs/results/learner.md"))
+#: Pages that may have marks.
+PAGES = ("README.md", "docs/*.md", "docs/results/*.md", "tutorials/*.md")
 
 # <!-- table: path, number --> ... <!-- end of table -->; the number is that of the table in the file, from 1 on.
 _MARKED = re.compile(r"(<!-- table: (?P<path>[^,>]+), (?P<number>\d+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -35,8 +36,11 @@ def main(folder: Path = Path()) -> None:
         made = copy(folder / output, folder / DOCS / output.name, patterns)
         print(f"{output}: {len(made)} files copied to {DOCS / output.name}")
     print(f"{JOINED}: runs of {join(folder / JOINED, folder / DOCS / 'transfer.csv')} folders joined")
-    for page in PAGES:
-        print(f"{page}: {fill_in(folder / page)} filled in")
+    for page in sorted(page for pattern in PAGES for page in folder.glob(pattern)):
+        n, missing = fill_in(page), fill_numbers(page)
+        if n or missing:
+            to_write = f"; to be written by hand: {', '.join(missing)}" if missing else ""
+            print(f"{page.relative_to(folder)}: {n} tables of files filled in{to_write}")
 
 
 def copy(output: Path, docs: Path, patterns: tuple[str, ...]) -> list[Path]:
