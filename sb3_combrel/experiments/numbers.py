@@ -106,7 +106,7 @@ def figure_of(file: Path, base: str, query: str, figure: str) -> str | float:
     if name in ("error", "interval"):
         half = stats.sem(values) * (1 if name == "error" else stats.t.ppf(0.975, len(values) - 1))
         return f"{values.mean():{form}} ± {half:{form}}"
-    return f"{getattr(np, name)(values):{form}}"
+    return _signed(getattr(np, name)(values), form)
 
 
 def _part_of(values: np.ndarray, others: np.ndarray, sign: float, form: str) -> str:
@@ -118,9 +118,9 @@ def _part_of(values: np.ndarray, others: np.ndarray, sign: float, form: str) -> 
     return f"{_signed(sign * more.value)} ({_signed(low)} to {_signed(high)})"
 
 
-def _signed(part: float, form: str = ".0%") -> str:
+def _signed(number: float, form: str = ".0%") -> str:
     """A number without the sign of a negative zero."""
-    return re.sub(r"^-(?=[0.]*%?$)", "", f"{part:{form}}")
+    return re.sub(r"^-(?=[0.]*%?$)", "", f"{number:{form}}")
 
 
 def _written_p(p: float) -> str:
