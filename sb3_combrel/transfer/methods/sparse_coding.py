@@ -7,7 +7,6 @@ from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
@@ -103,6 +102,8 @@ class SparseCodingMapping(LearnedTranslation):
         check_positive("sparsity", self.sparsity)
 
     def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
+        from scipy.spatial import cKDTree
+
         n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         seed = int(self.rng.integers(2**31))
         source_columns, target_columns = source.columns(n_source), target.columns(n_target)
