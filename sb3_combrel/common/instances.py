@@ -26,6 +26,7 @@ class Instances(NamedTuple):
     block_low: np.ndarray  # float64, (n_actions, n_variables, capacity / BLOCK): lower corners of the blocks' boxes
     block_high: np.ndarray  # the same: upper corners
     gap: np.ndarray  # float64 scratch, (capacity / BLOCK,): how far a state is from the boxes
+    apart: np.ndarray  # float64 scratch, (BLOCK,): squared distances of the instances of a block
     periodic: np.ndarray  # bool, (n_variables,): coordinates of periodic variables are stored wrapped to [0, 1]
 
     @classmethod
@@ -45,6 +46,7 @@ class Instances(NamedTuple):
             block_low=np.full((n_actions, n_variables, n_blocks), np.inf),
             block_high=np.full((n_actions, n_variables, n_blocks), -np.inf),
             gap=np.empty(n_blocks),
+            apart=np.empty(BLOCK),
             periodic=flag_array(periodic, n_variables),
         )
 

@@ -92,15 +92,32 @@ def insert_by_distance(items, distances, length, item, distance):
     return length + 1
 
 
+@inner
+def measure_block(instances, action, block, state):
+    """Measure the squared distances of the instances of a block, all at once: :attr:`Instances.apart`."""
+    apart, first = instances.apart, block * BLOCK
+    for j in range(BLOCK):
+        apart[j] = 0.0
+    for k in range(len(state)):
+        at = state[k]
+        if instances.periodic[k]:
+            for j in range(BLOCK):
+                along = difference(at, instances.state[action, first + j, k], True)
+                apart[j] += along * along
+        else:
+            for j in range(BLOCK):
+                along = at - instances.state[action, first + j, k]
+                apart[j] += along * along
+
+
 @inlined
 def scan_block(instances, action, block, state, farthest, length, items, distances):
     """Put the instances of a block that are no farther than squared ``farthest`` into the list: its length, and farthest."""
-    wraps = any_periodic(instances.periodic)
-    for i in range(block * BLOCK, min(instances.size[action], (block + 1) * BLOCK)):
-        distance = squared_distance(state, instances.state[action, i], instances.periodic, wraps)
-        if distance > farthest:
+    measure_block(instances, action, block, state)
+    for j in range(min(instances.size[action] - block * BLOCK, BLOCK)):
+        if instances.apart[j] > farthest:
             continue
-        length = insert_by_distance(items, distances, length, i, distance)
+        length = insert_by_distance(items, distances, length, block * BLOCK + j, instances.apart[j])
         if length == len(items):
             farthest = distances[length - 1]
     return length, farthest

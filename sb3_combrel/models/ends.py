@@ -11,7 +11,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.instances import BLOCK, Instances, put_instance
-from sb3_combrel.common.kernels import any_periodic, measure_blocks, squared_distance
+from sb3_combrel.common.kernels import any_periodic, measure_block, measure_blocks, squared_distance
 
 # Arrivals beyond this many squared breadths weigh less than 0.0002 of the nearest.
 NEGLIGIBLE = 9.0
@@ -114,10 +114,10 @@ def distance_of_nearest(state, nearest, of_end, outcome_breadth, arrivals, hint)
             break
         for block in range(measure_blocks(arrivals, action, state)):
             if arrivals.gap[block] < nearest:
-                for i in range(block * BLOCK, min(arrivals.size[action], (block + 1) * BLOCK)):
-                    distance = squared_distance(state, arrivals.state[action, i], arrivals.periodic, wraps)
-                    if distance < nearest:
-                        nearest, hint[0], hint[1] = distance, action, i
+                measure_block(arrivals, action, block, state)
+                for j in range(min(arrivals.size[action] - block * BLOCK, BLOCK)):
+                    if arrivals.apart[j] < nearest:
+                        nearest, hint[0], hint[1] = arrivals.apart[j], action, block * BLOCK + j
     return nearest
 
 
@@ -138,14 +138,14 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
     reach = reach_of(nearest, outcome_breadth)
     if of_end > reach:
         return
-    wraps = any_periodic(arrivals.periodic)
     breadth = min(outcome_breadth, nearest + ROUNDING)
     total, ended, reward = 0.0, 0.0, 0.0
     for action in range(len(arrivals.size)):
         for block in range(measure_blocks(arrivals, action, state)):
             if arrivals.gap[block] <= reach:
-                for i in range(block * BLOCK, min(arrivals.size[action], (block + 1) * BLOCK)):
-                    distance = squared_distance(state, arrivals.state[action, i], arrivals.periodic, wraps)
+                measure_block(arrivals, action, block, state)
+                for j in range(min(arrivals.size[action] - block * BLOCK, BLOCK)):
+                    i, distance = block * BLOCK + j, arrivals.apart[j]
                     if distance <= reach:
                         weight = np.exp((nearest - distance) / breadth)
                         total += weight
