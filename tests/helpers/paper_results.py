@@ -22,7 +22,7 @@ def made_up(domain, method, seed, steps, returns=None, seconds=1.0, **more):
     returns = [-float(n) for n in steps] if returns is None else returns
     terminated = [n < max(steps) for n in steps]
     name = file_name(domain, method, seed)
-    more = {"uses": [], "first_episode_seconds": 1.0, **more}
+    more = {"uses": [], "mappings_of_episodes": [0] * len(steps), "first_episode_seconds": 1.0, **more}
     return Result(name, domain, method, seed, steps, returns, terminated, sum(steps), more, seconds)
 
 

@@ -112,16 +112,17 @@ class BaselineJob(Job):
         return self.result(*episodes, self.n_steps, {"evaluations": evaluator.evaluations}, time.process_time() - start)
 
 
-def baseline_jobs(
-    domain: Domain, setting: str, source: SourceInstances, n_runs: int | None, n_episodes: int
-) -> list[BaselineJob]:
-    """Make the jobs of all baselines; with fewer episodes than by default they have fewer steps too."""
+def baseline_jobs(domain: Domain, setting: str, sources: Mapping[int, SourceInstances], n_episodes: int) -> list[BaselineJob]:
+    """Make the jobs of all baselines; with fewer episodes than by default they have fewer steps too.
+
+    :param sources: by seed; the first :data:`MAX_RUNS` count
+    """
     total = round(TOTAL_TIMESTEPS[domain.name] * min(1.0, n_episodes / domain.n_episodes))
     task: dict[str, Any] = {"group": domain.name, "env": domain.target_id, "n_steps": max(total, FEWEST_TIMESTEPS)}
     task["max_episode_steps"] = domain.settings[setting].max_episode_steps
     return [
         BaselineJob(method=algorithm, seed=seed, source=source if algorithm in OF_SOURCE else None, **task)
-        for seed in range(domain.first_seed, domain.first_seed + min(n_runs or MAX_RUNS, MAX_RUNS))
+        for seed, source in itertools.islice(sources.items(), MAX_RUNS)
         for algorithm in ALGORITHMS
     ]
 

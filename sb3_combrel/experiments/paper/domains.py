@@ -89,9 +89,7 @@ _ICUB_EXPLORE = Setting(
     combrel={"choice": "drawn", "neighbor_radius": 0.7, "breadth": 0.5, "breadth_decay": 1.0, "max_transitions": 20_000},
     timbrel={"breadth": 0.5, "breadth_decay": 1.0},
 )
-_ICUB_BEST = Setting(
-    learner=icub_arm.LEARNER, max_episode_steps=icub_arm.MAX_EPISODE_STEPS, mappings="factored", timbrel={"use": "prior"}
-)
+_ICUB_BEST = Setting(learner={}, max_episode_steps=icub_arm.MAX_EPISODE_STEPS, mappings="factored", timbrel={"use": "prior"})
 
 MOUNTAIN_CAR = Domain(
     name="mountain_car",
@@ -100,7 +98,7 @@ MOUNTAIN_CAR = Domain(
     learn_source=mountain_car.learn_source,
     n_runs=15,
     n_episodes=200,
-    first_seed=5000,
+    first_seed=26000,
     thresholds=(400, 300, 250),
     goal_reward=0.0,
     unit="steps",
@@ -113,7 +111,7 @@ ICUB = Domain(
     learn_source=icub_arm.learn_source,
     n_runs=10,
     n_episodes=300,
-    first_seed=5000,
+    first_seed=26000,
     thresholds=(200, 150, 100, 75, 50, 40),
     goal_reward=100.0,
     unit="commands",

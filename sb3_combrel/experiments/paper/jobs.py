@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -30,6 +30,7 @@ class PaperJob(Job):
       mapping, action mapping or "", times]
     - ``selections``, if they are recorded: each such use with the state, raw units: [number in ``uses``, *state]
     - ``at_sample``, likewise: source action selected in the end for each state of the finite sample, by target action
+    - ``mappings_of_episodes``: how many different mappings (source action, state mapping, action mapping) were used in each
     - ``first_episode_seconds``: processor time of the first episode
     """
 
@@ -37,13 +38,13 @@ class PaperJob(Job):
     records_selections: bool = False
 
     def callbacks(self) -> list[BaseCallback]:
-        return [FirstEpisodeTimer(), *([SelectionRecorder()] if self.records_selections else [])]
+        return [FirstEpisodeTimer(), MappingCounter(), *([SelectionRecorder()] if self.records_selections else [])]
 
     def measure(self, model: FittedRMax, result: Result, callbacks: list[BaseCallback]) -> dict[str, Any]:
-        timer, *recorders = cast(list[Any], callbacks)
+        timer, counter, *recorders = cast(list[Any], callbacks)
         transfer: Any = model.agent.transfer
         uses = uses_of(transfer)
-        more = {"uses": list(uses.values()), "first_episode_seconds": timer.seconds}
+        more = {"uses": list(uses.values()), "mappings_of_episodes": counter.counts, "first_episode_seconds": timer.seconds}
         if self.records_selections:
             (recorder,) = recorders
             more |= {"selections": recorder.rows(list(uses)), "at_sample": selections_at_sample(transfer)}
@@ -61,6 +62,24 @@ class FirstEpisodeTimer(BaseCallback):
     def _on_step(self) -> bool:
         if not self.seconds and self.locals["dones"][0]:
             self.seconds = time.process_time() - self._start
+        return True
+
+
+class MappingCounter(BaseCallback):
+    """Counts the different mappings whose instances were used in each episode: ``counts``; of one environment."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: list[int] = []
+        self._before: dict[int, int] = {}
+
+    def _on_step(self) -> bool:
+        if self.locals["dones"][0]:
+            transfer = self.model.agent.transfer  # type: ignore[attr-defined]
+            uses = {} if transfer is None else transfer.uses()
+            used = (transfer.candidate(number) for number, n in uses.items() if n != self._before.get(number, 0))
+            self.counts.append(len({(each.source_action, each.state_mapping, each.action_mapping) for each in used}))
+            self._before = uses
         return True
 
 
@@ -116,25 +135,28 @@ def selections_at_sample(transfer: Any) -> dict[str, list[str]]:
 
 
 def jobs_of(
-    domain: Domain, setting: str, methods: Sequence[str], sources: m.Sources, n_runs: int, n_episodes: int
+    domain: Domain, setting: str, methods: Sequence[str], sources: Mapping[int, m.Sources], n_episodes: int
 ) -> list[PaperJob]:
-    """Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete."""
+    """Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete.
+
+    :param sources: by seed, of all seeds that the methods are run with
+    """
     chosen = domain.settings[setting]
     task: dict[str, Any] = {"group": domain.name, "env": domain.target_id, "n_episodes": n_episodes, "setting": setting}
     task["max_episode_steps"] = chosen.max_episode_steps
 
     def job_of(name: str, seed: int) -> PaperJob:
         records = name in (m.COMBREL_PLAIN, m.COMBREL_WHOLE) and chosen.use == "instances"
-        learner, transfer = m.learner_of(name, domain, chosen), m.transfer_of(name, domain, chosen, sources, seed)
+        learner, transfer = m.learner_of(name, domain, chosen), m.transfer_of(name, domain, chosen, sources[seed], seed)
         own: dict[str, Any] = {"method": name, "seed": seed, "learner": learner, "transfer": transfer}
         return PaperJob(**task, **own, records_selections=records)
 
-    return [job_of(name, seed) for seed in range(domain.first_seed, domain.first_seed + n_runs) for name in methods]
+    return [job_of(name, seed) for seed in sources for name in methods]
 
 
-def diagnosis_jobs(domain: Domain, setting: str, sources: m.Sources, n_runs: int, n_episodes: int) -> list[PaperJob]:
+def diagnosis_jobs(domain: Domain, setting: str, sources: Mapping[int, m.Sources], n_episodes: int) -> list[PaperJob]:
     """Make the jobs of the diagnosis, see :func:`jobs_of`: of the episodes at most :data:`DIAGNOSED_EPISODES`."""
-    jobs = jobs_of(domain, setting, DIAGNOSED, sources, n_runs, min(n_episodes, DIAGNOSED_EPISODES))
+    jobs = jobs_of(domain, setting, DIAGNOSED, sources, min(n_episodes, DIAGNOSED_EPISODES))
 
     def at(breadth: float, job: PaperJob) -> PaperJob:
         learner = {**job.learner, "model_breadth": breadth}

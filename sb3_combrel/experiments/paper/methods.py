@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -48,7 +48,6 @@ _WITH_PRIOR = (NO_TRANSFER, TIMBREL_INTUITIVE, COMBREL_PLAIN, ONE_RANDOM, UNRELA
 _ONLY_IN = dict.fromkeys((TIMBREL_INTUITIVE, COMBREL_RELEVANCE, TIMBREL_RELEVANCE, COMBREL_WHOLE), MOUNTAIN_CAR.name)
 _ONLY_IN |= dict.fromkeys((TIMBREL_FREQUENT, ORACLE), ICUB.name)
 
-SOURCE_SEED = 0
 #: Seed of the learner whose transitions of the arm's task the oracle has; no run has it.
 TARGET_SEED = 1
 N_TARGET_TRANSITIONS = 4000
@@ -56,7 +55,7 @@ N_TARGET_TRANSITIONS = 4000
 
 @dataclass(frozen=True)
 class Sources:
-    """What is needed to make the transfer methods of a domain."""
+    """What is needed to make the transfer methods of a domain with one seed."""
 
     own: SourceInstances  # instances of the domain's source task
     unrelated: SourceInstances  # instances of the other domain's
@@ -64,11 +63,11 @@ class Sources:
     frequent: InterTaskMapping | None = None  # COMBREL's most frequent mapping, once its runs are complete
 
 
-def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
-    """Learn the source tasks of a domain, or load what was learned before from the output folder."""
+def prepare_sources(domain: Domain, seeds: Iterable[int], output: Path, console: Console) -> dict[int, Sources]:
+    """Learn the source tasks of a domain with each seed, or load what was learned before from the output folder."""
 
-    def instances_of(each: Domain) -> SourceInstances:
-        return load_or_learn(output / FOLDER / f"{each.name}.npz", each.learn_source, SOURCE_SEED, console)
+    def instances_of(each: Domain, seed: int) -> SourceInstances:
+        return load_or_learn(output / FOLDER / f"{each.name}_seed{seed}.npz", each.learn_source, seed, console)
 
     def record_target(seed: int) -> SourceInstances:
         max_value = domain.settings[PAPER].learner["max_value"]
@@ -78,7 +77,7 @@ def prepare_sources(domain: Domain, output: Path, console: Console) -> Sources:
     target = None
     if domain.name == ICUB.name:
         target = load_or_learn(output / FOLDER / f"{domain.name}_target.npz", record_target, TARGET_SEED, console)
-    return Sources(instances_of(domain), instances_of(other), target)
+    return {seed: Sources(instances_of(domain, seed), instances_of(other, seed), target) for seed in seeds}
 
 
 def methods_in(domain: Domain, setting: Setting) -> list[str]:

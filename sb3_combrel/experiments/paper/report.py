@@ -16,7 +16,7 @@ from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, Domain
 from sb3_combrel.experiments.paper.figures import draw_baselines, draw_curves, draw_diagnosis, draw_selection, draw_times
 from sb3_combrel.experiments.paper.jobs import steps_by_method
 from sb3_combrel.experiments.paper.targets import BASELINES, CONTROLS, DIAGNOSIS, Target
-from sb3_combrel.experiments.paper.verdicts import CONTROL, PAPERS, judge, verdict_table
+from sb3_combrel.experiments.paper.verdicts import CONTROL, PAPERS, WINDOWS, judge, verdict_table
 from sb3_combrel.runs.job import Result, chosen_on_purpose, make_env
 from sb3_combrel.runs.runner import read_results
 
@@ -100,7 +100,11 @@ def _tables(target: Target, setting: str, results: Mapping[str, Sequence[Result]
             steps = {name: steps_by_method(of_domain) for name, of_domain in results.items()}
             papers = verdict_table(judge(steps, PAPERS), f"Table 6: what the paper claims, in setting {setting!r}")
             controls = verdict_table(judge(steps, CONTROL), f"Controls, in setting {setting!r}")
-            return [papers, controls, tables.summary_table(results), tables.uses_table(results)]
+            found = [papers, controls, tables.summary_table(results), tables.uses_table(results)]
+            windows = judge(steps, WINDOWS)
+            return [*found, verdict_table(windows, "Table 6 by the paper's own windows")] if windows else found
+        case "fig6":
+            return [tables.thresholds_table(DOMAINS[name], of_domain)]
         case "table2":
             dependence = selections.dependence_table(selections.selections_of(of_domain, variables))
             mappings = selections.action_mapping_table(of_domain, actions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,25 +68,27 @@ def reproduce(
     domains = [domain for domain in DOMAINS.values() if any(domain.name in each.methods for each in targets)]
     prepare_folder(output)
     jobs: list[Job] = []
-    sources, counts = {}, {}
+    sources = {}
     for domain in domains:
-        counts[domain.name] = n_runs, n_episodes = runs or domain.n_runs, episodes or domain.n_episodes
+        n_episodes = episodes or domain.n_episodes
         _check_folder(output, domain.name, setting, n_episodes)
-        sources[domain.name] = own = m.prepare_sources(domain, output, console)
+        seeds = range(domain.first_seed, domain.first_seed + (runs or domain.n_runs))
+        sources[domain.name] = own = m.prepare_sources(domain, seeds, output, console)
         methods = [name for name in methods_of(targets, domain, setting) if name != m.TIMBREL_FREQUENT]
         wanted = {each.name for each in targets if domain.name in each.methods}
-        jobs += jobs_of(domain, setting, methods, own, n_runs, n_episodes)
+        jobs += jobs_of(domain, setting, methods, own, n_episodes)
         if DIAGNOSIS in wanted:
-            jobs += diagnosis_jobs(domain, setting, own, n_runs, n_episodes)
+            jobs += diagnosis_jobs(domain, setting, own, n_episodes)
         if BASELINES in wanted:
-            jobs += baseline_jobs(domain, setting, own.own, runs, n_episodes)
+            jobs += baseline_jobs(domain, setting, {seed: each.own for seed, each in own.items()}, n_episodes)
     results = run_missing(jobs, output, backend, console)
     check_all_succeeded(results)
     for domain in domains:
         if m.TIMBREL_FREQUENT in methods_of(targets, domain, setting):
-            with_frequent = replace(sources[domain.name], frequent=frequent_mapping(results, domain, sources[domain.name]))
-            console.print(f"{m.TIMBREL_FREQUENT}: {with_frequent.frequent!r}", markup=False)
-            of_frequent = jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, *counts[domain.name])
+            frequent = frequent_mapping(results, domain, sources[domain.name])
+            console.print(f"{m.TIMBREL_FREQUENT}: {frequent!r}", markup=False)
+            with_frequent = {seed: replace(own, frequent=frequent) for seed, own in sources[domain.name].items()}
+            of_frequent = jobs_of(domain, setting, [m.TIMBREL_FREQUENT], with_frequent, episodes or domain.n_episodes)
             forget_other_mappings(of_frequent, output)
             results += run_missing(of_frequent, output, backend, console)
             check_all_succeeded(results)
@@ -111,11 +113,12 @@ def forget_other_mappings(jobs: Sequence[Job], output: Path) -> None:
             result_file(output, job.name).unlink()
 
 
-def frequent_mapping(results: Iterable[Result], domain: Domain, sources: m.Sources) -> InterTaskMapping:
+def frequent_mapping(results: Iterable[Result], domain: Domain, sources: Mapping[int, m.Sources]) -> InterTaskMapping:
     """The mapping that COMBREL used most, over all its runs (Section 5.2)."""
     of_combrel = [each for each in results if (each.group, each.method) == (domain.name, m.COMBREL_PLAIN)]
     uses = [use for result in of_combrel for use in result.more["uses"]]
     if not uses:
         none = f"{m.COMBREL_PLAIN} has used no mapping within episodes={len(of_combrel[0].steps)}"
         raise ValueError(f"{none}, so {m.TIMBREL_FREQUENT} has no mapping; use more --episodes")
-    return most_frequent_mapping(uses, (sources.own.state_names, sources.own.action_names), domain.target_names())
+    own = next(iter(sources.values())).own
+    return most_frequent_mapping(uses, (own.state_names, own.action_names), domain.target_names())

@@ -55,6 +55,24 @@ def _median_text(needed: np.ndarray) -> str:
     return f"{np.median(needed):,.0f}" if np.isfinite(np.median(needed)) else "never"
 
 
+def thresholds_table(domain: Domain, results: Sequence[Result]) -> Table:
+    """Make a table of the environment steps until each threshold (the paper's Figure 6): median of the runs, Holm's p-value.
+
+    The p-value is of Mann and Whitney's test against COMBREL, over the rows of a column.
+    """
+    steps = {method: np.array([run.steps for run in runs]) for method, runs in by_method(results).items()}
+    columns = []
+    for threshold in domain.thresholds:
+        needed = {method: steps_to_reach(each, threshold, WINDOW) for method, each in steps.items()}
+        of_combrel = needed[m.COMBREL_PLAIN]
+        others = {name: p_value_of_difference(each, of_combrel, "mann-whitney") for name, each in needed.items()}
+        corrected = holm({name: p for name, p in others.items() if name != m.COMBREL_PLAIN})
+        p_values = {name: f" ({p_text(p)})" for name, p in corrected.items()}
+        columns.append([_median_text(each) + p_values.get(name, "") for name, each in needed.items()])
+    title = f"Environment steps until the median of {WINDOW} episodes is at most so many {domain.unit}; p against COMBREL"
+    return Table(title, ("method", *map(str, domain.thresholds)), list(zip(steps, *columns, strict=True)))
+
+
 def measures_table(domain: Domain, results: Sequence[Result]) -> Table:
     """Make a table of Taylor & Stone's measures: effect against no transfer and Holm's p-value over the column."""
     curves = {method: curves_of(runs) for method, runs in by_method(results).items()}
@@ -93,9 +111,10 @@ def uses_table(results: Mapping[str, Sequence[Result]]) -> Table:
             n_uses = np.array([sum(row[-1] for row in each) for each in uses])
             n_mappings = np.array([len({tuple(row[1:4]) for row in each}) for each in uses])
             per_step = np.mean(n_uses / [sum(result.steps) for result in runs])
-            cells = f"{n_uses.mean():,.0f}", f"{per_step:.3f}", f"{n_mappings.mean():,.0f}"
+            per_episode = np.mean([result.more["mappings_of_episodes"] for result in runs])
+            cells = f"{n_uses.mean():,.0f}", f"{per_step:.3f}", f"{n_mappings.mean():,.0f}", f"{per_episode:.1f}"
             rows.append((DOMAINS[name].title, method, *cells))
-    header = ("domain", "method", "uses", "uses a step", "mappings used")
+    header = ("domain", "method", "uses", "uses a step", "mappings used", "in an episode")
     title = "State-action pairs at the agent's states for which transferred instances were used, mean of the runs"
     return Table(title, header, rows)
 

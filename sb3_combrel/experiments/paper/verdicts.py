@@ -15,7 +15,7 @@ from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
 from sb3_combrel.experiments.paper.figures import WINDOW
 
 HELD, NOT_HELD, OPPOSITE = "held", "not held", "opposite"
-PAPERS, CONTROL = "paper", "control"
+PAPERS, WINDOWS, CONTROL = "paper", "window", "control"
 
 
 class Claim(NamedTuple):
@@ -25,7 +25,8 @@ class Claim(NamedTuple):
     domain: str
     better: str
     worse: str
-    kind: str = PAPERS  # the paper's, of its Table 6; or a control's: what must hold besides
+    kind: str = PAPERS  # the paper's, of its Table 6; the same of its own window; or a control's: what must hold besides
+    episodes: tuple[int, int] | None = None  # the first and the last that count, from 1 on; None: all
 
 
 _CAR, _ROBOT = MOUNTAIN_CAR.name, ICUB.name
@@ -38,6 +39,7 @@ _CONTROLS = {
 }
 # Where this held, what is saved need not come from the source.
 _UNRELATED_HELPS = "COMBREL with an unrelated source better than no transfer"
+_LATER, _RELEVANT = (50, 300), (100, 170)
 CLAIMS: Sequence[Claim] = (
     Claim("COMBREL better than no transfer", _CAR, m.COMBREL_PLAIN, m.NO_TRANSFER),
     Claim("COMBREL better than no transfer", _ROBOT, m.COMBREL_PLAIN, m.NO_TRANSFER),
@@ -47,6 +49,9 @@ CLAIMS: Sequence[Claim] = (
     Claim("COMBREL better without relevance than with it", _CAR, m.COMBREL_PLAIN, m.COMBREL_RELEVANCE),
     Claim("With relevance COMBREL better than TIMBREL", _CAR, m.COMBREL_RELEVANCE, m.TIMBREL_RELEVANCE),
     Claim("TIMBREL better with a random mapping than with the most frequent", _ROBOT, m.TIMBREL_RANDOM, m.TIMBREL_FREQUENT),
+    Claim("COMBREL better than TIMBREL, most frequent mapping", _ROBOT, m.COMBREL_PLAIN, m.TIMBREL_FREQUENT, WINDOWS, _LATER),
+    Claim("COMBREL better than TIMBREL, random mapping", _ROBOT, m.COMBREL_PLAIN, m.TIMBREL_RANDOM, WINDOWS, _LATER),
+    Claim("With relevance COMBREL better than TIMBREL", _CAR, m.COMBREL_RELEVANCE, m.TIMBREL_RELEVANCE, WINDOWS, _RELEVANT),
     *(
         Claim(f"COMBREL better than {words}", domain, m.COMBREL_PLAIN, other, CONTROL)
         for domain in (_CAR, _ROBOT)
@@ -80,9 +85,9 @@ class Verdict(NamedTuple):
 
 
 def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verdict]:
-    """Judge all claims of a kind whose methods have been run.
+    """Judge all claims of a kind whose methods have been run, for all of its episodes.
 
-    The steps of all of a run's episodes, the area under its learning curve, are compared. A claim held if the better method
+    The steps of a run's episodes, the area under its learning curve, are compared. A claim held if the better method
     takes fewer, with a corrected p-value below ``ALPHA``; the opposite if it takes more, with such a p-value.
     """
     totals, p_values, p_thresholds = {}, {}, {}
@@ -90,7 +95,11 @@ def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verd
         of_domain = steps.get(claim.domain, {})
         if claim.kind == kind and {claim.better, claim.worse} <= set(of_domain):
             better, worse = of_domain[claim.better], of_domain[claim.worse]
-            totals[claim] = first, second = better.sum(axis=1).astype(float), worse.sum(axis=1).astype(float)
+            start, end = claim.episodes or (1, better.shape[1])
+            if end > better.shape[1]:
+                continue
+            first, second = (each[:, start - 1 : end].sum(axis=1).astype(float) for each in (better, worse))
+            totals[claim] = first, second
             p_values[claim] = p_value_of_difference(first, second, "permutation")
             hardest = DOMAINS[claim.domain].thresholds[-1]
             first, second = steps_to_reach(better, hardest, WINDOW), steps_to_reach(worse, hardest, WINDOW)
@@ -109,7 +118,8 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
     header = ("claim", "domain", "steps saved", "95% interval", "Cliff's delta", "p", "p (Holm)", "p, threshold", "verdict")
     rows = []
     for each in verdicts:
-        claim = each.claim.text, DOMAINS[each.claim.domain].title
+        window = ", episodes {} to {}".format(*each.claim.episodes) if each.claim.episodes else ""
+        claim = each.claim.text + window, DOMAINS[each.claim.domain].title
         saved = share_text(each.saved), interval_text(each.low, each.high), f"{without_minus_zero(each.delta, 2):+.2f}"
         p_values = map(p_text, (each.p_value, each.corrected, each.p_threshold))
         rows.append((*claim, *saved, *p_values, each.verdict))

@@ -45,8 +45,8 @@ EXISTING = {
 FREQUENT = InterTaskMapping(state=(0, 1, None, None), action=(0, 1, 2, 3, 3, 2, 0, 1))
 
 
-def transfer_of(domain, setting, method, sources, seed=5000):
-    given = replace(sources[domain], frequent=FREQUENT)
+def transfer_of(domain, setting, method, sources, seed=26000):
+    given = replace(sources[domain][26000], frequent=FREQUENT)
     return m.transfer_of(method, DOMAINS[domain], DOMAINS[domain].settings[setting], given, seed)
 
 
@@ -61,7 +61,10 @@ def test_every_method_binds_to_its_target_and_learns(domain, setting, sources):
     chosen = DOMAINS[domain].settings[setting]
     use = "prior" if setting == BEST else "instances"
     # With many instances, of many mappings, and on a fine grid a step takes long.
-    few = {name: replace(each, own=each.own.subset(10), unrelated=each.unrelated.subset(10)) for name, each in sources.items()}
+    few = {
+        name: {seed: replace(each, own=each.own.subset(10), unrelated=each.unrelated.subset(10)) for seed, each in own.items()}
+        for name, own in sources.items()
+    }
     for method in EXISTING[domain, setting]:
         expected_class, mapping, relevance = CLASSES[method]
         transfer = transfer_of(domain, setting, method, few)
@@ -72,7 +75,7 @@ def test_every_method_binds_to_its_target_and_learns(domain, setting, sources):
             if expected_class is TIMBREL:
                 text = transfer.mapping if isinstance(transfer.mapping, str) else None
                 assert text == ("random" if drawn_once else mapping)
-            assert transfer.source is (few[domain].unrelated if method == m.UNRELATED else few[domain].own)
+            assert transfer.source is (few[domain][26000].unrelated if method == m.UNRELATED else few[domain][26000].own)
         with make_env(DOMAINS[domain].target_id, max_episode_steps=3) as env, chosen_on_purpose():
             learner = {**m.learner_of(method, DOMAINS[domain], chosen), "resolution": 3}
             model = FittedRMax(env, transfer=transfer, seed=0, **learner).learn(6)
@@ -95,8 +98,9 @@ def test_mappings_of_a_person_of_the_oracle_and_from_an_unrelated_source(sources
     assert transfer_of("mountain_car", BEST, m.TIMBREL_INTUITIVE, sources).mapping == factored_mapping(2)
     assert len(transfer_of("icub", PAPER, m.ORACLE, sources).mapping) == len(ICUB.target_names()[1])
     assert transfer_of("mountain_car", PAPER, m.UNRELATED, sources).mappings == "injective"
-    assert sources["mountain_car"].unrelated.origin == sources["icub"].own.origin
-    assert sources["icub"].unrelated.origin == sources["mountain_car"].own.origin
+    for seed, of_car in sources["mountain_car"].items():
+        assert of_car.unrelated.origin == sources["icub"][seed].own.origin
+        assert sources["icub"][seed].unrelated.origin == of_car.own.origin
 
 
 @pytest.mark.parametrize("setting", [PAPER, EXPLORE])
@@ -121,11 +125,13 @@ def test_one_random_mapping_with_a_prior_is_drawn_by_the_seed(sources):
 class TestTargets:
     def test_the_jobs_are_those_of_each_seed_and_method(self, sources):
         (target,) = targets_of("fig2", PAPER)
-        jobs = jobs_of(MOUNTAIN_CAR, PAPER, methods_of([target], MOUNTAIN_CAR, PAPER), sources["mountain_car"], 3, 7)
+        jobs = jobs_of(MOUNTAIN_CAR, PAPER, methods_of([target], MOUNTAIN_CAR, PAPER), sources["mountain_car"], 7)
         assert Counter(job.method for job in jobs) == Counter(dict.fromkeys(target.methods["mountain_car"], 3) | {m.ORACLE: 0})
-        assert {(job.seed, job.n_episodes) for job in jobs} == {(seed, 7) for seed in (5000, 5001, 5002)}
+        assert {(job.seed, job.n_episodes) for job in jobs} == {(seed, 7) for seed in (26000, 26001, 26002)}
         assert len({job.name for job in jobs}) == len(jobs)
         assert {job.method for job in jobs if job.records_selections} == {m.COMBREL_PLAIN}
+        of_combrel = {job.seed: job.transfer.source for job in jobs if job.method == m.COMBREL_PLAIN}
+        assert all(source is sources["mountain_car"][seed].own for seed, source in of_combrel.items())
 
     @pytest.mark.parametrize("setting", SETTINGS)
     def test_all_of_a_setting_need_methods_that_exist_there(self, setting):
@@ -144,7 +150,7 @@ METHODS = [("mountain_car", m.COMBREL_WHOLE), ("icub", m.COMBREL_PLAIN)]
 
 
 def job_of(short, domain, method, sources):
-    (job,) = jobs_of(short[domain], PAPER, [method], sources[domain], 1, N_EPISODES)
+    (job,) = jobs_of(short[domain], PAPER, [method], {5000: sources[domain][26000]}, N_EPISODES)
     # COMBREL chooses from many more mappings on the iCub, and its steps take longer.
     return replace(job, max_episode_steps=60 if domain == "icub" else 250)
 
@@ -155,10 +161,13 @@ class Replay(BaseCallback):
     def __init__(self, states):
         super().__init__()
         self.rows, self.n_done, self.before, self.states = [], 0, {}, states
+        self.used = [set() for _ in range(N_EPISODES)]
 
     def _on_step(self):
         uses, state = self.model.agent.transfer.uses(), self.states[self.num_timesteps - 1]
-        self.rows += [(number, state) for number, n in uses.items() if n > self.before.get(number, 0)]
+        new = [(number, state) for number, n in uses.items() if n > self.before.get(number, 0)]
+        self.rows += new
+        self.used[self.n_done] |= {number for number, _ in new}
         self.before = dict(uses)
         self.n_done += int(self.locals["dones"][0])
         return self.n_done < N_EPISODES
@@ -194,11 +203,11 @@ def run(request, short, sources):
         model = FittedRMax(env, transfer=job.transfer, seed=job.seed, **job.learner)
         callback = Replay(states)
         model.learn(10**6, callback)
-    return job, result, model.agent.transfer, callback.rows
+    return job, result, model.agent.transfer, callback
 
 
 def test_selections_are_those_of_the_transfer_method(run):
-    job, result, transfer, rows = run
+    job, result, transfer, replay = run
     assert (result.name, result.group, result.method, result.seed) == (job.name, job.group, job.method, job.seed)
     assert len(result.steps) == N_EPISODES and 0.0 < result.more["first_episode_seconds"] <= result.seconds
     uses, selections = result.more["uses"], result.more["selections"]
@@ -207,8 +216,15 @@ def test_selections_are_those_of_the_transfer_method(run):
     # The random source of the mountain car reaches little beyond what the target knows by then.
     assert sum(counts) == sum(transfer.uses().values()) > (0 if job.group == "mountain_car" else 5)
     numbers = list(uses_of(transfer))
-    assert [numbers[int(row[0])] for row in selections] == [number for number, _ in rows]
-    np.testing.assert_allclose([row[1:] for row in selections], [state for _, state in rows], atol=1e-5)
+    assert [numbers[int(row[0])] for row in selections] == [number for number, _ in replay.rows]
+    np.testing.assert_allclose([row[1:] for row in selections], [state for _, state in replay.rows], atol=1e-5)
+
+
+def test_the_mappings_of_each_episode_are_counted(run):
+    _, result, transfer, replay = run
+    # In "uses" they follow the target action and precede the number of times.
+    named = [{tuple(map(str, uses_of(transfer)[number][1:4])) for number in used} for used in replay.used]
+    assert result.more["mappings_of_episodes"] == [len(names) for names in named] and any(named)
 
 
 def test_names_are_those_of_the_candidates(run):
@@ -249,10 +265,10 @@ def test_without_transfer_nothing_is_recorded_and_the_same_run_has_the_same_resu
 
 def test_the_jobs_of_the_diagnosis_differ_in_breadth_alone(short, sources):
     car = short["mountain_car"]
-    jobs = diagnosis_jobs(car, EXPLORE, sources["mountain_car"], 2, 300)
-    assert len({job.name for job in jobs}) == len(jobs) == len(BREADTHS) * len(DIAGNOSED) * 2
+    jobs = diagnosis_jobs(car, EXPLORE, sources["mountain_car"], 300)
+    assert len({job.name for job in jobs}) == len(jobs) == len(BREADTHS) * len(DIAGNOSED) * 3
     assert {job.n_episodes for job in jobs} == {DIAGNOSED_EPISODES}
-    assert {job.n_episodes for job in diagnosis_jobs(car, EXPLORE, sources["mountain_car"], 1, 3)} == {3}
+    assert {job.n_episodes for job in diagnosis_jobs(car, EXPLORE, sources["mountain_car"], 3)} == {3}
     for job in jobs:
         method, breadth = job.method.split(" at ")
         assert method in DIAGNOSED

@@ -19,7 +19,7 @@ from sb3_combrel.runs.job import Job
 from sb3_combrel.runs.runner import FOLDER, Backend, JobError, read_results, run_missing
 
 TINY = {"runs": 2, "episodes": 2, "backend": Backend(n_jobs=1)}
-TABLES = {"table2": 3, "table4": 2, "table5": 1, "table6": 4, "measures": 2}
+TABLES = {"table2": 3, "table4": 2, "table5": 1, "table6": 4, "fig6": 1, "measures": 2}
 
 
 def reproduce(target, **given):
@@ -60,13 +60,13 @@ class TestChain:
         header, *rows = (complete / "mountain_car.csv").read_text().splitlines()
         assert header == "method,seed,steps,episodes_terminated,steps_of_episodes"
         assert rows == [
-            f"{method},{seed},120,0,60 60" for method in ("COMBREL", "TIMBREL", "no transfer") for seed in (5000, 5001)
+            f"{method},{seed},120,0,60 60" for method in ("COMBREL", "TIMBREL", "no transfer") for seed in (26000, 26001)
         ]
 
     def test_what_is_missing_is_done_again_and_nothing_else(self, complete, tmp_path):
         folder = shutil.copytree(complete, tmp_path / "copied")
-        (folder / FOLDER / "mountain_car_timbrel_seed5000.json").unlink()
-        damaged = folder / FOLDER / "mountain_car_combrel_seed5001.json"
+        (folder / FOLDER / "mountain_car_timbrel_seed26000.json").unlink()
+        damaged = folder / FOLDER / "mountain_car_combrel_seed26001.json"
         damaged.write_bytes(damaged.read_bytes()[:100])
         _, written = reproduce("table5", output=folder)
         assert "4 of 6 runs were complete already" in written
@@ -100,7 +100,7 @@ def test_everything_from_nothing(tmp_path):
         lines = (tmp_path / "output" / f"{name}.csv").read_text().splitlines()
         assert len(lines) == 1 + 2 * n_methods and all(len(line.split(",")[-1].split()) == 10 for line in lines[1:])
     before = files_in(tmp_path / "output")
-    assert ", seed 50" in written and ", seed 50" not in run().stdout and files_in(tmp_path / "output") == before
+    assert ", seed 260" in written and ", seed 260" not in run().stdout and files_in(tmp_path / "output") == before
 
 
 @pytest.mark.long
@@ -110,7 +110,7 @@ def test_everything_from_nothing(tmp_path):
         (
             "best",
             ("fig2", "fig5", "fig6", "baselines"),
-            {"table5": 1, "table6": 4, "measures": 2, "baselines": 1},
+            {"table5": 1, "table6": 4, "fig6": 1, "measures": 2, "baselines": 1},
             "diagnosis",
         ),
         ("explore", ("fig2", "fig4", "diagnosis"), {**TABLES, "diagnosis": 1}, "baselines"),
@@ -153,7 +153,7 @@ class TestBadInput:
         ("given", "message"),
         [
             ({"setting": "explore"}, "setting was 'paper' and is 'explore'"),
-            ({"episodes": 3}, r"mountain_car_combrel_seed5000: n_episodes was 2 and is 3\); use another --output"),
+            ({"episodes": 3}, r"mountain_car_combrel_seed26000: n_episodes was 2 and is 3\); use another --output"),
         ],
     )
     def test_results_of_other_settings(self, given, message, complete):
@@ -180,7 +180,7 @@ class TestBadInput:
         car = DOMAINS["mountain_car"]
         wrong = replace(car.settings["paper"], learner={"degree": 0, "model_breadth": -1.0})
         monkeypatch.setitem(DOMAINS, "mountain_car", replace(car, settings={**car.settings, "paper": wrong}))
-        with pytest.raises(JobError, match=r"COMBREL, seed 5000: ValueError: model_breadth must .*-1.0"):
+        with pytest.raises(JobError, match=r"COMBREL, seed 26000: ValueError: model_breadth must .*-1.0"):
             reproduce("fig4", runs=1, output=tmp_path / "output")
         assert not list((tmp_path / "output").glob("*.csv"))
 

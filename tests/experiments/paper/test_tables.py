@@ -13,7 +13,17 @@ from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR, P
 from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED, method_at
 from sb3_combrel.experiments.paper.report import write_report
 from sb3_combrel.experiments.paper.targets import targets_of
-from sb3_combrel.experiments.paper.verdicts import CLAIMS, CONTROL, HELD, NOT_HELD, OPPOSITE, PAPERS, judge, verdict_table
+from sb3_combrel.experiments.paper.verdicts import (
+    CLAIMS,
+    CONTROL,
+    HELD,
+    NOT_HELD,
+    OPPOSITE,
+    PAPERS,
+    WINDOWS,
+    judge,
+    verdict_table,
+)
 from sb3_combrel.runs import runner
 from sb3_combrel.runs.job import Job
 
@@ -58,11 +68,23 @@ class TestVerdicts:
     def test_all_rows_of_a_kind_with_all_methods(self):
         steps = {name: {method: runs(100 + 10 * k, 3) for k, method in enumerate(m.METHODS)} for name in DOMAINS}
         papers, controls = judge(steps, PAPERS), judge(steps, CONTROL)
-        assert [each.claim for each in (*papers, *controls)] == list(CLAIMS) and len(papers) == 8
+        without_windows = [claim for claim in CLAIMS if claim.kind != WINDOWS]
+        assert [each.claim for each in (*papers, *controls)] == without_windows and len(papers) == 8
+        # The windows are later than these episodes.
+        assert judge(steps, WINDOWS) == []
         # Every control is beside the method of every claim: against each of them in both domains.
         assert {(each.claim.domain, each.claim.worse) for each in controls} >= {
             (name, other) for name in DOMAINS for other in (m.ONE_RANDOM, m.UNRELATED, m.NO_TRANSFER_BEST)
         }
+
+    def test_a_window_counts_its_episodes_and_no_others(self):
+        fast, slow = runs(30, n_episodes=300), runs(60, n_episodes=300)
+        # Outside of episodes 50 to 300 it is the other way round, by more.
+        fast[:, :49] = 10_000
+        found = judge({ROBOT: {m.COMBREL_PLAIN: fast, m.TIMBREL_RANDOM: slow, m.NO_TRANSFER: slow}}, WINDOWS)
+        (row,) = verdict_table(found, "title").rows
+        assert row[0].endswith("random mapping, episodes 50 to 300") and row[-1] == HELD and abs(found[0].saved - 0.5) < 0.1
+        assert judge({ROBOT: {m.COMBREL_PLAIN: fast[:, :299], m.TIMBREL_RANDOM: slow[:, :299]}}, WINDOWS) == []
 
     def test_p_values_are_corrected_over_the_rows_of_the_table(self):
         better = np.arange(0, 10)[:, None] * 10 + 100
@@ -115,9 +137,25 @@ class TestSummary:
 
 def test_uses_a_step_and_mappings():
     some = [["East", "Left", "x<-x", "", 6], ["West", "Left", "x<-x", "", 3]], [["East", "Left", "x<-v", "", 1]]
-    results = [made_up(CAR, m.UNRELATED, seed, [20], uses=uses) for seed, uses in enumerate(some)]
-    expected = ("Mountain Car 4D", m.UNRELATED, "5", f"{(9 / 20 + 1 / 20) / 2:.3f}", "1")
-    assert tables.uses_table({CAR: [*results, made_up(CAR, m.NO_TRANSFER, 0, [20])]}).rows[0][:4] == expected[:4]
+    results = [
+        made_up(CAR, m.UNRELATED, seed, [5, 15], uses=uses, mappings_of_episodes=counts)
+        for seed, (uses, counts) in enumerate(zip(some, ([1, 1], [1, 0]), strict=True))
+    ]
+    (row,) = tables.uses_table({CAR: [*results, made_up(CAR, m.NO_TRANSFER, 0, [20])]}).rows
+    assert row == ("Mountain Car 4D", m.UNRELATED, "5", f"{(9 / 20 + 1 / 20) / 2:.3f}", "1", "0.8")
+
+
+def test_training_until_each_threshold():
+    # Never, at once, and after an episode of 400 and two of five fast ones more.
+    steps = {m.NO_TRANSFER: [[400] * 8] * 4, m.COMBREL_PLAIN: [[45] * 8] * 4, m.ORACLE: [[400] + [60] * 7] * 4}
+    table = tables.thresholds_table(ICUB, made_up_runs(ROBOT, steps))
+    assert table.header == ("method", "200", "150", "100", "75", "50", "40")
+    found = {row[0]: row[1:] for row in table.rows}
+    assert found[m.COMBREL_PLAIN] == (*[str(5 * 45)] * 5, "never")
+    assert found[m.ORACLE][0].startswith(f"{400 + 4 * 60} (0.0") and found[m.ORACLE][-1] == "never (1.00)"
+    others = {m.NO_TRANSFER: p_value_of_difference([np.inf] * 4, [225.0] * 4, "mann-whitney")}
+    corrected = holm({**others, m.ORACLE: p_value_of_difference([640.0] * 4, [225.0] * 4, "mann-whitney")})
+    assert found[m.NO_TRANSFER][2] == f"never ({p_text(corrected[m.NO_TRANSFER])})"
 
 
 def learnt(n_episodes=20, n_runs=6):
