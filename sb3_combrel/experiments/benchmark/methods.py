@@ -24,6 +24,7 @@ from sb3_combrel.experiments.benchmark.oracle import KnownCopies
 from sb3_combrel.experiments.benchmark.pair import Pair, check_name
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.methods.combrel import DEFAULT_OF_PRIOR
 from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS
 from sb3_combrel.transfer.methods.master import DEFAULT_RANDOM_STEPS
 
@@ -105,8 +106,8 @@ def _soft_homomorphism(sources: Sources, pair: Pair) -> Transfer:
 
 
 def _same_as_factored(pair: Pair) -> str | None:
-    """COMBREL by default is COMBREL with factored mappings, unless the pair needs mirrored variables."""
-    return FACTORED if pair.mappings == "factored" else None
+    """COMBREL by default is COMBREL with the pair's factored mappings if it has mirrored ones, for which the default looks."""
+    return FACTORED if pair.mappings == DEFAULT_OF_PRIOR else None
 
 
 FACTORED = "COMBREL-factored"
@@ -152,13 +153,13 @@ _METHODS: Sequence[Method] = (
     ),
     _finding(
         "COMBREL",
-        "COMBREL by default: factored mappings as a prior, without mirrored variables.",
+        "COMBREL by default: factored mappings as a prior, mirrored ones too.",
         lambda sources, pair: COMBREL(sources),
         same_as=_same_as_factored,
     ),
     _finding(
         FACTORED,
-        "COMBREL with factored mappings as a prior, mirrored ones too where the pair has such.",
+        "COMBREL that is told whether variables are mirrored: factored mappings as a prior, mirrored ones where the pair has such.",
         lambda sources, pair: COMBREL(sources, pair.mappings, use="prior"),
     ),
     _finding(

@@ -9,7 +9,7 @@ import pytest
 
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
 from sb3_combrel.experiments.benchmark.known import errors_of
-from sb3_combrel.experiments.benchmark.methods import METHODS, DoesNotFit, Method
+from sb3_combrel.experiments.benchmark.methods import FACTORED, METHODS, DoesNotFit, Method
 from sb3_combrel.experiments.benchmark.pair import Pair, recorded
 from sb3_combrel.experiments.benchmark.pairs import (
     ACTIONS,
@@ -59,6 +59,16 @@ class TestEveryPair:
         with closing(PAIRS[name].make_target()) as env:
             limit = env.get_wrapper_attr("_max_episode_steps")
             assert limit <= (PAIRS[name].n_steps or limit)
+
+    @pytest.mark.parametrize("name", ["mountain-car", "mirrored-car"])
+    def test_combrel_is_run_once_where_its_default_is_what_it_is_told(self, name, sources):
+        def bound(method):
+            transfer = METHODS[method].make(sources[name][0], PAIRS[name])
+            with closing(PAIRS[name].make_target()) as env, chosen_on_purpose():
+                return FittedRMax(env, transfer=transfer, seed=0, **PAIRS[name].learner).agent.transfer.arguments()
+
+        left_open, told = bound("COMBREL"), bound(FACTORED)
+        assert ({**left_open, "source": 0} == {**told, "source": 0}) == (METHODS["COMBREL"].same_as(PAIRS[name]) == FACTORED)
 
     @pytest.mark.parametrize(
         "name", ["mirrored-car", *(pytest.param(n, marks=pytest.mark.long) for n in [*PAIRS][3:]), "icub"]
