@@ -6,7 +6,6 @@
 # make results   takes what was reproduced, and the results of the benchmark, into docs/
 # make benchmark   methods of transfer on pairs of tasks, in benchmark/; BENCHMARK_ARGS="--pairs icub --seeds 3"
 # make icub    of these Figure 5, the arm of the iCub with and without transfer from its torso, in setting "explore"
-# make icub-breadths  both tasks of the iCub at three kernel breadths, with and without noise
 # make icub-video  learn the iCub's tasks; video and picture of each in icub_output/
 # make learner the learner on all tasks, as in docs/results/learner.md (an hour)
 # make transfer  the suite's transfer methods and sources, as in docs/results/transfer.md (six hours)
@@ -42,7 +41,7 @@ endif
 # Without this NumPy's and PyTorch's threads of parallel runs fight for the cores.
 export OMP_NUM_THREADS := 1
 
-.PHONY: demo doc figures dashboard learner transfer suite tutorials reproduce benchmark results icub icub-breadths icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
+.PHONY: demo doc figures dashboard learner transfer suite tutorials reproduce benchmark results icub icub-video test test-all test-oldest bench lint type format check-codestyle commit-checks build smoke gl clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel demo $(DEMO_ARGS)
@@ -79,13 +78,6 @@ results:
 # A later call goes on with what is there. ICUB_ARGS="--runs 3 --episodes 100", for instance.
 icub: $(VENV)/.installed-demo
 	$(BIN)/sb3-combrel reproduce fig5 --setting explore $(ICUB_ARGS)
-
-# Takes its table into the documentation as well. ICUB_ARGS="--seeds 3 --episodes 100", for instance.
-icub-breadths: $(VENV)/.installed-demo
-	$(BIN)/python -m sb3_combrel.experiments.suite.breadths $(ICUB_ARGS)
-	mkdir -p docs/results
-	cp breadths_experiment/summary.csv docs/results/icub_breadths.csv
-	cp breadths_experiment/tables.md docs/results/icub_breadths.md
 
 # The tasks of docs/results/protocol.md, without transfer. A later call goes on with what is there.
 LEARNER_TASKS := MountainCar4D-60 MountainCar2D MountainCar2D-noisy MountainCar-v0 MountainCar-v0-noisy Acrobot-v1 CartPole-v1 \
