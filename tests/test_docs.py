@@ -79,8 +79,10 @@ def cli_without_work(monkeypatch):
 def test_commands_exist(page, cli_without_work):
     n_calls = 0
     for words in commands(page.read_text()):
-        while re.match(r"[A-Z_]+=", words[0]):
+        while words and re.match(r"[A-Z_]+=", words[0]):
             words = words[1:]
+        if not words:
+            continue
         if words[0] == "sb3-combrel":
             assert cli.main(words[1:]) == 0, words
             n_calls += 1
