@@ -159,7 +159,7 @@ _METHODS: Sequence[Method] = (
     ),
     _finding(
         FACTORED,
-        "COMBREL that is told whether variables are mirrored: factored mappings as a prior, mirrored ones where the pair has such.",
+        "COMBREL that is told whether variables are mirrored: factored mappings as a prior, mirrored ones or none.",
         lambda sources, pair: COMBREL(sources, pair.mappings, use="prior"),
     ),
     _finding(
