@@ -9,7 +9,8 @@ from typing import Any
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 
-#: As in the paper; where exploration is expensive, with this package's instance transfer; and this package's defaults.
+#: As in the paper; where exploration is expensive, with this package's instance transfer; and this package's defaults,
+#: but that COMBREL looks for no mirrored variables.
 PAPER, EXPLORE, BEST = SETTINGS = ("paper", "explore", "best")
 
 
