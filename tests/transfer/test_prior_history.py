@@ -36,7 +36,7 @@ def test_between_two_points_nothing_changes(learnt):
     model, believed = learnt
     history = model.transfer.report().history
     steps = [point.step for point in history]
-    assert steps[0] == 10 and steps[-1] == 300 and len(steps) < 15 and (np.diff(steps) > 0).all()
+    assert steps[0] == 10 and steps[-1] == 300 and len(steps) < 20 and (np.diff(steps) > 0).all()
     for step, (strengths, mappings, excess) in believed.seen.items():
         if step >= steps[0] and step not in believed.ended:  # what an episode's end changes was seen before it
             point = history[np.searchsorted(steps, step, side="right") - 1]
@@ -58,7 +58,10 @@ def test_it_is_saved_with_the_model_and_goes_on(learnt, tmp_path):
     model, _ = learnt
     model.save(tmp_path / "model")
     loaded = FittedRMax.load(tmp_path / "model", env=NamedWalk())
-    np.testing.assert_equal(loaded.transfer.report().history, model.transfer.report().history)
+    before = model.transfer.report().history
+    np.testing.assert_equal(loaded.transfer.report().history, before)
     loaded.learn(200, reset_num_timesteps=False)
-    history = loaded.transfer.report().history
-    assert history[: len(history) - 2][-1].step <= 300 < history[-1].step == 500
+    after = loaded.transfer.report().history
+    # The last point is of the present, until something changes.
+    np.testing.assert_equal(after[: len(before) - 1], before[:-1])
+    assert 300 < after[len(before)].step <= after[-1].step == 500

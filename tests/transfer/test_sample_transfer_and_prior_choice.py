@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sb3_combrel import InterTaskMapping, MappingSet, SampleTransfer
+from sb3_combrel.mappings.state_mappings import copies_of_source, with_mirrored
 from sb3_combrel.transfer import equations
 from sb3_combrel.transfer.candidates import Candidates, stacked_instances
 from sb3_combrel.transfer.equations import Bandwidths
@@ -235,6 +236,40 @@ def test_the_division_found_has_the_most_evidence_of_all():
     found = prior_choice.choose_factored(copies, sums)
     chosen = tuple(sorted({c for c in found.copies[0].tolist() if c >= 0}))
     assert score(chosen) == pytest.approx(max(score(d) for d in all_divisions(copies.state >= 0)), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("own_image", "mirrored"),
+    [(True, (False, False)), (True, (True, True)), *((False, each) for each in itertools.product([False, True], repeat=2))],
+)
+def test_variables_are_mirrored_where_that_explains_far_more(own_image, mirrored, seed):
+    """The oscillator, both variables mirrored, is the same with other actions; what always moves upwards is not."""
+    rng = np.random.default_rng(seed)
+    effects_of = f.oscillate if own_image else lambda states, actions: 0.1 * states[:, ::-1] ** 2 + np.abs(f.PUSH[actions])
+    states, actions = rng.random((60, 2)), rng.integers(3, size=60)
+    effects = effects_of(states, actions) + 0.005 * rng.normal(size=states.shape)
+    rows, sign = with_mirrored(copies_of_source(2, 2))
+    source = f.oscillator_source(200, seed, effects=effects_of)
+    copies = Copies([source], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2, 1.0)
+    sums = CopySums.zero(len(copies), 3, 3, 2)
+    for state, action, effect in zip(np.where(mirrored, 1.0 - states, states), actions.tolist(), effects, strict=True):
+        copies.measure(state, action, np.where(mirrored, -effect, effect), sums)
+    chosen = np.unique(prior_choice.choose_factored(copies, sums).copies)
+    found = (copies.sign[chosen[chosen >= 0]] < 0.0).any(axis=0)
+    np.testing.assert_array_equal(found, (False, False) if own_image else mirrored)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 30))
+def test_a_mirrored_copy_is_compared_with_the_best_of_the_same_variables(seed, n_variables, n_copies):
+    rng = np.random.default_rng(seed)
+    members, mirrored = rng.random((n_copies, n_variables)) < 0.5, rng.random(n_copies) < 0.5
+    scores = 10.0 * rng.normal(size=n_copies)
+    found = prior_choice.explains_more(members, mirrored, scores)
+    for c in range(n_copies):
+        same = [scores[k] for k in range(n_copies) if not mirrored[k] and (members[k] == members[c]).all()]
+        assert found[c] == (scores[c] > 2.0 * max([0.0, *same]))
 
 
 def test_an_action_that_was_never_taken_has_no_source_action():

@@ -12,6 +12,9 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 
 # Divisions are searched subset by subset of the target's variables.
 MAX_FACTORED_VARIABLES = 12
+# Mirrored variables must explain so many times as much as the same variables do as they are. Where a task's effects are their
+# own mirror image, both explain about as much, and only one of them has the goal on the right side.
+MIRRORED_GAIN = 2.0
 
 
 class Choice(NamedTuple):
@@ -57,13 +60,31 @@ def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choic
 
 
 def choose_factored(copies: Copies, sums: CopySums) -> Choice:
-    """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``."""
+    """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``.
+
+    Of mirrored copies those alone may be chosen that have :data:`MIRRORED_GAIN` times the evidence of one that is not.
+    """
     action, gain = best_actions(copies, sums)
     taken = sums.n > 0.0
     scores = np.where(taken, gain, 0.0).sum(axis=1) - taken.sum() * np.log(copies.table.n_actions) - np.log(len(copies))
-    chosen = best_division(copies.state >= 0, scores)
+    members: np.ndarray = copies.state >= 0
+    mirrored = np.asarray((copies.sign < 0.0).any(axis=1))
+    chosen = best_division(members, np.where(mirrored & ~explains_more(members, mirrored, scores), -np.inf, scores))
     n_actions = len(sums.n)
     return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), action[chosen].T.copy())
+
+
+def explains_more(members: np.ndarray, mirrored: np.ndarray, scores: np.ndarray) -> np.ndarray:
+    """Whether copies score :data:`MIRRORED_GAIN` times as much as the best of the same variables that is not mirrored.
+
+    :param members: the variables of each copy, bool, shape (n_copies, n_variables); ``mirrored``: bool, shape (n_copies,)
+    :param scores: of each copy, shape (n_copies,)
+    """
+    variables = members @ (1 << np.arange(members.shape[1]))
+    best = np.zeros(1 << members.shape[1])
+    np.maximum.at(best, variables[~mirrored], scores[~mirrored])
+    more: np.ndarray = scores > MIRRORED_GAIN * best[variables]
+    return more
 
 
 def best_division(members: np.ndarray, scores: np.ndarray) -> list[int]:
