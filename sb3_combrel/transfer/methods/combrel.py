@@ -54,8 +54,8 @@ class COMBREL(MappingTransfer):
     :param mappings: a set as there, by default "injective" with ``use="instances"``; with ``use="prior"`` also
         "signed_factored", the default, or "factored": the target's variables are divided among copies of the source, or of
         some of its variables, as they are or, where that explains twice as much, mirrored, each moved by a source action of
-        its own, and variables that stay; or a ``FactoredMapping``. Where every target variable is mapped, as in "surjective", translated instances lie on diagonals
-        of the target's space and help much less
+        its own, and variables that stay; or a ``FactoredMapping``. Where every target variable is mapped, as in "surjective",
+        translated instances lie on diagonals of the target's space and help much less
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
     :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the nearest
         whatever their action, each judged by the source action that the mapping has for *its* action; at most 20,000 mappings
