@@ -108,10 +108,10 @@ class FittedRMaxAgent:
             max_value=self.rewards.max_value,
         )
 
-    def _build(self) -> None:
-        """Make model and planner, without any instances."""
+    def _build(self, width: int | None = None) -> None:
+        """Make model and planner, without any instances; ``width``: room for successors that rows have had before."""
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
-        self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma)
+        self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma, width)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
         asked = None if self._model_transfer is None else self.correspondence.of_learner(self._model_transfer)
         self.model = self.model_class(self.mdp, self.model_settings, asked)
@@ -301,7 +301,7 @@ class FittedRMaxAgent:
             learned = self.transfer.get_state() if self.transfer is not None and same else {}
             self.task = replace(self.task, scaling=scaling, bounds=bounds)
             self._bind()
-            self._build()
+            self._build(self.mdp.width)
             if self.transfer is not None and learned:
                 self.transfer.set_state(learned)
             self._widen(min(0.0, lowest) / LONGEST_PLAN)

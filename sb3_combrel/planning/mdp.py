@@ -42,17 +42,19 @@ class FiniteMDP:
     :param grid: the finite sample of states
     :param n_actions: number of actions
     :param gamma: discount factor
+    :param width: room for successors in each row; None: for one, between the corners of a cell
     """
 
-    def __init__(self, grid: StateGrid, n_actions: int, gamma: float):
+    def __init__(self, grid: StateGrid, n_actions: int, gamma: float, width: int | None = None):
         d, n_points, n_pairs = grid.n_variables, grid.n_points, grid.n_points * n_actions
+        width = n_corners(d) if width is None else width
         self.grid = grid
         self.n_actions = n_actions
         self.gamma = float(gamma)
         #: The MDP for compiled code; ``plain``: the same as a plain tuple (see ``common.compiled``).
         self.arrays = MDPArrays(
-            to=np.zeros((n_points, n_actions, n_corners(d)), dtype=np.int32),
-            weight=np.zeros((n_points, n_actions, n_corners(d))),
+            to=np.zeros((n_points, n_actions, width), dtype=np.int32),
+            weight=np.zeros((n_points, n_actions, width)),
             length=np.zeros((n_points, n_actions), dtype=np.int32),
             reward=np.zeros((n_points, n_actions)),
             modelled=np.zeros(n_pairs, dtype=np.bool_),
@@ -68,6 +70,11 @@ class FiniteMDP:
             touched=np.empty(n_points, dtype=np.int64),
         )
         self.plain_scratch = tuple(self.scratch)
+
+    @property
+    def width(self) -> int:
+        """Room for successors in each row."""
+        return int(self.arrays.to.shape[2])
 
     def make_room(self) -> None:
         """Make rows twice as wide: a mean of many successors needs more room than one successor."""
