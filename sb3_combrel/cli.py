@@ -91,10 +91,9 @@ def reproduce(
 
     It can be stopped at any time; the same command continues from there.
 
-    :param target: fig2, fig3, fig4, fig5, fig6, table2, table4, table5, table6, diagnosis (setting explore: what transfer
-        saves at each breadth), baselines (setting best: DQN and QR-DQN), or all
-    :param setting: paper (the paper's parameters), explore (a narrow kernel, where exploration is expensive) or best (this
-        package's defaults)
+    :param target: fig2, fig3, fig4, fig5, fig6, table2, table4, table5, table6, diagnosis (what transfer saves at
+        breadths of the learner's kernel), baselines (setting best: DQN and QR-DQN), or all
+    :param setting: paper (the paper's parameters) or best (this package's defaults)
     :param runs: of each method; by default 15 for Mountain Car and 10 for the iCub
     :param episodes: of each run; by default 200 and 300
     :param jobs: local processes at a time; one a core by default

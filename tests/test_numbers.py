@@ -17,7 +17,7 @@ FIGURES_IN = ("results.md", "benchmark.md", "results/learner.md", "results/trans
 WITH_FIGURES = [ROOT / "README.md", *(DOCS / name for name in FIGURES_IN)]
 #: Tables that need no mark, by their first heading.
 UNMARKED = {
-    "| | paper | explore | best |": "settings",
+    "| | paper | best |": "settings",
 }
 
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
-from sb3_combrel.experiments.paper.domains import EXPLORE, ICUB, MOUNTAIN_CAR, Domain
+from sb3_combrel.experiments.paper.domains import ICUB, MOUNTAIN_CAR, Domain
 from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, Episodes, play
 from sb3_combrel.runs.job import UNLIMITED, Job, Result, chosen_on_purpose, described
@@ -56,13 +56,16 @@ TOTAL_TIMESTEPS = {MOUNTAIN_CAR.name: 300_000, ICUB.name: 100_000}
 FEWEST_TIMESTEPS = 5000
 
 
-_ARM = ICUB.settings[EXPLORE]
 _CAR_LEARNER = {"degree": 0, "model_breadth": 0.1, "resolution": 3}
+_ARM_LEARNER = {"degree": 0, "model_breadth": 0.2, **icub_arm.LEARNER}
+# Of all signed injective mappings many have about the same compliance. If only the best is used, its errors determine all
+# predictions and are corrected slowly; drawn mappings do not have that drawback, and may be used farther from transitions.
+_ARM_COMBREL = {"choice": "drawn", "neighbor_radius": 0.7, "breadth": 0.5, "breadth_decay": 1.0, "max_transitions": 20_000}
 #: How COMBREL learns before the replay buffer is filled: arguments of FittedRMax and COMBREL, and the number of episodes;
 #: instances are translated for the states visited in them.
 PREFILLINGS: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], int]] = {
     mountain_car.TARGET_ID: (_CAR_LEARNER, {"mappings": "injective", "use": "instances"}, 2),
-    icub_arm.TARGET_ID: (_ARM.learner, {"mappings": _ARM.mappings, **_ARM.combrel, "use": "instances"}, 5),
+    icub_arm.TARGET_ID: (_ARM_LEARNER, {"mappings": "signed_injective", **_ARM_COMBREL, "use": "instances"}, 5),
 }
 
 

@@ -15,7 +15,7 @@ from sb3_combrel.comparison.statistics import bootstrap_band
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baselines import ALGORITHMS
 from sb3_combrel.experiments.paper.domains import DOMAINS, Domain
-from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED, method_at
+from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED_METHODS, method_at
 from sb3_combrel.runs.job import Result
 
 #: Moving average, and the median for thresholds, over so many episodes.
@@ -93,7 +93,7 @@ def draw_selection(
 def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) -> list[Path]:
     """Draw the steps of all episodes against the breadth, mean of the runs with 95% bootstrap intervals."""
     figure, (axes,) = panels_of(1, f"{domain.title}: what transfer can save depends on the learner's kernel")
-    for method, colour in zip(DIAGNOSED, COLOURS, strict=False):
+    for method, colour in zip(DIAGNOSED_METHODS, COLOURS, strict=False):
         # Shape (n_runs, n_breadths).
         totals = np.stack([steps[method_at(method, breadth)].sum(axis=1) for breadth in BREADTHS], axis=1)
         mean, low, high = bootstrap_band(totals)
@@ -102,7 +102,7 @@ def draw_diagnosis(steps: Mapping[str, np.ndarray], domain: Domain, path: Path) 
     axes.set_yscale("log")
     readable_ticks(axes.yaxis)
     _label(axes, "", "model_breadth")
-    n_episodes = steps[method_at(DIAGNOSED[0], BREADTHS[0])].shape[1]
+    n_episodes = steps[method_at(DIAGNOSED_METHODS[0], BREADTHS[0])].shape[1]
     axes.set_ylabel(f"{domain.unit} in {n_episodes} episodes")
     return save(figure, path)
 

@@ -11,13 +11,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.experiments.paper import methods as m
-from sb3_combrel.experiments.paper.domains import Domain
+from sb3_combrel.experiments.paper.domains import DIAGNOSED, Domain, Setting
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.runs.job import Job, Result
 
 #: The diagnosis: what transfer saves at breadths of the learner's kernel.
-BREADTHS = (0.05, 0.1, 0.2, 0.3, 0.4)
-DIAGNOSED = (m.NO_TRANSFER, m.COMBREL_PLAIN, m.TIMBREL_RANDOM)
+BREADTHS = (0.1, 0.2, 0.3, 0.4)
+DIAGNOSED_METHODS = (m.NO_TRANSFER, m.COMBREL_PLAIN, m.TIMBREL_RANDOM)
 #: The methods differ in the first episodes.
 DIAGNOSED_EPISODES = 25
 
@@ -135,13 +135,19 @@ def selections_at_sample(transfer: Any) -> dict[str, list[str]]:
 
 
 def jobs_of(
-    domain: Domain, setting: str, methods: Sequence[str], sources: Mapping[int, m.Sources], n_episodes: int
+    domain: Domain,
+    setting: str,
+    methods: Sequence[str],
+    sources: Mapping[int, m.Sources],
+    n_episodes: int,
+    arguments: Setting | None = None,
 ) -> list[PaperJob]:
     """Make the jobs of some methods, seed by seed, so that the methods can be compared before all are complete.
 
     :param sources: by seed, of all seeds that the methods are run with
+    :param arguments: how the methods are set, if not as the setting says
     """
-    chosen = domain.settings[setting]
+    chosen = arguments or domain.settings[setting]
     task: dict[str, Any] = {"group": domain.name, "env": domain.target_id, "n_episodes": n_episodes, "setting": setting}
     task["max_episode_steps"] = chosen.max_episode_steps
 
@@ -156,7 +162,8 @@ def jobs_of(
 
 def diagnosis_jobs(domain: Domain, setting: str, sources: Mapping[int, m.Sources], n_episodes: int) -> list[PaperJob]:
     """Make the jobs of the diagnosis, see :func:`jobs_of`: of the episodes at most :data:`DIAGNOSED_EPISODES`."""
-    jobs = jobs_of(domain, setting, DIAGNOSED, sources, min(n_episodes, DIAGNOSED_EPISODES))
+    n_episodes = min(n_episodes, DIAGNOSED_EPISODES)
+    jobs = jobs_of(domain, setting, DIAGNOSED_METHODS, sources, n_episodes, DIAGNOSED)
 
     def at(breadth: float, job: PaperJob) -> PaperJob:
         learner = {**job.learner, "model_breadth": breadth}

@@ -46,7 +46,7 @@ def reproduce(
     """Carry out the runs that a figure or table needs, unless they were carried out before, and make it.
 
     :param target: name of a figure or table, or "all"
-    :param setting: "paper", "explore" or "best"
+    :param setting: "paper" or "best"
     :param runs: of each method; None: as many as in the paper
     :param episodes: of each run; None: 200 for Mountain Car, 300 for the iCub
     :param output: folder for all results; None: ``reproduction/<setting>``

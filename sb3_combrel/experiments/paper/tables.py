@@ -18,7 +18,7 @@ from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baselines import ALGORITHMS, always_reached_from
 from sb3_combrel.experiments.paper.domains import DOMAINS, Domain
 from sb3_combrel.experiments.paper.figures import WINDOW
-from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED, method_at, steps_by_method
+from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED_METHODS, method_at, steps_by_method
 from sb3_combrel.runs.job import Result
 
 #: Minutes that the paper gives for 200 episodes (Table 5).
@@ -139,13 +139,13 @@ def diagnosis_table(results: Sequence[Result]) -> Table:
     steps = steps_by_method(results)
     rows, p_values = [], {}
     for breadth in BREADTHS:
-        none, combrel, random = (steps[method_at(method, breadth)].sum(axis=1).astype(float) for method in DIAGNOSED)
+        none, combrel, random = (steps[method_at(method, breadth)].sum(axis=1).astype(float) for method in DIAGNOSED_METHODS)
         savings = [bootstrap_relative_difference(each, none) for each in (combrel, random)]
         cells = [f"{share_text(-each.value)} ({interval_text(-each.high, -each.low)})" for each in savings]
         p_values[breadth] = p_value_of_difference(combrel, random, "permutation")
         rows.append((f"{breadth:g}", f"{none.mean():,.0f}", *cells))
     savings_of = ("COMBREL saves", "random mappings save", "p (Holm), COMBREL against random")
-    n_runs, n_episodes = steps[method_at(DIAGNOSED[0], BREADTHS[0])].shape
+    n_runs, n_episodes = steps[method_at(DIAGNOSED_METHODS[0], BREADTHS[0])].shape
     title = f"What transfer saves at each breadth of the learner's kernel: {n_episodes} episodes, {n_runs} runs"
     cells_of_p = map(p_text, holm(p_values).values())
     rows = [(*row, p) for row, p in zip(rows, cells_of_p, strict=True)]

@@ -11,7 +11,7 @@ from sb3_combrel.experiments.paper import figures
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.baselines import ALGORITHMS
 from sb3_combrel.experiments.paper.domains import ICUB, MOUNTAIN_CAR
-from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED, method_at
+from sb3_combrel.experiments.paper.jobs import BREADTHS, DIAGNOSED_METHODS, method_at
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +73,7 @@ def test_selection_over_a_plane(tmp_path):
 def test_diagnosis_names_its_own_number_of_episodes(n_runs, tmp_path):
     # Beside the runs of a figure, which have more episodes.
     made = {"no transfer": np.full((2, 200), 300)}
-    made |= {method_at(method, breadth): np.full((n_runs, 6), 300) for method in DIAGNOSED for breadth in BREADTHS}
+    made |= {method_at(method, breadth): np.full((n_runs, 6), 300) for method in DIAGNOSED_METHODS for breadth in BREADTHS}
     figures.draw_diagnosis(made, MOUNTAIN_CAR, tmp_path / "diagnosis")
     check_figure(tmp_path, "diagnosis", "steps in 6 episodes")
 
