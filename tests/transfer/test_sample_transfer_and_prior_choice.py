@@ -255,9 +255,13 @@ def test_variables_are_mirrored_where_that_explains_far_more(own_image, mirrored
     sums = CopySums.zero(len(copies), 3, 3, 2)
     for state, action, effect in zip(np.where(mirrored, 1.0 - states, states), actions.tolist(), effects, strict=True):
         copies.measure(state, action, np.where(mirrored, -effect, effect), sums)
-    chosen = np.unique(prior_choice.choose_factored(copies, sums).copies)
+    choice = prior_choice.choose_factored(copies, sums)
+    chosen = np.unique(choice.copies)
     found = (copies.sign[chosen[chosen >= 0]] < 0.0).any(axis=0)
     np.testing.assert_array_equal(found, (False, False) if own_image else mirrored)
+    # The image that can't be told from it may bound values as well.
+    images = prior_choice.images_of(copies, sums, choice)
+    assert {tuple(sign) for sign in copies.sign[images]} == ({(-1, -1)} if own_image else set())
 
 
 @settings(max_examples=30, deadline=None)
@@ -270,6 +274,22 @@ def test_a_mirrored_copy_is_compared_with_the_best_of_the_same_variables(seed, n
     for c in range(n_copies):
         same = [scores[k] for k in range(n_copies) if not mirrored[k] and (members[k] == members[c]).all()]
         assert found[c] == (scores[c] > 2.0 * max([0.0, *same]))
+
+
+@pytest.mark.parametrize("n_copies", [1, 2])
+def test_images_are_the_same_but_for_signs_and_have_more_than_half_the_evidence(n_copies):
+    mapping, (states, actions, effects) = f.copies_mapping(n_copies), f.walk(f.copies_mapping(n_copies), 60)
+    rows, sign = with_mirrored(copies_of_source(2, 2 * n_copies))
+    copies = Copies([f.oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2, 1.0)
+    sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
+    for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
+        copies.measure(state, action, effect, sums)
+    choice, scores = prior_choice.choose_factored(copies, sums), prior_choice.scores_of(copies, sums)
+    found, chosen = prior_choice.images_of(copies, sums, choice), np.unique(choice.copies[choice.copies >= 0])
+    assert len(chosen) == n_copies and found.sum() == n_copies
+    for c in range(len(copies)):
+        of = [k for k in chosen if k != c and (rows[k] == rows[c]).all()]
+        assert found[c] == any(2.0 * scores[c] > scores[k] for k in of)
 
 
 def test_an_action_that_was_never_taken_has_no_source_action():

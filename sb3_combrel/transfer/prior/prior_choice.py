@@ -12,9 +12,9 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 
 # Divisions are searched subset by subset of the target's variables.
 MAX_FACTORED_VARIABLES = 12
-# Mirrored variables must explain so many times as much as the same variables do as they are. Where a task's effects are their
-# own mirror image, both explain about as much, and only one of them has the goal on the right side.
-MIRRORED_GAIN = 2.0
+# By so many times as much evidence a copy is told apart from its mirror images. Where a task's effects are their own mirror
+# image both explain about as much, and only one of them has the goal on the right side.
+TELLS_APART = 2.0
 
 
 class Choice(NamedTuple):
@@ -62,11 +62,10 @@ def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choic
 def choose_factored(copies: Copies, sums: CopySums) -> Choice:
     """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``.
 
-    Of mirrored copies those alone may be chosen that have :data:`MIRRORED_GAIN` times the evidence of one that is not.
+    Of mirrored copies those alone may be chosen that have :data:`TELLS_APART` times the evidence of one that is not.
     """
-    action, gain = best_actions(copies, sums)
-    taken = sums.n > 0.0
-    scores = np.where(taken, gain, 0.0).sum(axis=1) - taken.sum() * np.log(copies.table.n_actions) - np.log(len(copies))
+    action, _ = best_actions(copies, sums)
+    scores = scores_of(copies, sums)
     members: np.ndarray = copies.state >= 0
     mirrored = np.asarray((copies.sign < 0.0).any(axis=1))
     chosen = best_division(members, np.where(mirrored & ~explains_more(members, mirrored, scores), -np.inf, scores))
@@ -74,16 +73,42 @@ def choose_factored(copies: Copies, sums: CopySums) -> Choice:
     return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), action[chosen].T.copy())
 
 
+def scores_of(copies: Copies, sums: CopySums) -> np.ndarray:
+    """What each copy adds to the evidence for a division, with its best actions, ``equations.division_evidence``."""
+    _, gain = best_actions(copies, sums)
+    taken = sums.n > 0.0
+    cost = taken.sum() * np.log(copies.table.n_actions) + np.log(len(copies))
+    return np.asarray(np.where(taken, gain, 0.0).sum(axis=1) - cost)
+
+
+def images_of(copies: Copies, sums: CopySums, choice: Choice) -> np.ndarray:
+    """Which copies are mirror images of one that is chosen, or the original, that the evidence does not tell apart from it.
+
+    :return: bool, shape (n_copies,)
+    """
+    scores, found = scores_of(copies, sums), np.zeros(len(copies), dtype=np.bool_)
+    for copy in np.unique(choice.copies[choice.copies >= 0]).tolist():
+        images = (copies.state == copies.state[copy]).all(axis=1) & (copies.source == copies.source[copy])
+        found |= images & (TELLS_APART * scores > scores[copy])
+        found[copy] = False
+    return found
+
+
+def variables_of(members: np.ndarray) -> np.ndarray:
+    """A number for the set of variables of each copy, int64; ``members``: bool, shape (n_copies, n_variables)."""
+    return np.asarray(members @ (1 << np.arange(members.shape[1])))
+
+
 def explains_more(members: np.ndarray, mirrored: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Whether copies score :data:`MIRRORED_GAIN` times as much as the best of the same variables that is not mirrored.
+    """Whether copies score :data:`TELLS_APART` times as much as the best of the same variables that is not mirrored.
 
     :param members: the variables of each copy, bool, shape (n_copies, n_variables); ``mirrored``: bool, shape (n_copies,)
     :param scores: of each copy, shape (n_copies,)
     """
-    variables = members @ (1 << np.arange(members.shape[1]))
+    variables = variables_of(members)
     best = np.zeros(1 << members.shape[1])
     np.maximum.at(best, variables[~mirrored], scores[~mirrored])
-    more: np.ndarray = scores > MIRRORED_GAIN * best[variables]
+    more: np.ndarray = scores > TELLS_APART * best[variables]
     return more
 
 
@@ -94,7 +119,7 @@ def best_division(members: np.ndarray, scores: np.ndarray) -> list[int]:
     bool, shape (n_copies, n_variables); ``scores``: of each copy; of variables in no copy it is 0.
     """
     n_variables = members.shape[1]
-    masks = members @ (1 << np.arange(n_variables))
+    masks = variables_of(members)
     # Of the copies of the same variables only the best can be chosen; the first of equal ones.
     best: dict[int, int] = {}
     for copy in np.argsort(-scores, kind="stable").tolist():
@@ -131,7 +156,7 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
     """
     members = copies.state >= 0
     n_variables = members.shape[1]
-    masks = (members @ (1 << np.arange(n_variables))).tolist()
+    masks = variables_of(members).tolist()
     ways = _count_divisions(masks, n_variables)
     taken, chosen = 0, []
     while taken < (1 << n_variables) - 1:

@@ -16,13 +16,11 @@ from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
-from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
+from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, images_of
 from sb3_combrel.transfer.prior.prior_history import PriorHistory
-from sb3_combrel.transfer.prior.value_bound import ValueBound
+from sb3_combrel.transfer.prior.value_bound import Episode, ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
-#: States, rewards and effects.
-Episode = list[tuple[np.ndarray, float, np.ndarray]]
 # Rounding, in unit coordinates: a transition begins where the one before it led.
 SAME_STATE = 1e-9
 # So many transitions are compared with what all copies predict; of later ones one in so many.
@@ -84,6 +82,8 @@ class SourcePrior:
         self._episodes: defaultdict[int, Episode] = defaultdict(list)
         #: Whether the mapping in use explains all target actions, as last renewed; a given one does until it is shown not to.
         self.explains = isinstance(choose, Choice)
+        #: Mirror images that the evidence does not tell from the choice's copies, as last renewed, bool, shape (n_copies,).
+        self.images = np.zeros(len(copies), dtype=np.bool_)
         #: By how much a return that was seen exceeds what the source bounds it by.
         self.excess = 0.0
         self.transitions = RecordedTransitions(task.n_variables)
@@ -183,7 +183,7 @@ class SourcePrior:
     def _bound(self) -> np.ndarray | None:
         if self.choice is None or not self.transfer_terminals or not self.explains:
             return None
-        return self._value_bound.through(self.choice)
+        return self._value_bound.through(self.choice, self.images)
 
     def _explains(self) -> bool:
         """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
@@ -212,7 +212,7 @@ class SourcePrior:
         # What follows a time limit may cost more than was gained until then.
         complete = not truncated or all(reward >= 0.0 for _, reward, _ in episode)
         if episode and complete and self.choice is not None and self._bound() is not None:
-            excess = self._value_bound.excess(self.choice, episode)
+            excess = self._value_bound.excess(self.choice, episode, self.images)
             if excess > self.excess:
                 self.excess, self.version = excess, self.version + 1
         if self.version > version:
@@ -233,6 +233,8 @@ class SourcePrior:
         if self.choice is not None:
             self.evidence.renew()
             self.explains = self._explains()
+            if self.choose is not None and self.n_observed <= self.max_transitions:
+                self.images = images_of(self.copies, self.sums, self.choice)
             self.version += 1
 
     def _set_choice(self, choice: Choice) -> None:
@@ -318,6 +320,7 @@ class SourcePrior:
             "transitions": self.transitions.rows(),
             "prior_choice": chosen.ravel(),
             "prior_evidence": np.append(self.evidence.get_state(), self.excess),
+            "prior_images": self.images.astype(np.float64),
             "prior_episodes": self._episode_rows(),
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": self.errors.sums.ravel().copy(),
@@ -346,6 +349,7 @@ class SourcePrior:
         self._renewal_due, self._warned, self.explains = due, warned > 0.5, explains > 0.5
         self.evidence.set_state(state["prior_evidence"][:-1])
         self.excess = float(state["prior_evidence"][-1])
+        self.images = state["prior_images"] > 0.5
         self._episodes.clear()
         for row in state["prior_episodes"]:
             self._episodes[int(row[0])].append((row[1 : d + 1].copy(), float(row[d + 1]), row[d + 2 :].copy()))
