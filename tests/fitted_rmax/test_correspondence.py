@@ -70,8 +70,8 @@ def test_a_source_fits_a_target_whose_scales_are_finer_than_its_bounds(make, tmp
     scaling, seen = model.policy.scaling, model.transfer.task.scaling
     assert scaling.high[0] - scaling.low[0] < 4.0
     np.testing.assert_array_equal((seen.low[0], seen.high[0]), (-20.0, 20.0))
-    assert model.transfer.region_errors.task is model.transfer.task
-    assert model.transfer.statistics()["transfer/prediction_error"] < 0.05
+    assert model.transfer.region_errors.task.scaling == seen
+    assert model.transfer.statistics()["transfer/prediction_error"] < 0.1
     model.save(tmp_path / "wide")
     assert same_parameters(model, FittedRMax.load(tmp_path / "wide"))
 
