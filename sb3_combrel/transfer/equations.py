@@ -365,6 +365,25 @@ def evidence(effects: Floats, predicted: Floats, scales: Floats, weights: Floats
     return (weights / (1.0 + weights))[:, None] * np.log(ratio)
 
 
+def foretold_ends(ends: Floats, weights: Floats, rate: float) -> Floats:
+    """Compute how probable a source makes it that transitions end an episode.
+
+    The mean of the beta distribution that starts out worth one transition and is as high as the source's rate of ends.
+
+    :param ends: share of the source's instances near each transition that ended, shape (t,); ``weights``: of them, shape (t,)
+    :param rate: share of all the source's instances that ended
+    """
+    return (weights * ends + rate) / (weights + 1.0)
+
+
+def ends_evidence(ended: Bools, foretold: Floats) -> float:
+    """Compute the logarithm of how probable it was that of t transitions those ended an episode that did, and no others.
+
+    :param ended: shape (t,); ``foretold``: how probable it was of each, shape (t,), neither 0 nor 1
+    """
+    return float(np.log(np.where(ended, foretold, 1.0 - foretold)).sum())
+
+
 def division_evidence(of_copies: Sequence[Floats], actions: Ints, n_source_actions: Sequence[int], n_copies: int) -> float:
     """Compute the evidence for a division of the target's variables into copies of the source, against "all of them stay".
 

@@ -103,29 +103,6 @@ def test_of_several_copies_the_one_that_is_worth_least_bounds_the_target():
     assert (found < one).any() and (found < two).any()
 
 
-def test_of_a_copy_and_its_mirror_image_the_one_that_is_worth_more_bounds_the_target():
-    """The first two are of one variable, as it is and mirrored; so are the others, of another variable."""
-    state, sign = [[0, -1], [0, -1], [-1, 0], [-1, 0]], [[1, 1], [-1, 1], [1, 1], [1, -1]]
-    target = task(2)
-    bounds = value_bound([line_source()], target, state, sign)
-    one, one_mirrored, other, other_mirrored = (bounds.through(all_of(copy)) for copy in range(4))
-    assert (one != one_mirrored).any()
-
-    def through(*images):
-        return bounds.through(all_of(0, 2), np.isin(np.arange(4), images))
-
-    np.testing.assert_array_equal(through(), np.minimum(one, other))
-    np.testing.assert_array_equal(through(1), np.minimum(np.maximum(one, one_mirrored), other))
-    either = np.minimum(np.maximum(one, one_mirrored), np.maximum(other, other_mirrored))
-    np.testing.assert_array_equal(through(1, 3), either)
-    # A return that only the mirrored one explains exceeds the bound without it by as much as the two differ.
-    for at in (0.3, 0.7):
-        episode = [(np.array([at, 0.5]), -1.0, np.zeros(2))]
-        alone, both = bounds.excess(all_of(0), episode), bounds.excess(all_of(0), episode, np.arange(4) == 1)
-        np.testing.assert_allclose(alone, max(0.0, -1.0 - best_return(at)), atol=2.5)
-        np.testing.assert_allclose(both, max(0.0, -1.0 - max(best_return(at), best_return(1.0 - at))), atol=2.5)
-
-
 @pytest.mark.parametrize("rewards", [(-1.0, -2.0), (1.0, 1.0), (np.linspace(-1.0, -2.0, 400), -1.0)])
 def test_nothing_bounds_several_copies_whose_steps_do_not_cost_the_same(rewards):
     sources = [line_source(reward=reward) for reward in rewards]

@@ -88,6 +88,11 @@ class Copies:
     def __len__(self) -> int:
         return len(self.source)
 
+    def is_whole(self, copy: int) -> bool:
+        """Whether a copy has all variables of its source."""
+        variables = self.state[copy]
+        return len(np.unique(variables[variables >= 0])) == self.sources[self.source[copy]].n_variables
+
     def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums) -> None:
         """Add a target transition to the sums."""
         _add_transition.call(self.model.plain, self._plain_table, (state, action, effect), tuple(sums), self._scratch)

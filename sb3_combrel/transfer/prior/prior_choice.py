@@ -81,17 +81,12 @@ def scores_of(copies: Copies, sums: CopySums) -> np.ndarray:
     return np.asarray(np.where(taken, gain, 0.0).sum(axis=1) - cost)
 
 
-def images_of(copies: Copies, sums: CopySums, choice: Choice) -> np.ndarray:
-    """Which copies are mirror images of one that is chosen, or the original, that the evidence does not tell apart from it.
-
-    :return: bool, shape (n_copies,)
-    """
-    scores, found = scores_of(copies, sums), np.zeros(len(copies), dtype=np.bool_)
-    for copy in np.unique(choice.copies[choice.copies >= 0]).tolist():
-        images = (copies.state == copies.state[copy]).all(axis=1) & (copies.source == copies.source[copy])
-        found |= images & (TELLS_APART * scores > scores[copy])
-        found[copy] = False
-    return found
+def images_of(copies: Copies, sums: CopySums, copy: int) -> list[int]:
+    """Find the mirror images of a copy, the original among them, that the effects' evidence does not tell apart from it."""
+    scores = scores_of(copies, sums)
+    images = (copies.state == copies.state[copy]).all(axis=1) & (copies.source == copies.source[copy])
+    images[copy] = False
+    return np.flatnonzero(images & (TELLS_APART * scores > scores[copy])).tolist()
 
 
 def variables_of(members: np.ndarray) -> np.ndarray:

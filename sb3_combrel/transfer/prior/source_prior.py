@@ -15,8 +15,9 @@ from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, Re
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
+from sb3_combrel.transfer.prior.image_ends import best_ending
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
-from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, images_of
+from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
 from sb3_combrel.transfer.prior.prior_history import PriorHistory
 from sb3_combrel.transfer.prior.value_bound import Episode, ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
@@ -82,8 +83,8 @@ class SourcePrior:
         self._episodes: defaultdict[int, Episode] = defaultdict(list)
         #: Whether the mapping in use explains all target actions, as last renewed; a given one does until it is shown not to.
         self.explains = isinstance(choose, Choice)
-        #: Mirror images that the evidence does not tell from the choice's copies, as last renewed, bool, shape (n_copies,).
-        self.images = np.zeros(len(copies), dtype=np.bool_)
+        #: The mapping in use; of copies that effects do not tell from their mirror images, those that foretell ends best.
+        self.bounding: Choice | None = None
         #: By how much a return that was seen exceeds what the source bounds it by.
         self.excess = 0.0
         self.transitions = RecordedTransitions(task.n_variables)
@@ -181,9 +182,9 @@ class SourcePrior:
         return None if bound is None else bound + self.excess
 
     def _bound(self) -> np.ndarray | None:
-        if self.choice is None or not self.transfer_terminals or not self.explains:
+        if self.bounding is None or not self.transfer_terminals or not self.explains:
             return None
-        return self._value_bound.through(self.choice, self.images)
+        return self._value_bound.through(self.bounding)
 
     def _explains(self) -> bool:
         """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
@@ -211,8 +212,9 @@ class SourcePrior:
         episode = self._episodes.pop(self.environment, [])
         # What follows a time limit may cost more than was gained until then.
         complete = not truncated or all(reward >= 0.0 for _, reward, _ in episode)
-        if episode and complete and self.choice is not None and self._bound() is not None:
-            excess = self._value_bound.excess(self.choice, episode, self.images)
+        self._renew_bounding()
+        if episode and complete and self.bounding is not None and self._bound() is not None:
+            excess = self._value_bound.excess(self.bounding, episode)
             if excess > self.excess:
                 self.excess, self.version = excess, self.version + 1
         if self.version > version:
@@ -226,6 +228,7 @@ class SourcePrior:
                 self._set_choice(choice)
                 self._replay()
                 self.version += 1
+        self._renew_bounding()
         self._renew_evidence()
         self.history.note(self)
 
@@ -233,12 +236,18 @@ class SourcePrior:
         if self.choice is not None:
             self.evidence.renew()
             self.explains = self._explains()
-            if self.choose is not None and self.n_observed <= self.max_transitions:
-                self.images = images_of(self.copies, self.sums, self.choice)
             self.version += 1
 
+    def _renew_bounding(self) -> None:
+        """Find anew which mirror images bound values; another bound has not been exceeded."""
+        if self.choice is None or self.choose is None or self.n_observed > self.max_transitions:
+            return
+        bounding = best_ending(self.copies, self.sums, self.choice, self.transitions)
+        if not bounding.same(self.bounding):
+            self.bounding, self.excess, self.version = bounding, 0.0, self.version + 1
+
     def _set_choice(self, choice: Choice) -> None:
-        self.choice = choice
+        self.choice = self.bounding = choice
         self._used = self.copies.uses(*choice)
         self._work_space = self.copies.work_space(self._used)
         self._stored.clear()
@@ -310,17 +319,16 @@ class SourcePrior:
         return self.candidates.uses()
 
     def get_state(self) -> dict[str, np.ndarray]:
-        chosen, n_slots = np.full((3, self.task.n_actions, self.task.n_variables), -1.0), 0
-        if self.choice is not None:
+        chosen, n_slots = np.full((4, self.task.n_actions, self.task.n_variables), -1.0), 0
+        if self.choice is not None and self.bounding is not None:
             chosen[0], n_slots = 0.0, self.choice.copies.shape[1]
-            for row, array in zip(chosen[1:], self.choice, strict=True):
+            for row, array in zip(chosen[1:], (*self.choice, self.bounding.copies), strict=True):
                 row[:, : array.shape[1]] = array
         figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, n_slots, self.explains
         return {
             "transitions": self.transitions.rows(),
             "prior_choice": chosen.ravel(),
             "prior_evidence": np.append(self.evidence.get_state(), self.excess),
-            "prior_images": self.images.astype(np.float64),
             "prior_episodes": self._episode_rows(),
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": self.errors.sums.ravel().copy(),
@@ -340,16 +348,17 @@ class SourcePrior:
         for name, array in self.sums._asdict().items():
             array.ravel()[:] = state[f"prior_sums_{name}"]
         observed, switches, version, due, warned, n_slots, explains = state["prior_figures"].tolist()
-        chosen = state["prior_choice"].reshape(3, n_actions, d)[:, :, : int(n_slots)].astype(np.int64)
+        chosen = state["prior_choice"].reshape(4, n_actions, d)[:, :, : int(n_slots)].astype(np.int64)
         if state["prior_choice"][0] >= 0.0:
             copies = np.clip(chosen[1], -1, len(self.copies) - 1)
             most = np.where(copies >= 0, self.copies.table.n_actions[copies] - 1, -1)
-            self._set_choice(Choice(copies, np.minimum(chosen[2], most)))
+            actions = np.minimum(chosen[2], most)
+            self._set_choice(Choice(copies, actions))
+            self.bounding = Choice(np.clip(chosen[3], -1, len(self.copies) - 1), actions)
         self.n_observed, self.n_switches, self.version = int(observed), int(switches), int(version)
         self._renewal_due, self._warned, self.explains = due, warned > 0.5, explains > 0.5
         self.evidence.set_state(state["prior_evidence"][:-1])
         self.excess = float(state["prior_evidence"][-1])
-        self.images = state["prior_images"] > 0.5
         self._episodes.clear()
         for row in state["prior_episodes"]:
             self._episodes[int(row[0])].append((row[1 : d + 1].copy(), float(row[d + 1]), row[d + 2 :].copy()))

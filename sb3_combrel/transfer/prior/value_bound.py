@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,8 +30,7 @@ class ValueBound:
     The source's values are those of Fitted R-Max's planning with its local linear model: where it has no data to speak of (a
     weight below ``LEAST_WEIGHT``), a pair is worth ``max_value``. Actions that no instance has taken are left out: they would
     be worth that everywhere, and so would every state. A target of several copies ends when all of them have ended:
-    if every step costs the same, the least of their values bounds it. Otherwise nothing is said of several. Where the evidence
-    does not tell a copy from its mirror image, the larger of their values bounds that of the target.
+    if every step costs the same, the least of their values bounds it. Otherwise nothing is said of several.
 
     A bound is contradicted by one thing only: a return to go that exceeds it, see :meth:`excess`.
     """
@@ -49,44 +47,33 @@ class ValueBound:
         self._planners: dict[int, Planner] = {}
         self._of_copy: dict[int, np.ndarray] = {}
 
-    def through(self, choice: Choice, images: np.ndarray | None = None) -> np.ndarray | None:
+    def through(self, choice: Choice) -> np.ndarray | None:
         """Bound the values of all states of the target's sample, shape (n_points,).
 
         None if nothing bounds them: if actions are taken for those of different copies or for some that the source's instances
         lack, no copy has all variables of its source, or several copies do not cost the same at every step.
-
-        :param images: mirror images that the evidence does not tell from the choice's copies, bool, shape (n_copies,)
         """
         used = choice.copies[0][choice.copies[0] >= 0].tolist()
         if not self._copies.taken[choice.copies, choice.actions][(choice.copies >= 0) & (choice.actions >= 0)].all():
             return None
         if not (choice.copies == choice.copies[0]).all() or (len(used) > 1 and not self._costs_are_alike(used)):
             return None
-        groups = self._groups(used, images)
-        bounds = [np.maximum.reduce([self._bound(copy) for copy in group]) for group in groups]
+        bounds = [self._bound(copy) for copy in used if self._copies.is_whole(copy)]
         return np.minimum.reduce(bounds) if bounds else None
 
-    def _groups(self, used: Sequence[int], images: np.ndarray | None) -> list[list[int]]:
-        """Each copy in use that has all variables of its source, with its images."""
-        state, whole = self._copies.state, [copy for copy in used if self._is_whole(copy)]
-        if images is None:
-            return [[copy] for copy in whole]
-        return [[copy, *np.flatnonzero(images & (state == state[copy]).all(axis=1)).tolist()] for copy in whole]
-
-    def excess(self, choice: Choice, episode: Episode, images: np.ndarray | None = None) -> float:
+    def excess(self, choice: Choice, episode: Episode) -> float:
         """Return by how much the returns to go of an episode exceed what the source's values bound them by, at least 0.
 
         Within a cell of the source's grid a value is no more than the largest at its corners.
 
-        :param choice: that bounds values; ``images``: see :meth:`through`
+        :param choice: that bounds values
         :param episode: states, unit coordinates, rewards and effects
         """
         states, returns, to_go = np.array([state for state, *_ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
             returns[i] = to_go = episode[i][1] + self._gamma * to_go
-        bounds = np.full(len(episode), np.inf)
-        for group in self._groups(choice.copies[0][choice.copies[0] >= 0].tolist(), images):
-            bounds = np.minimum(bounds, np.maximum.reduce([self._bound_in_cells(copy, states) for copy in group]))
+        used = choice.copies[0][choice.copies[0] >= 0].tolist()
+        bounds = np.minimum.reduce([self._bound_in_cells(copy, states) for copy in used if self._copies.is_whole(copy)])
         return float((returns - bounds).max(initial=0.0))
 
     def _bound_in_cells(self, copy: int, states: np.ndarray) -> np.ndarray:
@@ -99,11 +86,6 @@ class ValueBound:
     def _costs_are_alike(self, used: list[int]) -> bool:
         rewards = np.concatenate([self._copies.sources[self._copies.source[copy]].rewards for copy in used])
         return bool(rewards.max() <= 0.0 and rewards.max() - rewards.min() <= 1e-9)
-
-    def _is_whole(self, copy: int) -> bool:
-        """Whether a copy has all variables of its source."""
-        variables = self._copies.state[copy]
-        return len(np.unique(variables[variables >= 0])) == self._copies.sources[self._copies.source[copy]].n_variables
 
     def _bound(self, copy: int) -> np.ndarray:
         """The source's value at the state that each state of the target's sample is in a copy."""
