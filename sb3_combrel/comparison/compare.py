@@ -111,7 +111,8 @@ def compare(
     :param n_jobs: runs at a time, each in a process of its own; 1: one after the other in this process; None: one a core.
         Results do not depend on it.
     :param progress_bar: show which runs are complete; None: in a terminal or notebook
-    :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from there
+    :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from
+        there. Where the source of the environment's class or function, or that of a method's class, has changed, it is refused
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
     :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument

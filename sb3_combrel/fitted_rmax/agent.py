@@ -71,6 +71,9 @@ class FittedRMaxAgent:
         warn_if_long(self.workload, self.grid)
         self.rewards = RewardRange(settings.gamma, settings.max_value)
         self.n_sweeps = 0
+        #: Whether it has learned from what it has done itself.
+        self.has_acted = False
+        self._cautious: np.ndarray | None = None
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
         #: Whether to measure the time of planning, which takes some itself.
@@ -144,7 +147,8 @@ class FittedRMaxAgent:
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
             first. Otherwise the best of the actions that are known, or else modelled with transferred instances; where a
-            source bounds the values, of all.
+            source bounds the values, of all. An agent that has been given transitions, but has made none itself, keeps to
+            what they show.
         :param environment: in learning, the number of the environment, for a transfer method that decides actions
         :return: the action, from 0 on
         :raises ValueError: if a transfer method decides on something that is no action
@@ -182,14 +186,24 @@ class FittedRMaxAgent:
         return chosen
 
     def _exploit(self, state: np.ndarray) -> int:
-        """The best of what is known: nobody has seen what the others do."""
-        prediction = self._evaluate(state)
+        """The best of what is known: nobody has seen what the others do.
+
+        By the learner's own values; of an agent that has only been given others' transitions by values without optimism, as it
+        has not tried what it hopes for.
+        """
+        prediction = self._evaluate(state, None if self.has_acted else self._values_without_optimism())
         eligible = prediction.weight >= self.model.exploration_threshold
         if not eligible.any():
             eligible = prediction.modelled
-        if self.planner.is_bounded or not eligible.any():
+        if (self.planner.is_bounded and self.has_acted) or not eligible.any():
             return int(self._q.q.argmax())
         return int(np.where(eligible, self._q.q, -np.inf).argmax())
+
+    def _values_without_optimism(self) -> np.ndarray | None:
+        """Values at the grid points of what is known alone; None if nothing is."""
+        if self._cautious is None and self.mdp.arrays.modelled.any():
+            self._cautious = self.planner.cautious_values(SWEEPS_AT_EPISODE_END)
+        return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:
         """Choose an action as in learning, optimistic ones first, but for a prediction: it does not change what is learned."""
@@ -229,6 +243,7 @@ class FittedRMaxAgent:
         :param environment: see :meth:`act`
         """
         with self._lock:
+            self.has_acted = True
             self.rewards.note(reward, terminated)
             self._widen(reward)
             if self.transfer is not None:
@@ -338,6 +353,7 @@ class FittedRMaxAgent:
         self._outdated.clear()
         self._search()
         self.n_sweeps += self.planner.sweep(max_sweeps)
+        self._cautious = None
         if began is not None:
             self.planning_seconds += perf_counter() - began
 
@@ -389,6 +405,7 @@ class FittedRMaxAgent:
                 **self.model.get_state(),
                 "values": self.planner.values.copy(),
                 "lowest_value": np.array([self.planner.bounds[0]]),
+                "has_acted": np.array([float(self.has_acted)]),
                 "rewards": self.rewards.get_state(),
                 "promises": self.promises.rows(),
             }
@@ -412,6 +429,7 @@ class FittedRMaxAgent:
             self.planner.restore(state["values"])
             self._search()
             self.promises.restore(state["promises"])
+            self.has_acted, self._cautious = bool(state["has_acted"][0] > 0.5), None
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""

@@ -235,6 +235,8 @@ class FittedRMax(PastData):
 
     def _check_arguments(self) -> None:
         """Refuse what the policy does not check before anything is built."""
+        if not hasattr(self, "action_space"):
+            raise ValueError('env is missing: FittedRMax(env), an environment or its id, "MountainCar-v0"')
         check_actions(self.action_space)
         check_count("seed", self.seed, min=0, max=MAX_SEED, none_allowed=True)
         check_count("stats_window_size", self._stats_window_size)
@@ -305,7 +307,12 @@ class FittedRMax(PastData):
         states = self._last_states
         choices = [self.agent.act(state, environment=e) for e, state in enumerate(states)]
         actions = np.array(choices) + self.policy._first_action
-        new_obs, rewards, dones, infos = self.env.step(actions)
+        try:
+            new_obs, rewards, dones, infos = self.env.step(actions)
+        except BaseException:
+            # An interrupt, or a simulator's error: where the environment is now nobody knows. The next ``learn`` resets it.
+            self._last_obs = None
+            raise
         self.num_timesteps += self.env.num_envs
         self._update_info_buffer(infos, dones)
         raw_rewards = self._raw_rewards(rewards)

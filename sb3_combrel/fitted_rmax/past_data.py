@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import reprlib
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
+from sb3_combrel.sources.recipes import is_table
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.sources.transitions import describe_origin
 
@@ -122,12 +124,12 @@ class PastData(SavedAlgorithm):
         return found
 
     def _read_file(self, path: Path, names: dict[str, Any]) -> SourceInstances:
-        if path.suffix.lower() in (".pkl", ".pickle"):
+        if path.suffix.lower() in (".pkl", ".pickle") and path.is_file():
             raise ValueError(
                 f"{path} is a pickle, which may run any program when it is read: if you trust it, read it with "
                 "stable_baselines3.common.save_util.load_from_pkl, and pass the replay buffer"
             )
-        if path.suffix.lower() in (".csv", ".txt") or path.name.lower().endswith((".csv.gz", ".csv.zip")):
+        if is_table(path):
             return SourceInstances.from_table(path, **names)
         if path.suffix.lower() == ".zip":
             return type(self).load(path).source_instances()
@@ -152,8 +154,20 @@ class PastData(SavedAlgorithm):
                 f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
             )
-        columns = _order(found.state_names, tuple(task.state_names), "state variables", other)
-        numbers = _order(tuple(task.action_names), found.action_names, "actions", other)
+        names = found.state_names, tuple(task.state_names)
+        lacking = [name for name in names[1] if name not in names[0]]
+        if not lacking or any(map(_are_numbered, names)):
+            columns = np.arange(len(names[1])) if lacking else np.array([names[0].index(name) for name in names[1]])
+        else:
+            raise ValueError(f"instances must have the state variables {names[1]}, got {names[0]}, without {lacking}{other}")
+        if lacking and not all(map(_are_numbered, names)):
+            as_what = ", ".join(f"{given} as {own}" for given, own in zip(*names, strict=True))
+            warnings.warn(
+                f"state variables of the instances have other names than the task's and are taken in their order: {as_what}",
+                stacklevel=3,
+            )
+        self._check_units(found.states, columns)
+        numbers = _numbers_of_actions(found.action_names, tuple(task.action_names), other)
         return replace(
             found,
             states=found.states[:, columns],
@@ -167,20 +181,32 @@ class PastData(SavedAlgorithm):
             periodic=tuple(np.array(found.periodic)[columns].tolist()),
         )
 
+    def _check_units(self, states: np.ndarray, columns: np.ndarray) -> None:
+        """Refuse states that lie farther beyond the observation space than it is wide: they are in other units, or damaged."""
+        task, periodic = self.policy.agent.task, self.policy.agent.periodic
+        low, high = (np.asarray(side, dtype=np.float64) for side in StateScaling.limits_of(self.observation_space, None))
+        for k, name in enumerate(task.state_names):
+            least, most, width = states[:, columns[k]].min(), states[:, columns[k]].max(), high[k] - low[k]
+            if not periodic[k] and (least < low[k] - width or most > high[k] + width):
+                raise ValueError(
+                    f"instances must be in the units of the task, got {name} from {least:.4g} to {most:.4g}; the observation "
+                    f"space has it from {low[k]:.4g} to {high[k]:.4g}"
+                )
+
 
 def _are_numbered(names: Sequence[str]) -> bool:
     """Whether names are those that are given where a task has none: s0, s1, ... or a0, a1, ..."""
     return all(name[1:] == str(k) for k, name in enumerate(names))
 
 
-def _order(given: tuple[str, ...], wanted: tuple[str, ...], what: str, other: str) -> np.ndarray:
-    """Where each wanted name is among those given; in their own order where one side has no names of its own."""
-    if _are_numbered(given) or _are_numbered(wanted) or given[: len(wanted)] == wanted:
-        return np.arange(len(wanted))
-    missing = [name for name in wanted if name not in given]
-    if missing:
-        raise ValueError(f"instances must have the {what} {wanted if what[0] == 's' else given}, got others: {missing}{other}")
-    return np.array([given.index(name) for name in wanted])
+def _numbers_of_actions(given: tuple[str, ...], own: tuple[str, ...], other: str) -> np.ndarray:
+    """The task's number of each given action; the same where one side has no names of its own."""
+    if _are_numbered(given) or _are_numbered(own):
+        return np.arange(len(given))
+    unknown = [name for name in given if name not in own]
+    if unknown:
+        raise ValueError(f"instances must have the actions {own}, or some of them, got {given}, with {unknown}{other}")
+    return np.array([own.index(name) for name in given])
 
 
 def _of_buffer(buffer: ReplayBuffer, task: Task) -> SourceInstances:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -68,6 +69,7 @@ class FittedRMaxPolicy(BasePolicy):
         self._first_action = int(action_space.start)
         self._settings = settings
         self._model_class = model_class
+        self._warned_beyond_space = False
 
     def _renew_to_unit(self) -> None:
         #: Observations, raw units, to unit coordinates; what is outside fixed bounds is moved to the boundary, or wrapped.
@@ -98,9 +100,23 @@ class FittedRMaxPolicy(BasePolicy):
             return False
         scaling = self.scales.renewed(episode_ended)
         if scaling is not None:
+            self._warn_beyond_space()
             self.agent.rescale(scaling, self.scales.bounds)
             self._renew_to_unit()
         return scaling is not None
+
+    def _warn_beyond_space(self) -> None:
+        beyond = np.flatnonzero(self.scales.beyond_space()).tolist()
+        if self._warned_beyond_space or not beyond:
+            return
+        self._warned_beyond_space = True
+        least, most, names = *self.scales.observed, self.agent.task.state_names
+        seen = ", ".join(f"{names[k]} from {least[k]:.4g} to {most[k]:.4g}" for k in beyond)
+        space = ", ".join(f"from {self.scales.low[k]:.4g} to {self.scales.high[k]:.4g}" for k in beyond)
+        warnings.warn(
+            f"observations are outside the observation space: {seen}, but the space says {space}; they are taken as they are",
+            stacklevel=4,
+        )
 
     @property
     def transfer(self) -> Any:

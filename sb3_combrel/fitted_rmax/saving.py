@@ -189,10 +189,13 @@ def _other_version(path: object) -> str:
     """Say that the file of a model was saved by another version of this package, if so."""
     try:
         with zipfile.ZipFile(path) as archive:  # type: ignore[call-overload]
-            version = json.loads(archive.read("data")).get("package_version", "before 0.2")
+            data = json.loads(archive.read("data"))
+            version, policy = data.get("package_version", "before 0.2"), data.get("policy_class", {}).get("__module__", "")
     except Exception:
         # Damaged content makes libraries raise anything; then nothing is known.
         return ""
+    if policy and not policy.startswith(f"{__name__.partition('.')[0]}."):
+        return f"; it is a model of another algorithm, of {policy}: load it with its own class"
     same = version == __version__
     return "" if same else f"; it was saved by sb3_combrel {version}, which can load it, and this is {__version__}"
 

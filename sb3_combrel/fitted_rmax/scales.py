@@ -68,10 +68,19 @@ class FoundScales:
         # A single observation has no range.
         around = np.where(used > 0.0, 0.0, 0.5 * given)
         wanted_low, wanted_high = around_zero(least - around, most + around)
-        low = np.where(renewed, np.maximum(wanted_low, self.low), low)
-        high = np.where(renewed, np.minimum(wanted_high, self.high), high)
+        # No farther than the space allows, unless an observation lies beyond that.
+        low = np.where(renewed, np.maximum(wanted_low, np.minimum(self.low, least)), low)
+        high = np.where(renewed, np.minimum(wanted_high, np.maximum(self.high, most)), high)
         self.scaling = StateScaling(low, high)
         return self.scaling
+
+    def beyond_space(self) -> np.ndarray:
+        """Which variables have been observed outside the observation space, bool, shape (n_variables,)."""
+        least, most = self.observed
+        with np.errstate(invalid="ignore"):  # nothing is beyond a space without bounds
+            tolerated = np.nan_to_num(BEYOND * (self.high - self.low), posinf=0.0)
+        beyond: np.ndarray = self._found & ((least < self.low - tolerated) | (most > self.high + tolerated))
+        return beyond
 
     def get_state(self) -> np.ndarray:
         """Bounds in use and range of the observations, float64, shape (4 * n_variables,), for :meth:`set_state`."""

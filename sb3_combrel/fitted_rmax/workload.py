@@ -7,7 +7,7 @@ import warnings
 from typing import NamedTuple
 
 from sb3_combrel.models.base import ModelSettings
-from sb3_combrel.planning.grid import StateGrid
+from sb3_combrel.planning.grid import MAX_VARIABLES, StateGrid
 
 # In seconds, without and with transfer: for each state-action pair until the first step, and for each grid point that an
 # instance reaches in a step.
@@ -15,7 +15,6 @@ SETUP_OF_PAIR = (1e-6, 1e-5)
 STEP_OF_POINT = (7e-7, 4e-6)
 
 LONG_SETUP_SECONDS = 5.0
-MAX_VARIABLES = 6
 LONG_STEP_SECONDS = 0.05
 
 
@@ -53,7 +52,7 @@ def warn_if_long(work: Workload, grid: StateGrid) -> None:
             "learned in fewer steps; for more there are DQN and PPO of Stable-Baselines3",
             stacklevel=6,
         )
-    if work.setup_seconds > LONG_SETUP_SECONDS or work.step_seconds > LONG_STEP_SECONDS:
+    elif work.setup_seconds > LONG_SETUP_SECONDS or work.step_seconds > LONG_STEP_SECONDS:
         warnings.warn(
             f"resolution={list(grid.resolution)} means {work}; a lower resolution takes less time, each number less by one "
             "about half",

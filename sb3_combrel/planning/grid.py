@@ -223,6 +223,8 @@ def coarsest_in_reach(n_variables: int, reach: float) -> int:
 BYTES_PER_PAIR = 1000
 BYTES_PER_POINT = 200
 MAX_PAIRS_BY_DEFAULT = 1_000_000
+# Of more state variables than these a grid is coarse in any case.
+MAX_VARIABLES = 6
 
 
 def fitting_grid(
@@ -255,7 +257,8 @@ def fitting_grid(
             f"points and about {size / 2**30:,.1f} GiB of memory, more than half of what this machine has; "
             f"resolution={fits} fits"
         )
-    _warn_if_too_coarse(n_variables, resolution, reach, model_breadth)
+    if n_variables <= MAX_VARIABLES:
+        _warn_if_too_coarse(n_variables, resolution, reach, model_breadth)
     return StateGrid(n_variables, resolution, margin, periodic)
 
 

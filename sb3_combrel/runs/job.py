@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import re
 import time
 import warnings
@@ -15,7 +16,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
@@ -31,6 +32,8 @@ TransferLike = Transfer | dict[str, Any] | str | None
 UNLIMITED = 10**9
 # Limit of the episodes of a run that is made for compiling: some must end.
 _COMPILED_EPISODE = 30
+# What is in these changes with their versions.
+OURS = ("sb3_combrel", "combrel_envs", "gymnasium", "stable_baselines3")
 # What this process has learnt before.
 _compiled: set[tuple[str, str]] = set()
 
@@ -193,7 +196,8 @@ def chosen_on_purpose() -> Iterator[None]:
 def described(value: Any) -> Any:
     """Return as JSON: functions by name and arguments, transfers by arguments, arrays by digest, others by repr.
 
-    Of a lambda the names and constants count, as it has no name that tells it from others.
+    Functions and classes that are not this package's have a digest of their source behind their name. Of a lambda the names
+    and constants count, as it has no name that tells it from others.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -215,15 +219,23 @@ def described(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _digest(value)
     if isinstance(value, EnvSpec):
-        return described(vars(value))
+        return {**described(vars(value)), "entry_point": described(_creator(value))}
     if isinstance(value, FunctionType) and value.__name__ == "<lambda>":
-        return {_name_of(value): _content_of(value)}
+        return {f"{value.__module__}.{value.__qualname__}": _content_of(value)}
     if callable(value) and hasattr(value, "__qualname__"):
         return _name_of(value)
     if type(value).__repr__ is object.__repr__:
         return _name_of(type(value))
     # Another process has the same objects elsewhere.
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+def _creator(spec: EnvSpec) -> Any:
+    """The class or function of an environment, or its name where it cannot be imported."""
+    try:
+        return load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    except (ImportError, AttributeError, ValueError):
+        return spec.entry_point
 
 
 def _content_of(function: FunctionType) -> list[Any]:
@@ -234,7 +246,15 @@ def _content_of(function: FunctionType) -> list[Any]:
 
 
 def _name_of(defined: Any) -> str:
-    return f"{defined.__module__}.{defined.__qualname__}"
+    """Module and name; and a digest of the source, if there is any, where this package's version says nothing of it."""
+    name = f"{defined.__module__}.{defined.__qualname__}"
+    if name.partition(".")[0] in OURS:
+        return name
+    try:
+        source = inspect.getsource(defined)
+    except (OSError, TypeError):
+        return name
+    return f"{name} {hashlib.sha256(source.encode()).hexdigest()[:8]}"
 
 
 def _digest(*arrays: np.ndarray) -> str:

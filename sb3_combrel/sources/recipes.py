@@ -8,6 +8,7 @@ import inspect
 import json
 import os
 import re
+import reprlib
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -57,7 +58,12 @@ def find_source(source: Any) -> SourceInstances:
     found = _file_or_recipe(source)
     if not isinstance(found, Path):
         return _learn_or_read(found)
-    return SourceInstances.from_table(found) if found.suffix.lower() == ".csv" else SourceInstances.load(found)
+    return SourceInstances.from_table(found) if is_table(found) else SourceInstances.load(found)
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file is a CSV file, compressed or not, by its name."""
+    return path.name.lower().endswith((".csv", ".txt", ".csv.gz", ".csv.zip"))
 
 
 def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
@@ -65,6 +71,12 @@ def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
     if isinstance(source, str | os.PathLike):
         path = Path(source)
         for file in (path, path.with_name(path.name + ".npz") if path.name else path):
+            if file.is_file() and file.suffix.lower() == ".zip" and not is_table(file):
+                raise ValueError(
+                    f"source must be a file of instances, got {source}, a saved model: pass its experience, "
+                    f"FittedRMax.load({str(source)!r}).source_instances(), or what it does in its task, "
+                    "SourceInstances.record(model, env)"
+                )
             if file.is_file():
                 return file
         if task_spec(str(source)) is not None:
@@ -77,7 +89,7 @@ def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
     if not isinstance(source, Mapping) or not source:
         raise ValueError(
             "source must be SourceInstances, a path to them, or a list of these; or a task to learn them from, the id of an "
-            f"environment or a recipe such as {{'env': 'MountainCar-v0'}}, got {source!r}"
+            f"environment or a recipe such as {{'env': 'MountainCar-v0'}}, got {reprlib.repr(source)}{_instead(source)}"
         )
     if not isinstance(source.get("env"), str):
         raise ValueError(f"the recipe of a source needs 'env', the id of its task, got {dict(source)!r}")
@@ -86,6 +98,15 @@ def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
         raise ValueError(f"the recipe's learner must be {' or '.join(LEARNERS)}, got {learner!r}")
     default = DEFAULT_RECIPE if learner == "q_learning" else {**DEFAULT_RECIPE, "total_timesteps": None}
     return {name: value for name, value in {**default, **source}.items() if value is not None}
+
+
+def _instead(source: Any) -> str:
+    """Say how a table or a model becomes a source, if it is one."""
+    if hasattr(source, "columns") and hasattr(source, "iloc"):
+        return ": pass SourceInstances.from_table(table)"
+    if hasattr(source, "source_instances"):
+        return ": pass model.source_instances(), its experience"
+    return ": pass SourceInstances.record(model, env)" if hasattr(source, "predict") or callable(source) else ""
 
 
 def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:

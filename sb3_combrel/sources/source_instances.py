@@ -265,9 +265,15 @@ class SourceInstances:
     def __repr__(self) -> str:
         return (
             f"<{len(self)} source instances of {self.origin.get('env') or 'an unnamed task'}: states "
-            f"({', '.join(self.state_names)}), actions ({', '.join(self.action_names)}), "
+            f"({', '.join(self.state_names)}), actions ({', '.join(self.action_names)}){self.without()}, "
             f"{int(self.terminated.sum())} of them terminal>"
         )
+
+    def without(self) -> str:
+        """Name the actions that no instance has taken: ", none with open"; "" if there are none."""
+        taken = np.unique(self.actions)
+        names = [name for a, name in enumerate(self.action_names) if a not in taken]
+        return f", none with {' or '.join(names)}" if names else ""
 
     def subset(self, n_instances: int, method: str = "random", seed: int | None = None) -> SourceInstances:
         """A choice of the instances, in their order. If any instance is terminal, so is at least one of the choice.

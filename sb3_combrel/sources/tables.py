@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 # Importing pandas takes a while, and only who has a table needs it.
 Table: TypeAlias = "str | os.PathLike[str] | pd.DataFrame"
 ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE = "action", "reward", "terminated", "done", "truncated", "episode"
-NEXT = "next_"
+NEXT, INDEX = "next_", "Unnamed: "
 _NO_STATES = {ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE}
 
 
@@ -31,9 +32,11 @@ def read_table(
 ) -> Transitions:
     """Read the transitions of a table; for the parameters see :meth:`SourceInstances.from_table`."""
     frame = _read(table)
-    names = _state_names(frame) if state_names is None else tuple(state_names)
-    for name in (*names, ACTION, REWARD):
+    if len(frame) == 0:
+        raise ValueError(f"the table has no rows, its columns are {[str(name) for name in frame.columns]}")
+    for name in (ACTION, REWARD, *(state_names or ())):
         _require(frame, name)
+    names = _state_names(frame) if state_names is None else tuple(state_names)
     frame = frame.reset_index(drop=True)
     steps, next_states = _with_next_states(frame, names)
     states = _numbers(steps, names)
@@ -71,8 +74,16 @@ def _read(table: Table) -> pd.DataFrame:
 
 
 def _state_names(frame: pd.DataFrame) -> tuple[str, ...]:
-    """All columns that are nothing else."""
-    return tuple(str(name) for name in frame.columns if str(name) not in _NO_STATES and not str(name).startswith(NEXT))
+    """All columns that are nothing else; a column without a name is the index that pandas has written."""
+    columns = [str(name) for name in frame.columns]
+    names = [name for name in columns if name not in _NO_STATES and not name.startswith((NEXT, INDEX))]
+    without = [name for name in names if f"{NEXT}{name}" not in columns]
+    if without and len(without) < len(names):
+        raise ValueError(
+            f"the columns {without} have no column {[NEXT + name for name in without]} of where they lead, others have: add "
+            f"them, or, if they are no state variables, name those that are: from_table(table, state_names={names[:1]} ...)"
+        )
+    return tuple(names)
 
 
 def _require(frame: pd.DataFrame, name: str, others: Sequence[str] = ()) -> None:
@@ -151,7 +162,16 @@ def _flags(frame: pd.DataFrame, name: str) -> np.ndarray:
 
 def _terminated(frame: pd.DataFrame) -> np.ndarray:
     """Whether each transition reached a terminal state: "done" counts where there is no "terminated", but for time limits."""
-    return _flags(frame, TERMINATED) if TERMINATED in frame.columns else _flags(frame, DONE) & ~_flags(frame, TRUNCATED)
+    if TERMINATED in frame.columns:
+        return _flags(frame, TERMINATED)
+    done = _flags(frame, DONE)
+    if done.any() and TRUNCATED not in frame.columns:
+        warnings.warn(
+            f"the table has a column {DONE!r}, but none of {TRUNCATED!r}: all {done.sum()} ends count as terminal states, "
+            "time limits as well",
+            stacklevel=5,
+        )
+    return done & ~_flags(frame, TRUNCATED)
 
 
 def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib import metadata
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.checks import as_count
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.version import __version__
 
 Floats = NDArray[np.float64]
 AnyEnv = VecEnv | gym.Env[Any, Any]
@@ -150,5 +150,5 @@ def _attribute(env: AnyEnv, name: str) -> Any:
 def describe_origin(env: AnyEnv, recorder: str, seed: int | None) -> dict[str, Any]:
     """Where instances come from: id of the environment, what acted in it (``recorder``), seed and version of this package."""
     spec = _attribute(env, "spec")
-    package = f"sb3-combrel {metadata.version('sb3-combrel')}"
+    package = f"sb3-combrel {__version__}"
     return {"env": None if spec is None else spec.id, "recorder": recorder, "seed": seed, "package": package}

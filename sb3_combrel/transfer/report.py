@@ -181,8 +181,10 @@ class TransferReport:
 
 
 def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
-    """Name source tasks, and how many instances each has."""
-    return tuple(f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances)" for source in sources)
+    """Name source tasks, and how many instances each has, and of which actions it has none."""
+    return tuple(
+        f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances{source.without()})" for source in sources
+    )
 
 
 _FIGURES = ("compliance", "next best", "no change", "error", "next best's", "strength")

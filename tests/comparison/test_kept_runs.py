@@ -1,7 +1,10 @@
 """``compare(output=folder)``: finished runs are kept, the same call goes on from them, and what would be mixed is refused."""
 
+import importlib
 import json
+import linecache
 import os
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -119,7 +122,7 @@ def with_combrel(source=None, **arguments):
             dict(resolution=4, gamma=0.9),
             r"learner.resolution was 3 and is 4; learner.gamma was '\(not given\)' and is 0.9",
         ),
-        ({}, dict(env=NamedWalk), "env was 'helpers.walk.Walk' and is 'helpers.dashboard.NamedWalk'"),
+        ({}, dict(env=NamedWalk), r"env was 'helpers.walk.Walk \w{8}' and is 'helpers.dashboard.NamedWalk \w{8}'"),
         (dict(env=tasks(20)), dict(env=tasks(30)), r"env\.\S*lambda> was .*20.* and is .*30"),
         ({}, with_combrel(breadth=0.4), r"\(COMBREL, seed 0: transfer\.\S*COMBREL.breadth was .* and is 0.4\)"),
         ({}, with_combrel(walk_source(61)), "source was '60 instances .* and is '61 instances "),
@@ -160,6 +163,26 @@ def test_settings_do_not_depend_on_where_things_lie_in_memory():
     assert settings == json.dumps(other.settings()) and " at 0x" not in settings and "helpers.walk.Walk" in settings
     assert described(tasks(3)) == described(tasks(3)) != described(tasks(4))
     assert " at 0x" not in str(described(lambda: [each for each in (lambda: 3)()]))
+
+
+def test_an_edited_environment_is_another(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def settings_of(step):
+        (tmp_path / "edited_walk.py").write_text(
+            f"from helpers.walk import Walk\n\nclass Mine(Walk):\n    step_size = {step}\n"
+        )
+        monkeypatch.delitem(sys.modules, "edited_walk", raising=False)
+        linecache.clearcache()
+        importlib.invalidate_caches()
+        made = importlib.import_module("edited_walk").Mine
+        by_name = gym.envs.registration.EnvSpec("Mine-v0", "edited_walk:Mine")
+        return [described(made), described(by_name)["entry_point"]]
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    one, again, other = settings_of(1), settings_of(1), settings_of(22)
+    assert one == again and one[0] == one[1] and one[0] != other[0] and one[1] != other[1]
+    assert described(ComparedRun) == "sb3_combrel.comparison.compare.ComparedRun", "the version tells"
 
 
 @pytest.mark.parametrize("kind", ["file", "below a file", "number", "others"])

@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from helpers.agents import assert_same_state, make_agent
@@ -213,8 +214,89 @@ def test_a_table_with_other_columns_is_read_with_the_names_of_the_states():
 def test_other_names_are_another_task():
     source = model(NamedWalk()).load_instances(walk_source()).source_instances()
     renamed = replace(source, state_names=("height", "mass"))
-    with pytest.raises(ValueError, match=r"others: .'place'.*COMBREL"):
+    with pytest.raises(ValueError, match=r"got \('height', 'mass'\), without \['place'\].*COMBREL"):
         model(NamedWalk()).load_instances(renamed)
+
+
+def test_names_that_a_task_was_given_are_names_too():
+    source = model().load_instances(walk_source()).source_instances()
+    assert source.state_names == ("s0", "s1")
+    turned = source.to_table()[["s1", "s0", "action", "reward", "next_s1", "next_s0", "terminated"]]
+    np.testing.assert_allclose(model().load_instances(turned).source_instances().states, source.states, atol=1e-12)
+
+
+def test_without_names_of_its_own_a_task_takes_variables_in_their_order_and_says_so():
+    named = replace(walk_source(), state_names=("height", "mass"))
+    with pytest.warns(UserWarning, match="in their order: height as s0, mass as s1"):
+        found = model().load_instances(named).source_instances()
+    np.testing.assert_allclose(found.states, named.states, atol=1e-12)
+
+
+def test_states_in_other_units_are_refused_and_nothing_is_taken_in():
+    fits, table = model(bounds=None), walk_source().to_table()
+    with pytest.raises(
+        ValueError, match=r"units of the task, got s0 from -\d\S* to \d\S*; the observation space has it from -1 to 1"
+    ):
+        fits.load_instances(table.assign(s0=100 * table["s0"]))
+    assert fits.agent.model.n_instances == 0 and not np.isfinite(fits.policy.scales.observed).any()
+
+
+class Doors(gym.Env):
+    """A walk on a line to one end; at the other nobody has been, as the log has never gone there."""
+
+    observation_space, action_space = gym.spaces.Box(0.0, 1.0, (1,)), gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = 0.4
+        return np.float32([self.at]), {}
+
+    def step(self, action):
+        self.at = float(np.clip(self.at + (0.05 if action else -0.05), 0.0, 1.0))
+        return np.float32([self.at]), -1.0, self.at > 0.9, False, {}
+
+
+def test_before_it_has_acted_itself_its_policy_keeps_to_what_the_data_show(tmp_path):
+    rng = np.random.default_rng(0)
+    log = SourceInstances.record(lambda state: int(rng.random() < 0.8), Doors(), 200, seed=0)
+    given = FittedRMax(gym.wrappers.TimeLimit(Doors(), 50), seed=0).load_instances(log)
+    assert not given.agent.has_acted
+    given.save(tmp_path / "given")
+    for each in (given, FittedRMax.load(tmp_path / "given")):
+        mean, _ = evaluate_policy(each, Monitor(gym.wrappers.TimeLimit(Doors(), 50)), n_eval_episodes=1)
+        assert mean >= -11.0, "the shortest way"
+    values = given.agent.planner.values.copy()
+    given.agent.act(np.array([0.5]), explore=False)
+    np.testing.assert_array_equal(given.agent.planner.values, values)
+    given.learn(1)
+    given.save(tmp_path / "given")
+    assert given.agent.has_acted and FittedRMax.load(tmp_path / "given").agent.has_acted
+
+
+class Interrupted(Walk):
+    """Its tenth step is made and interrupted."""
+
+    def __init__(self):
+        super().__init__()
+        self.n = 0
+
+    def step(self, action):
+        made = super().step(action)
+        self.n += 1
+        if self.n == 10:
+            raise KeyboardInterrupt
+        return made
+
+
+def test_a_step_that_was_interrupted_is_no_transition():
+    stopped = model(Interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        stopped.learn(50)
+    stopped.learn(20, reset_num_timesteps=False)
+    found = stopped.source_instances()
+    assert len(found) == 9 + 20
+    moved = np.abs(found.next_states - found.states)[:, 0]
+    assert (moved <= STRIDE + 1e-6).all(), "a step at most"
 
 
 def test_a_pickle_is_never_read(tmp_path):
@@ -222,6 +304,14 @@ def test_a_pickle_is_never_read(tmp_path):
     (tmp_path / "buffer.pkl").write_bytes(pickle.dumps({"a": 1}))
     with pytest.raises(ValueError, match=r"pickle.*load_from_pkl"):
         model().load_instances(tmp_path / "buffer.pkl")
+
+
+def test_what_is_no_file_of_past_data_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no file"):
+        model().load_instances(tmp_path / "nothing.pkl")
+    DQN("MlpPolicy", Walk(), buffer_size=10).save(tmp_path / "dqn")
+    with pytest.raises(ValueError, match=r"a model of another algorithm, of stable_baselines3\.dqn\.policies"):
+        model().load_instances(tmp_path / "dqn.zip")
 
 
 def test_without_experience_there_is_nothing_to_write(tmp_path):

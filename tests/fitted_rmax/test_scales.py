@@ -56,6 +56,29 @@ def test_what_has_been_renewed_is_not_renewed_again_until_something_new_is_obser
     assert renewed is not None or not beyond
 
 
+@given(OBSERVATIONS)
+def test_what_lies_beyond_the_space_is_scaled_once(observations):
+    scales = after(observations, box([-1.0, -1.0], [1.0, 1.0]))
+    tolerated = BEYOND * (scales.scaling.high - scales.scaling.low) + 1e-9
+    inside = (observations >= scales.scaling.low - tolerated) & (observations <= scales.scaling.high + tolerated)
+    assert inside.all() and scales.renewed(episode_ended=True) is None
+    np.testing.assert_array_equal(scales.beyond_space(), (np.abs(observations) > 1.0 + 2.0 * BEYOND).any(axis=0))
+
+
+class Wider(Walk):
+    """It says that it ends halfway."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gym.spaces.Box(np.float32([-1.0, 0.0]), np.float32([-0.5, 2.0]))
+
+
+def test_an_environment_that_leaves_its_space_is_told_once():
+    with pytest.warns(UserWarning, match=r"s0 from -\S+ to \S+, but the space says from -1 to -0\.5") as told:
+        FittedRMax(Wider(), seed=0).learn(100)
+    assert len([each for each in told if "observation space" in str(each.message)]) == 1
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_an_observation_that_is_beyond_them_changes_them_at_once(side):
     scales = after([[-1.0, -1.0], [1.0, 1.0]])

@@ -71,6 +71,29 @@ def test_done_is_an_end_but_for_time_limits():
     np.testing.assert_array_equal(SourceInstances.from_table(frame).terminated, [False, False, True, False, False])
 
 
+def test_done_without_truncated_may_be_a_time_limit():
+    frame = pd.DataFrame(STEPS).drop(columns="terminated").assign(done=[0, 0, 1, 0, 1])
+    with pytest.warns(UserWarning, match="all 2 ends count as terminal states, time limits as well"):
+        SourceInstances.from_table(frame)
+
+
+def test_the_index_that_pandas_writes_is_no_state_variable(tmp_path):
+    pd.DataFrame(STEPS).to_csv(tmp_path / "log.csv")
+    assert SourceInstances.from_table(tmp_path / "log.csv").state_names == ("x", "v")
+
+
+def test_a_column_without_a_next_one_is_named():
+    frame = pd.DataFrame(STEPS).assign(time=range(5))
+    with pytest.raises(ValueError, match=r"columns \['time'\] have no column \['next_time'\]"):
+        SourceInstances.from_table(frame)
+    assert SourceInstances.from_table(frame, state_names=["x", "v"]).state_names == ("x", "v")
+
+
+def test_a_table_without_rows_is_named():
+    with pytest.raises(ValueError, match=r"no rows, its columns are \['x', "):
+        SourceInstances.from_table(pd.DataFrame(STEPS).iloc[:0])
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 20), st.integers(1, 4), st.integers(1, 5), st.integers(0, 2**31))
 def test_what_is_written_as_a_table_is_read_again(n, d, n_actions, seed):
@@ -91,7 +114,7 @@ def test_what_is_written_as_a_table_is_read_again(n, d, n_actions, seed):
     ("change", "message"),
     [
         ({"reward": None, "rewards": STEPS["reward"]}, "no column 'reward'.*did you mean 'rewards'"),
-        ({"next_v": None}, r"no column 'next_v', its columns are .*\]$"),
+        ({"next_v": None}, r"columns \['v'\] have no column \['next_v'\].*state_names=\['x'\]"),
         ({"x": [0.0, np.nan, 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got nan in row 1"),
         ({"x": [0.0, "wall", 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got 'wall' in row 1"),
         ({"action": [0, 1, 0.5, 1, 1]}, "'action' must be whole numbers from 0 on, got 0.5 in row 2"),

@@ -2,16 +2,18 @@
 
 import os
 import time
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from helpers.sources import assert_same, some_source
-from helpers.walk import Walk, small
+from helpers.walk import Walk, small, walk_source
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
 from sb3_combrel.sources import recipes
 from sb3_combrel.sources.recipes import check_source, find_source, task_spec
+from sb3_combrel.transfer.report import describe_sources
 
 WALK = "WalkForRecipes-v0"
 SHORT = {"n_instances": 40, "total_timesteps": 200, "seed": 0}
@@ -161,3 +163,29 @@ def test_specifications_of_tasks():
     assert task_spec("combrel_envs:combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("Nowhere-v0") is None and task_spec("source.npz") is None
     check_source("combrel/MountainCar2D-v0")
+
+
+def test_what_is_no_source_yet_is_told_how_it_becomes_one(tmp_path):
+    model = small(Walk()).learn(20)
+    with pytest.raises(ValueError, match=r"pass SourceInstances\.from_table\(table\)$"):
+        check_source(walk_source().to_table())
+    with pytest.raises(ValueError, match=r"pass model\.source_instances\(\), its experience$"):
+        check_source(model)
+    with pytest.raises(ValueError, match=r"pass SourceInstances\.record\(model, env\)$"):
+        check_source(lambda state: 0)
+    model.save(tmp_path / "walk")
+    with pytest.raises(ValueError, match=r"a saved model: pass its experience, FittedRMax\.load\(.*walk\.zip'\)"):
+        check_source(str(tmp_path / "walk.zip"))
+
+
+def test_a_compressed_table_is_a_source(tmp_path):
+    walk_source().to_table().to_csv(tmp_path / "log.csv.gz", index=False)
+    np.testing.assert_allclose(find_source(tmp_path / "log.csv.gz").states, walk_source().states)
+
+
+def test_actions_that_nobody_has_taken_are_named():
+    source = walk_source()
+    assert "none with" not in repr(source)
+    more = replace(source, n_actions=4, action_names=("back", "forth", "up", "down"))
+    assert ", none with up or down, " in repr(more)
+    assert describe_sources([more]) == ("an unnamed task (60 instances, none with up or down)",)
