@@ -277,6 +277,35 @@ def test_a_mirrored_copy_is_compared_with_the_best_of_the_same_variables(seed, n
         assert found[c] == (scores[c] > 2.0 * max([0.0, *same]))
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 12))
+def test_parts_in_the_place_of_a_copy_have_its_variables_alone(seed, n_variables, n_copies):
+    rng = np.random.default_rng(seed)
+    members, mirrored = rng.random((n_copies, n_variables)) < 0.5, rng.random(n_copies) < 0.5
+    members[~members.any(axis=1), rng.integers(n_variables)] = True
+    chosen = prior_choice.best_division(members, rng.normal(size=n_copies))
+    found = prior_choice.made_of_parts(members, mirrored, chosen)
+    for c in range(n_copies):
+        touching = [k for k in chosen if (members[k] & members[c]).any()]
+        inside = all((members[k] <= members[c]).all() for k in touching)
+        assert found[c] == (inside and any(mirrored[k] for k in touching))
+
+
+def test_a_mirrored_copy_is_chosen_rather_than_its_parts(monkeypatch):
+    """Of two variables: plain, mirrored, and each on its own, one of them mirrored, which alone explains twice as much."""
+    _, copies, *_ = f.measured(1, 30)
+    state, sign = np.array([[0, 1], [0, 1], [0, -1], [0, -1], [-1, 1]]), np.ones((5, 2))
+    sign[1], sign[3, 0] = -1.0, -1.0
+    five = Copies(copies.sources, np.zeros(5, dtype=np.int64), state, sign, 0.2, 1.0)
+    scores = np.array([100.0, 150.0, 10.0, 90.0, 40.0])
+    monkeypatch.setattr(prior_choice, "scores_of", lambda copies, sums: scores)
+    fresh = CopySums.zero(5, 3, 3, 2)
+    assert prior_choice.choose_factored(five, fresh).copies[0].tolist() == [1]
+    # Were the parts worth less than the plain copy, that would be chosen.
+    scores[3] = 50.0
+    assert prior_choice.choose_factored(five, fresh).copies[0].tolist() == [0]
+
+
 @pytest.mark.parametrize("n_copies", [1, 2])
 def test_images_are_the_same_but_for_signs_and_have_more_than_half_the_evidence(n_copies):
     mapping, (states, actions, effects) = f.copies_mapping(n_copies), f.walk(f.copies_mapping(n_copies), 60)

@@ -62,13 +62,17 @@ def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choic
 def choose_factored(copies: Copies, sums: CopySums) -> Choice:
     """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``.
 
-    Of mirrored copies those alone may be chosen that have :data:`TELLS_APART` times the evidence of one that is not.
+    Of mirrored copies those alone may be chosen that have :data:`TELLS_APART` times the evidence of one that is not, or in
+    whose place there would be parts of them, one of which is mirrored.
     """
     action, _ = best_actions(copies, sums)
     scores = scores_of(copies, sums)
     members: np.ndarray = copies.state >= 0
     mirrored = np.asarray((copies.sign < 0.0).any(axis=1))
-    chosen = best_division(members, np.where(mirrored & ~explains_more(members, mirrored, scores), -np.inf, scores))
+    barred = mirrored & ~explains_more(members, mirrored, scores)
+    chosen = best_division(members, np.where(barred, -np.inf, scores))
+    barred &= ~made_of_parts(members, mirrored, chosen)
+    chosen = best_division(members, np.where(barred, -np.inf, scores))
     n_actions = len(sums.n)
     return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), action[chosen].T.copy())
 
@@ -105,6 +109,19 @@ def explains_more(members: np.ndarray, mirrored: np.ndarray, scores: np.ndarray)
     np.maximum.at(best, variables[~mirrored], scores[~mirrored])
     more: np.ndarray = scores > TELLS_APART * best[variables]
     return more
+
+
+def made_of_parts(members: np.ndarray, mirrored: np.ndarray, chosen: list[int]) -> np.ndarray:
+    """Whether copies that are chosen, one of them mirrored, have some of each copy's variables and no others.
+
+    :param members: the variables of each copy, bool, shape (n_copies, n_variables); ``mirrored``: bool, shape (n_copies,)
+    :return: bool, shape (n_copies,)
+    """
+    parts = members[chosen]
+    overlap = (members[:, None] & parts).any(axis=2)
+    inside = overlap & ~(parts & ~members[:, None]).any(axis=2)
+    made: np.ndarray = (overlap == inside).all(axis=1) & (inside & mirrored[chosen]).any(axis=1)
+    return made
 
 
 def best_division(members: np.ndarray, scores: np.ndarray) -> list[int]:
