@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_combrel.common.checks import as_count, check_boolean, check_count, check_finite
 from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.common.suggestions import did_you_mean
-from sb3_combrel.comparison.controls import CONTROL, random_control
+from sb3_combrel.comparison.controls import CONTROL, name_of_control, random_control
 from sb3_combrel.comparison.result import CompareResult, evaluate
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
@@ -158,7 +158,7 @@ def compare(
             where = f"the run of {result.method}, seed {result.seed}"
             raise ValueError(f"steps={steps} is too few: no episode ended in {where}; take more, or a time limit")
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(first)}
-    found = evaluate(by_method, baseline, threshold, _name_of(env))
+    found = evaluate(by_method, baseline, threshold, _name_of(env), name_of_control(in_use))
     for words in found.warnings:
         warnings.warn(words, stacklevel=2)
     return found

@@ -1,4 +1,4 @@
-"""The control that a comparison adds by itself: a mapping drawn at random from the set that a method chooses from."""
+"""The control that a comparison adds by itself: a mapping drawn at random from the set that its first method chooses from."""
 
 from __future__ import annotations
 
@@ -16,13 +16,18 @@ CONTROL = "random mapping"
 _SAME = ("use", "source_breadth", "transfer_terminals", "breadth", "breadth_decay")
 
 
+def name_of_control(in_use: Mapping[str, Transfer | None]) -> str:
+    """Return the name of the method that is a mapping drawn at random, whoever has added it."""
+    return next((name for name, each in in_use.items() if isinstance(each, TIMBREL) and each.mapping == "random"), CONTROL)
+
+
 def random_control(in_use: Mapping[str, Transfer | None]) -> TIMBREL | None:
     """Make the control of the first method that chooses among mappings, or of the first to which one is given.
 
     :param in_use: the methods by name, each bound to the task
     :return: None if no method transfers through mappings, or one of them is such a control
     """
-    if CONTROL in in_use or any(isinstance(each, TIMBREL) and each.mapping == "random" for each in in_use.values()):
+    if CONTROL in in_use or name_of_control(in_use) in in_use:
         return None
     with_mappings = [each for each in in_use.values() if isinstance(each, MappingTransfer)]
     if not with_mappings:

@@ -21,7 +21,14 @@ from sb3_combrel.comparison.measures import (
     compare_learning,
     counts_within,
 )
-from sb3_combrel.comparison.statistics import ALPHA, bootstrap_band, fewest_runs, holm, smallest_p_value
+from sb3_combrel.comparison.statistics import (
+    ALPHA,
+    bootstrap_band,
+    fewest_runs,
+    holm,
+    p_value_of_difference,
+    smallest_p_value,
+)
 from sb3_combrel.comparison.tables import markdown_table
 from sb3_combrel.pages.palette import method_colours
 from sb3_combrel.pages.plane import VariablePair
@@ -53,6 +60,7 @@ class CompareResult:
     :param snapshots: for each method values, policy and bound after the run of the first seed
     :param task: what the task is called
     :param warnings: why the figures may say little: few runs, few episodes
+    :param control: which method, if it is one of them, is a mapping drawn at random
     """
 
     curves: Mapping[str, LearningCurves]
@@ -65,6 +73,7 @@ class CompareResult:
     snapshots: Mapping[str, Snapshot]
     task: str = "the task"
     warnings: tuple[str, ...] = ()
+    control: str = CONTROL
 
     @property
     def sentence(self) -> str:
@@ -147,21 +156,28 @@ class CompareResult:
         return f"{method}: transfer helped: {tested}.{self._of_control(method, with_it)}"
 
     def _of_control(self, method: str, with_it: float) -> str:
-        """Say if a mapping drawn at random did as well."""
+        """Say if it is not shown that it does better than a mapping drawn at random."""
+        control = self.control
         if (
-            method == CONTROL
-            or CONTROL not in self.measures
+            method == control
+            or control not in self.measures
             or not any(each.mappings for each in self.reports.get(method, ()))
         ):
             return ""
-        control = float(self.measures[CONTROL].total_reward_by_steps.with_transfer.mean()) / self.n_steps
-        return (
-            f" But {CONTROL} did as well ({control:.4g}): it may not be the mapping that helps." if control >= with_it else ""
-        )
+        runs, others = (self.measures[each].total_reward_by_steps.with_transfer for each in (method, control))
+        mean, p_value = float(others.mean()) / self.n_steps, p_value_of_difference(runs, others, "permutation")
+        if mean < with_it and p_value < ALPHA:
+            return ""
+        compared = f"{mean:.4g}, p = {p_value_text(p_value)}"
+        return f" But it is not shown to be better than {control} ({compared}): it may not be the mapping that helps."
 
 
 def evaluate(
-    results: Mapping[str, Sequence[Result]], baseline: str, threshold: float | None, task: str = "the task"
+    results: Mapping[str, Sequence[Result]],
+    baseline: str,
+    threshold: float | None,
+    task: str = "the task",
+    control: str = CONTROL,
 ) -> CompareResult:
     """Compare methods with one of them, the baseline, given the runs of each by the order of the seeds."""
     curves = {method: curves_of(runs) for method, runs in results.items()}
@@ -188,6 +204,7 @@ def evaluate(
         reports={method: reports for method, runs in results.items() if (reports := _reports(runs))},
         snapshots={method: shown for method, runs in results.items() if (shown := runs[0].more.get("snapshot")) is not None},
         task=task,
+        control=control,
         warnings=few_data(len(next(iter(results.values()))), shortest),
     )
 

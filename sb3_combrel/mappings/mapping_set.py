@@ -181,7 +181,14 @@ class MappingSet:
         """
         check_set_name(name, (*_SIZED_SETS, *_PAPER_SETS))
         if name in _PAPER_SETS:
-            return cls.paper_icub() if name == "paper_icub" else cls.paper_mountain_car()
+            made = cls.paper_icub() if name == "paper_icub" else cls.paper_mountain_car()
+            own = made.state_mappings.shape[1], made.n_target_actions
+            if own != (n_target_variables, n_target_actions):
+                raise ValueError(
+                    f"mappings must be for a target with {n_target_variables} state variables and {n_target_actions} actions, "
+                    f'got "{name}", which is for {own[0]} and {own[1]}'
+                )
+            return made
         unsigned = name.removeprefix("signed_")
         once, allow_none, action_mappings = _SETS[unsigned]
         rows = state_mappings_using_sources(n_source_variables, n_target_variables, once=once, allow_none=allow_none)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_combrel.pages.page import Cell, PageTable, Section
 from sb3_combrel.pages.palette import mapping_colours
-from sb3_combrel.transfer.report import Contradiction, MappingReport, TransferReport
+from sb3_combrel.transfer.report import NOWHERE, Contradiction, MappingReport, TransferReport
 
 NONE, ANOTHER = "—", "another in each run"
 FIGURES = ("compliance", "no change", "error", "strength")
@@ -87,7 +87,7 @@ def contradictions_text(report: TransferReport) -> str:
     if not report.n_compared:
         return "No prediction of the source has been compared with what happened."
     share = f"{report.n_worse:,} ({100 * report.n_worse / report.n_compared:.0f} %)"
-    nowhere = "" if report.contradictions else " Nowhere was it contradicted on average."
+    nowhere = "" if report.contradictions else f" {NOWHERE}"
     return f'Compared on {report.n_compared:,} steps, the source was worse than "no change" on {share}.{nowhere}'
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.report import Contradiction
+from sb3_combrel.transfer.report import MIN_IN_PART, Contradiction
 
 # Above the first probability a transition is predicted to end the episode, below the second not to: between them, at the
 # border of where episodes end, a kernel average decides nothing.
@@ -20,7 +20,6 @@ STEPS_OF_A_VISIT = 10  # so many steps in a row where an end is predicted, and n
 COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "steps_of_visit")
 TRANSITIONS_BEFORE_WARNING = 300  # transitions from which on predictions worse than "no change" are warned of
 N_PARTS = 4  # each state variable's range is divided into so many parts
-MIN_IN_PART = 10  # a part with fewer transitions says nothing
 MAX_CONTRADICTIONS = 8
 NO_MOVEMENT = 1e-18  # effects are squared unit coordinates; less than this is no movement
 _N, _ERROR, _EFFECT, _WORSE = range(4)

@@ -23,6 +23,12 @@ class NotBoundError(ValueError, AttributeError):
     """
 
 
+#: A part of the states with fewer transitions says nothing.
+MIN_IN_PART = 10
+#: Said also of a source that was worse than no change on most of a few steps.
+NOWHERE = f"In no part of the states with at least {MIN_IN_PART} steps was it contradicted on average."
+
+
 @dataclass(frozen=True)
 class MappingReport:
     """What one target action was taken for.
@@ -94,6 +100,7 @@ class TransferReport:
     ends: tuple[int, int] = (0, 0)  #: episode ends where the source predicts them, and ends predicted or not, wrongly
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
+    why_unbounded: str = ""  #: with ``use="prior"``: why not
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
     source_actions: tuple[str, ...] = ()  #: with ``use="instances"``, the names of the source actions of all sources
     history: tuple[EvidencePoint, ...] = ()  #: the evidence over time; empty where none is kept
@@ -136,6 +143,8 @@ class TransferReport:
             more = self.statistics.get("transfer/bound_exceeded", 0.0)
             raised = f", and {more:.3g} more, by which returns exceeded it" if more > 0.0 else ""
             lines.append(f"The value of what is unknown is bounded by the source's value there{raised}.")
+        elif self.why_unbounded:
+            lines.append(f"The source's values do not bound that of what is unknown: {self.why_unbounded}.")
         return "\n".join(lines)
 
     def _mappings(self) -> str:
@@ -167,7 +176,7 @@ class TransferReport:
             f"({100 * self.n_worse / self.n_compared:.0f} %)."
         ]
         where = [f"  {each}" for each in self.contradictions]
-        lines += ["Contradicted (prediction error above 1):", *where] if where else ["Nowhere was it contradicted on average."]
+        lines += ["Contradicted (prediction error above 1):", *where] if where else [NOWHERE]
         for name, (right, wrong) in (("Ends of episodes", self.ends), ("Rewards", self.rewards)):
             if right or wrong:
                 lines.append(f"{name}: {right:,} as the source predicts, {wrong:,} not.")

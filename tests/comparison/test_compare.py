@@ -14,7 +14,7 @@ import sb3_combrel
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import compare
-from sb3_combrel.comparison.controls import random_control
+from sb3_combrel.comparison.controls import name_of_control, random_control
 from sb3_combrel.comparison.curves import LearningCurves, returns_over_steps
 from sb3_combrel.comparison.measures import compare_learning
 from sb3_combrel.runs.episodes import EpisodeRecorder
@@ -170,10 +170,21 @@ def test_a_random_mapping_that_does_as_well_is_mentioned(monkeypatch):
     runs = {"none": around(-60.0, 5), "COMBREL": around(-50.0, 5), "random mapping": around(-40.0, 5)}
     reports = (TransferReport("COMBREL()", "prior", mappings=(MappingReport("go", "went"),)),)
     found = replace(made_up(monkeypatch, runs), reports={"COMBREL": reports})
-    assert "transfer helped" in found.sentences["COMBREL"] and "But random mapping did as well" in found.sentences["COMBREL"]
-    assert "But" not in found.sentences["random mapping"]
+    assert "transfer helped" in found.sentences["COMBREL"]
+    but = "But it is not shown to be better than random mapping (-40"
+    assert but in found.sentences["COMBREL"] and "But" not in found.sentences["random mapping"]
     better = replace(made_up(monkeypatch, {**runs, "COMBREL": around(-30.0, 5)}), reports={"COMBREL": reports})
     assert "But" not in better.sentence
+    # A little better is as good, and a control of the user's own, under another name, is one.
+    own = {"none": runs["none"], "COMBREL": around(-39.9, 5), "drawn": runs["random mapping"]}
+    assert "But" not in replace(made_up(monkeypatch, own), reports={"COMBREL": reports}).sentence
+    found = replace(made_up(monkeypatch, own), reports={"COMBREL": reports}, control="drawn")
+    assert "better than drawn (-40" in found.sentences["COMBREL"]
+
+
+def test_a_control_is_known_by_what_it_is():
+    drawn = TIMBREL(walk_source(), "random", use="prior")
+    assert name_of_control({"none": None, "mine": drawn}) == "mine" and name_of_control({"none": None}) == "random mapping"
 
 
 def controls_of(methods, **learner):

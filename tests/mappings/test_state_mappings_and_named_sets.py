@@ -138,7 +138,7 @@ class TestResolve:
         ("mappings", "message"),
         [
             ("bijective", "one of injective, .*, signed_injective, .*, paper_icub; .*factored.* got 'bijective'"),
-            ("paper_icub", "action must have 5 entries, .* got 8"),
+            ("paper_icub", 'target with 4 state variables and 5 actions, got "paper_icub", which is for 4 and 8'),
             (MappingSet.injective(3, 4, 3, 5), "state must hold indices from 0 to 1"),
             ([InterTaskMapping((0,), (0,)), InterTaskMapping((0, 1), (0,))], "same numbers of target variables"),
         ],

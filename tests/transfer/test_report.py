@@ -219,3 +219,19 @@ def test_dir_has_what_is_for_the_user():
     assert {"report", "describe_prior", "mapping_counts", "source", "mappings", "use"} <= names
     assert not {"bind", "observe", "transferred", "set_state", "note_use"} & names
     assert not any(name.startswith("_") for name in names)
+
+
+def test_it_says_why_the_sources_values_bound_nothing():
+    def report_of(source):
+        env = NamedWalk()
+        return small(env, transfer=COMBREL(source), degree=1).learn(150).transfer.report()
+
+    source = SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0)
+    assert report_of(source).why_unbounded == ""
+    wrong = report_of(dataclasses.replace(source, rewards=-source.rewards))
+    assert not wrong.bounds_values and wrong.why_unbounded == "its rewards are not the target's"
+    assert "do not bound that of what is unknown: its rewards are not the target's." in str(wrong)
+
+
+def test_a_mapping_that_was_left_to_chance_is_shown():
+    assert repr(TIMBREL(walk_source(), use="prior")).endswith("mapping='random', use='prior')")

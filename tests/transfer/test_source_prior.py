@@ -191,16 +191,16 @@ def test_of_two_sources_the_one_that_fits_is_found_and_it_says_which_copies_each
     assert transfer.describe_prior().startswith("a0: nothing; a1: nothing")
     assert (transfer.choices() == -1).all() and transfer.mapping_counts() == []
     show(transfer, f.walk(TWO, 300))
-    first, second = "on (s0, s2) as (x, v)", "on (s1, s3) as (x, v)"
+    first, second = "of source 2 on (s0, s2) as (x, v)", "of source 2 on (s1, s3) as (x, v)"
     assert transfer.describe_prior() == (
         f"a0: Wait {first}, Wait {second}; a1: Down {first}, Wait {second}; a2: Up {first}, Wait {second}; "
         f"a3: Wait {first}, Down {second}; a4: Wait {first}, Up {second}"
     )
     [first, *_] = transfer.choices().reshape(5, -1)[3]
-    assert transfer.candidate(first) == (3, "Wait + Down", "(s0, s2) + (s1, s3)", ())
+    assert transfer.candidate(first) == (3, "Wait of source 2 + Down of source 2", "(s0, s2) + (s1, s3)", ())
     assert (transfer.selected(np.zeros((2, 4)), np.array([3, 3])) == first).all()
-    assert transfer.describe(first) == "a3<-Wait + Down with (s0, s2) + (s1, s3)"
-    assert "Wait + Down" in transfer.source_action_names() and sum(transfer.uses().values()) > 250
+    assert transfer.describe(first) == "a3<-Wait of source 2 + Down of source 2 with (s0, s2) + (s1, s3)"
+    assert "Wait of source 2 + Down of source 2" in transfer.source_action_names() and sum(transfer.uses().values()) > 250
     assert set(transfer.source_prior.copies.source[transfer.source_prior.choice.copies].ravel().tolist()) == {1}
 
 

@@ -9,6 +9,7 @@ from helpers import factored as f
 from helpers import naive_transfer as naive
 from helpers.oscillators import episodes
 from helpers.own_method import Mine
+from helpers.walk import small, walk_source
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
@@ -211,3 +212,17 @@ def test_a_source_of_the_target_itself_makes_the_prior_exact_and_bounds_the_valu
     states, actions = f.inside(50, 2, 3)
     np.testing.assert_allclose(transfer.prior(states, actions).effect, f.oscillate(states, actions), atol=2e-3)
     assert transfer.value_bound() is not None and transfer.source_prior.evidence.strength.mean() > 0.5
+
+
+@pytest.mark.parametrize("use", ["prior", "instances"])
+def test_a_mapping_that_is_given_is_of_one_source(use):
+    mapping = InterTaskMapping(state=(0, 1), action=(0, 1))
+    with pytest.raises(ValueError, match="source must be one source for a mapping that is given, got 2"):
+        small(transfer=TIMBREL([walk_source(), walk_source(50)], mapping, use=use), degree=1)
+
+
+def test_what_has_no_meaning_for_a_prior_is_refused():
+    with pytest.raises(ValueError, match=r"n_neighbors=20, choice='drawn' must be left out with use=\"prior\""):
+        COMBREL(walk_source(), use="prior", n_neighbors=20, choice="drawn")
+    with pytest.raises(ValueError, match=r"breadth=0\.1 must be left out"):
+        COMBREL(walk_source(), "factored", breadth=0.1)

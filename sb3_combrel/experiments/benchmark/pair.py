@@ -14,6 +14,7 @@ import gymnasium as gym
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.checks import check_count, check_finite
 from sb3_combrel.experiments.suite.tasks import Source, check_budget
+from sb3_combrel.mappings.named_sets import check_mappings
 from sb3_combrel.runs.job import Task, chosen_on_purpose, described, make_env
 from sb3_combrel.transfer.candidates import MappedVariables
 
@@ -89,6 +90,11 @@ class Pair:
 
     def __post_init__(self) -> None:
         check_name(self.name)
+        try:
+            for name in (self.mappings, self.instance_mappings):
+                check_mappings(name)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from error
         check_budget(self.name, self.n_steps, self.n_episodes)
         if self.threshold is not None:
             check_finite("threshold", self.threshold)

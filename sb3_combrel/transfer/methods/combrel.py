@@ -111,6 +111,10 @@ class COMBREL(MappingTransfer):
                 self._left_open = {"mappings": None, "use": None}
         if self.use is None:
             self.use = "prior" if self.mappings is not None and is_factored(self.mappings) else "instances"
+        meaningless = [each for each in of_instances if np.any(getattr(self, each.name) != each.default)]
+        if self.use == "prior" and meaningless:
+            given = ", ".join(f"{each.name}={getattr(self, each.name)!r}" for each in meaningless)
+            raise ValueError(f'{given} must be left out with use="prior": it has a meaning for use="instances" alone')
         if self.mappings is None:
             self.mappings = DEFAULT_OF_PRIOR if self.use == "prior" else "injective"
         super().__post_init__()

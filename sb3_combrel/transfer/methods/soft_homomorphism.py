@@ -227,7 +227,7 @@ class SoftHomomorphism(Transfer):
         of_mapping = soft.probabilities(self._logits, self._readings)[0] if self._logits else np.full((1, 1), np.nan)
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
-            "transfer/prior_strength": self._evidence.mean_strength(),
+            "transfer/prior_strength": float(self._evidence.strength_of_actions().mean()),
             "transfer/mapping_probability": float(of_mapping.max(axis=1).mean()),
             "transfer/steps_to_find_mapping": self._steps_to_find,
             "transfer/fits": self._n_fits,

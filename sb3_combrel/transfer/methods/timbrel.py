@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -44,6 +44,8 @@ class TIMBREL(MappingTransfer):
     :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
     """
 
+    always_shown: ClassVar[tuple[str, ...]] = ("mapping",)
+
     mapping: str | InterTaskMapping | FactoredMapping | Sequence[InterTaskMapping] | dict[str, Any] = "random"
     mappings: MappingsLike = field(default="injective", kw_only=True)
 
@@ -71,6 +73,8 @@ class TIMBREL(MappingTransfer):
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
         if isinstance(self.mapping, str):
             return PooledSelector(parts) if self.mapping == "pool" else RandomSelector(parts)
+        if len(parts.candidates.sets) > 1:
+            raise ValueError(f"source must be one source for a mapping that is given, got {len(parts.candidates.sets)}")
         n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
         n_actions = parts.task.n_actions
         if n_given not in (1, n_actions):

@@ -75,10 +75,6 @@ class PriorEvidence:
             self.reward_errors += part * abs(reward - expected), part * abs(reward - total / n)
         self._rewards += 1.0, reward
 
-    def mean_strength(self) -> float:
-        """The mean of :attr:`strength`."""
-        return float(self.strength.mean())
-
     def strength_of_actions(self) -> np.ndarray:
         """The geometric mean of :attr:`strength` over variables, shape (n_actions,)."""
         with np.errstate(divide="ignore"):  # a source that is surely wrong may count as nothing at all

@@ -107,7 +107,10 @@ class PriorCandidates:
         return self.copies.mapping(copy, self.task, (0,) * self.task.n_actions)
 
     def _action_name(self, copy: int, used: int) -> str:
-        return self.copies.sources[self.copies.source[copy]].action_names[used]
+        """The name of a source action, and of several sources the number of the source, from 1 on."""
+        number = int(self.copies.source[copy])
+        name = self.copies.sources[number].action_names[used]
+        return name if len(self.copies.sources) == 1 else f"{name} of source {number + 1}"
 
     def get_state(self) -> np.ndarray:
         """Return all candidates and their uses, one a row, float64, shape (n, 2 * n_variables + 2)."""

@@ -100,14 +100,24 @@ def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTas
     return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
 
 
+def _check_one_source(sources: Sequence[SourceInstances]) -> None:
+    """A mapping that is given is one to one source; a ValueError if there are more."""
+    if len(sources) > 1:
+        raise ValueError(
+            f"source must be one source for a mapping that is given, got {len(sources)}; COMBREL(sources) finds out which of "
+            "them each target action is to be taken for"
+        )
+
+
 def _given_factored(
     mapping: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float
 ) -> tuple[Copies, Choice]:
-    """The copies of a factored mapping, of the first source."""
+    """The copies of a factored mapping."""
     if not isinstance(mapping, FactoredMapping):
         if set(mapping) != {"copies"}:
             raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
         mapping = FactoredMapping(**mapping)
+    _check_one_source(sources)
     mapping.check(**sizes(sources[0], task))
     actions = np.array([copy.action for copy in mapping.copies], dtype=np.int64).T
     numbers = np.tile(np.arange(len(mapping.copies)), (task.n_actions, 1))
@@ -115,7 +125,8 @@ def _given_factored(
 
 
 def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
-    """One mapping, or one for each target action, of the first source."""
+    """One mapping, or one for each target action."""
+    _check_one_source(sources)
     given = resolve(mappings, **sizes(sources[0], task))
     if len(given) not in (1, task.n_actions):
         raise ValueError(
@@ -131,7 +142,7 @@ def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, 
 def _of_mappings(
     mappings: Sequence[InterTaskMapping], sources: Sequence[SourceInstances], task: TargetTask, breadth: float
 ) -> Copies:
-    """The state mappings of some mappings to the first source."""
+    """The state mappings of some mappings to a source."""
     state = np.array([mapping.state_index for mapping in mappings])
     sign = np.array([mapping.state_sign for mapping in mappings])
     number = np.zeros(len(state), dtype=np.int64)

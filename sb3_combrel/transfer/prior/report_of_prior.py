@@ -69,6 +69,7 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         next_best=next_best[0],
         next_best_error=next_best[1],
         bounds_values=prior.value_bound() is not None,
+        why_unbounded=prior.why_unbounded(),
         statistics=statistics,
         history=prior.history.points(prior),
         **prior.errors.report_fields(),
@@ -102,7 +103,7 @@ def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, o
         error=error,
         next_best_error=next_best[2],
         n_compared=n_compared,
-        strength=float(prior.evidence.strength_of_actions()[action]),
+        strength=float(prior.strengths()[action]),
     )
 
 

@@ -186,6 +186,20 @@ class SourcePrior:
             return None
         return self._value_bound.through(self.bounding)
 
+    def why_unbounded(self) -> str:
+        """Say why the source's values bound nothing; "" if they do."""
+        if self.choice is None:
+            return "no mapping has been chosen"
+        if not self.transfer_terminals:
+            return "transfer_terminals=False"
+        if not self.evidence.explains_rewards():
+            return "its rewards are not the target's"
+        if not self.explains:
+            return "some target action is not explained"
+        if self._bound() is None:
+            return "the mapping has no whole source for all target actions, or its copies do not cost the same at every step"
+        return ""
+
     def _explains(self) -> bool:
         """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
 
@@ -289,10 +303,19 @@ class SourcePrior:
             errors[a, has] = self.sums.error[copy, a, used, has]
         return float(errors.sum()) / baseline if baseline > 0.0 else np.nan
 
+    def strengths(self) -> np.ndarray:
+        """As how many of the target's own instances the source counts, by target action; NaN where it is taken for nothing."""
+        return np.where(self._in_copies().any(axis=1), self.evidence.strength_of_actions(), np.nan)
+
+    def mean_strength(self) -> float:
+        """The mean of :meth:`strengths`; 0 if no action is taken for anything."""
+        found = self.strengths()
+        return float(np.nanmean(found)) if np.isfinite(found).any() else 0.0
+
     def statistics(self) -> dict[str, float]:
         return {
             "transfer/prediction_error": self.error(),
-            "transfer/prior_strength": self.evidence.mean_strength(),
+            "transfer/prior_strength": self.mean_strength(),
             "transfer/values_bounded": float(self.value_bound() is not None),
             "transfer/bound_exceeded": self.excess,
             "transfer/prior_copies": 0 if self.choice is None else int((self.choice.copies >= 0).sum(axis=1).max(initial=0)),
