@@ -71,3 +71,14 @@ def test_a_file_names_its_version_and_one_of_another_version_that_does_not_fit_s
             written.writestr(name, content if name != "policy.pth" else b"of another layout")
     with pytest.raises(ValueError, match=r"it was saved by sb3_combrel 0\.0\.7, which can load it"):
         FittedRMax.load(tmp_path / "old.zip")
+
+
+def test_of_many_variables_there_is_one_warning_alone():
+    """Not also that the resolution, which nobody has given, is too coarse, and too fine."""
+    said = said_by(lambda: FittedRMax(Drift(12), seed=0))
+    assert ["12 state variables are many" in text for text in said] == [True]
+
+
+def test_a_model_without_an_environment_is_refused():
+    with pytest.raises(ValueError, match="env is missing"):
+        FittedRMax()

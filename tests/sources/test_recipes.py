@@ -11,6 +11,7 @@ from helpers.sources import assert_same, some_source
 from helpers.walk import Walk, small, walk_source
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
+from sb3_combrel.common.version import __version__
 from sb3_combrel.sources import recipes
 from sb3_combrel.sources.recipes import check_source, find_source, task_spec
 from sb3_combrel.transfer.report import describe_sources
@@ -189,3 +190,7 @@ def test_actions_that_nobody_has_taken_are_named():
     more = replace(source, n_actions=4, action_names=("back", "forth", "up", "down"))
     assert ", none with up or down, " in repr(more)
     assert describe_sources([more]) == ("an unnamed task (60 instances, none with up or down)",)
+
+
+def test_instances_say_by_which_version_they_were_recorded():
+    assert SourceInstances.record(None, Walk(), 5, seed=0).origin["package"] == f"sb3-combrel {__version__}"
