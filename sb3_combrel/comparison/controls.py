@@ -17,7 +17,7 @@ _SAME = ("use", "source_breadth", "transfer_terminals", "breadth", "breadth_deca
 
 
 def name_of_control(in_use: Mapping[str, Transfer | None]) -> str:
-    """Return the name of the method that is a mapping drawn at random, whoever has added it."""
+    """Return the name of the method that is a mapping drawn at random, whoever has added it; or :data:`CONTROL`."""
     return next((name for name, each in in_use.items() if isinstance(each, TIMBREL) and each.mapping == "random"), CONTROL)
 
 
@@ -27,7 +27,7 @@ def random_control(in_use: Mapping[str, Transfer | None]) -> TIMBREL | None:
     :param in_use: the methods by name, each bound to the task
     :return: None if no method transfers through mappings, or one of them is such a control
     """
-    if CONTROL in in_use or name_of_control(in_use) in in_use:
+    if name_of_control(in_use) in in_use:
         return None
     with_mappings = [each for each in in_use.values() if isinstance(each, MappingTransfer)]
     if not with_mappings:

@@ -154,18 +154,7 @@ class PastData(SavedAlgorithm):
                 f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
             )
-        names = found.state_names, tuple(task.state_names)
-        lacking = [name for name in names[1] if name not in names[0]]
-        if not lacking or any(map(_are_numbered, names)):
-            columns = np.arange(len(names[1])) if lacking else np.array([names[0].index(name) for name in names[1]])
-        else:
-            raise ValueError(f"instances must have the state variables {names[1]}, got {names[0]}, without {lacking}{other}")
-        if lacking and not all(map(_are_numbered, names)):
-            as_what = ", ".join(f"{given} as {own}" for given, own in zip(*names, strict=True))
-            warnings.warn(
-                f"state variables of the instances have other names than the task's and are taken in their order: {as_what}",
-                stacklevel=3,
-            )
+        columns = _columns_of_variables(found.state_names, tuple(task.state_names), other)
         self._check_units(found.states, columns)
         numbers = _numbers_of_actions(found.action_names, tuple(task.action_names), other)
         return replace(
@@ -197,6 +186,26 @@ class PastData(SavedAlgorithm):
 def _are_numbered(names: Sequence[str]) -> bool:
     """Whether names are those that are given where a task has none: s0, s1, ... or a0, a1, ..."""
     return all(name[1:] == str(k) for k, name in enumerate(names))
+
+
+def _columns_of_variables(given: tuple[str, ...], own: tuple[str, ...], other: str) -> np.ndarray:
+    """Where each of the task's variables is among those given: by its name, or its place if one side has no names of its own.
+
+    :raises ValueError: if both have names, and some are missing
+    """
+    lacking = [name for name in own if name not in given]
+    if not lacking:
+        return np.array([given.index(name) for name in own])
+    numbered = _are_numbered(given), _are_numbered(own)
+    if not any(numbered):
+        raise ValueError(f"instances must have the state variables {own}, got {given}, without {lacking}{other}")
+    if not all(numbered):
+        taken = ", ".join(f"{name} as {of_task}" for name, of_task in zip(given, own, strict=True))
+        warnings.warn(
+            f"state variables of the instances have other names than the task's and are taken in their order: {taken}",
+            stacklevel=4,
+        )
+    return np.arange(len(own))
 
 
 def _numbers_of_actions(given: tuple[str, ...], own: tuple[str, ...], other: str) -> np.ndarray:

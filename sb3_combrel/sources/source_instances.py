@@ -265,12 +265,12 @@ class SourceInstances:
     def __repr__(self) -> str:
         return (
             f"<{len(self)} source instances of {self.origin.get('env') or 'an unnamed task'}: states "
-            f"({', '.join(self.state_names)}), actions ({', '.join(self.action_names)}){self.without()}, "
+            f"({', '.join(self.state_names)}), actions ({', '.join(self.action_names)}){self.words_for_missing_actions()}, "
             f"{int(self.terminated.sum())} of them terminal>"
         )
 
-    def without(self) -> str:
-        """Name the actions that no instance has taken: ", none with open"; "" if there are none."""
+    def words_for_missing_actions(self) -> str:
+        """Name the actions that no instance has taken, of which a source says nothing: ", none with open"; "" without any."""
         taken = np.unique(self.actions)
         names = [name for a, name in enumerate(self.action_names) if a not in taken]
         return f", none with {' or '.join(names)}" if names else ""

@@ -192,7 +192,8 @@ class TransferReport:
 def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
     """Name source tasks, and how many instances each has, and of which actions it has none."""
     return tuple(
-        f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances{source.without()})" for source in sources
+        f"{source.origin.get('env') or 'an unnamed task'} ({len(source):,} instances{source.words_for_missing_actions()})"
+        for source in sources
     )
 
 

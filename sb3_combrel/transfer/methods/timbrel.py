@@ -16,6 +16,7 @@ from sb3_combrel.transfer.candidates import MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.prior.prior_sets import check_one_source
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
@@ -73,8 +74,7 @@ class TIMBREL(MappingTransfer):
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
         if isinstance(self.mapping, str):
             return PooledSelector(parts) if self.mapping == "pool" else RandomSelector(parts)
-        if len(parts.candidates.sets) > 1:
-            raise ValueError(f"source must be one source for a mapping that is given, got {len(parts.candidates.sets)}")
+        check_one_source(parts.candidates.sources)
         n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
         n_actions = parts.task.n_actions
         if n_given not in (1, n_actions):

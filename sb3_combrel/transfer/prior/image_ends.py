@@ -9,7 +9,7 @@ import numpy as np
 from sb3_combrel.transfer.equations import ends_evidence, foretold_ends
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.prior.prior_choice import TELLS_APART, Choice, best_actions, images_of
+from sb3_combrel.transfer.prior.prior_choice import TELLS_APART, Choice, best_actions, images_of, scores_of
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 
@@ -19,8 +19,8 @@ def best_ending(copies: Copies, sums: CopySums, choice: Choice, transitions: Rec
     Effects that are their own mirror image do not tell a copy from its images (``images_of``), but ends do. A target of
     several copies ends when all of them have ended.
     """
-    used = choice.copies[0][choice.copies[0] >= 0].tolist()
-    options = [[copy, *images_of(copies, sums, copy)] if copies.is_whole(copy) else [copy] for copy in used]
+    used, scores = choice.copies[0][choice.copies[0] >= 0].tolist(), scores_of(copies, sums)
+    options = [[copy, *images_of(copies, scores, copy)] if copies.is_whole(copy) else [copy] for copy in used]
     if not (choice.copies == choice.copies[0]).all() or all(len(each) == 1 for each in options):
         return choice
     actions, _ = best_actions(copies, sums)

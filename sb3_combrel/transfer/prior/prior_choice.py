@@ -85,9 +85,11 @@ def scores_of(copies: Copies, sums: CopySums) -> np.ndarray:
     return np.asarray(np.where(taken, gain, 0.0).sum(axis=1) - cost)
 
 
-def images_of(copies: Copies, sums: CopySums, copy: int) -> list[int]:
-    """Find the mirror images of a copy, the original among them, that the effects' evidence does not tell apart from it."""
-    scores = scores_of(copies, sums)
+def images_of(copies: Copies, scores: np.ndarray, copy: int) -> list[int]:
+    """Find the mirror images of a copy, the original among them, that the effects' evidence does not tell apart from it.
+
+    :param scores: :func:`scores_of`
+    """
     images = (copies.state == copies.state[copy]).all(axis=1) & (copies.source == copies.source[copy])
     images[copy] = False
     return np.flatnonzero(images & (TELLS_APART * scores > scores[copy])).tolist()

@@ -100,7 +100,7 @@ def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTas
     return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
 
 
-def _check_one_source(sources: Sequence[SourceInstances]) -> None:
+def check_one_source(sources: Sequence[SourceInstances]) -> None:
     """A mapping that is given is one to one source; a ValueError if there are more."""
     if len(sources) > 1:
         raise ValueError(
@@ -117,7 +117,7 @@ def _given_factored(
         if set(mapping) != {"copies"}:
             raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
         mapping = FactoredMapping(**mapping)
-    _check_one_source(sources)
+    check_one_source(sources)
     mapping.check(**sizes(sources[0], task))
     actions = np.array([copy.action for copy in mapping.copies], dtype=np.int64).T
     numbers = np.tile(np.arange(len(mapping.copies)), (task.n_actions, 1))
@@ -126,7 +126,7 @@ def _given_factored(
 
 def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
     """One mapping, or one for each target action."""
-    _check_one_source(sources)
+    check_one_source(sources)
     given = resolve(mappings, **sizes(sources[0], task))
     if len(given) not in (1, task.n_actions):
         raise ValueError(
