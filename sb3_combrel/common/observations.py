@@ -23,7 +23,8 @@ def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, un
 
     :param states: float64, raw units, shape (n, n_variables); ``units`` receives the unit coordinates
     :param observed: float64, shape (2, n_variables) or (0, n_variables): receives the least and the largest observations
-    :param n_outside: float64, shape (n_variables + 1,): counts these by variable where they are outside; and all, at the end
+    :param n_outside: float64, shape (n_variables + 1,): counts these by variable where they are outside by more than rounding
+        explains; and all, at the end
     :return: whether anything is outside, or is no number
     """
     outside = False
@@ -42,7 +43,7 @@ def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, un
             units[i, k] = inside if fixed or periodic[k] else unit
             if inside != unit:
                 outside = True
-                n_outside[k] += noted
+                n_outside[k] += noted and abs(unit - inside) > ROUNDING
     return outside
 
 

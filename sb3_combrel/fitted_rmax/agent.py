@@ -116,13 +116,10 @@ class FittedRMaxAgent:
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma, width)
         self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        asked = None if self._model_transfer is None else self.correspondence.of_learner(self._model_transfer)
-        self.model = self.model_class(self.mdp, self.model_settings, asked)
+        self._asked = None if self._model_transfer is None else self.correspondence.of_learner(self._model_transfer)
+        self.model = self.model_class(self.mdp, self.model_settings, self._asked)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
-        # Transferred instances tell what is where; a prior does so by its bound on values.
-        told = self._model_transfer is not None and self._model_transfer.use != "prior"
-        self._searches = self.model.searches and not told
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
@@ -174,8 +171,8 @@ class FittedRMaxAgent:
 
     def _explore(self, state: np.ndarray, environment: int) -> int:
         prediction, given = self.model.predict_at(state)
-        if given is not None and self.transfer is not None:
-            self.transfer.note_use(given)
+        if given is not None and self._asked is not None:
+            self._asked.note_use(given)
         best = self._q.compute(prediction, state, self._value_function(self.planner.values))
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())
@@ -359,7 +356,9 @@ class FittedRMaxAgent:
 
     def _search(self) -> None:
         """Let places be worth what they are after the visits to them, as long as nothing has been found."""
-        if not self._searches or self.rewards.differ or self.model.n_instances == 0:
+        # Transferred instances tell what is where; a prior does so by its bound on values.
+        transferred = (self.mdp.arrays.modelled & ~self.model.known).any()
+        if not self.model.searches or self.rewards.differ or transferred or self.model.n_instances == 0:
             self.planner.set_worth(None)
             return
         visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances, check_transferred
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -36,21 +36,17 @@ class Correspondence:
         """The other way around."""
         return np.asarray(effects / self._factor)
 
-    def of_learner(self, transfer: Transfer) -> Transfer | PriorOfLearner:
+    def of_learner(self, transfer: Transfer) -> Transfer | OfLearner:
         """What the learner's model asks in place of a transfer method."""
-        return transfer if self.same else PriorOfLearner(transfer, self)
+        return transfer if self.same else OfLearner(transfer, self)
 
 
-class PriorOfLearner:
-    """A prior in the unit coordinates of the learner; see ``models.base.InstanceTransfer``.
-
-    Methods that transfer instances see no others: variables with bounds keep them then.
-    """
-
-    use = "prior"
+class OfLearner:
+    """What is transferred, in the unit coordinates of the learner; see ``models.base.InstanceTransfer``."""
 
     def __init__(self, transfer: Transfer, correspondence: Correspondence):
         self._transfer, self._correspondence = transfer, correspondence
+        self.use = transfer.use
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         given = self._transfer.prior(self._correspondence.states(states), actions)
@@ -60,6 +56,16 @@ class PriorOfLearner:
         return self._transfer.prior_version()
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        raise NotImplementedError("a prior transfers no instances")
+        return self._scaled(self._transfer.transferred(self._correspondence.states(states), actions, own_weight), own_weight)
 
-    transferred_to_sample = transferred
+    def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        return self._scaled(self._transfer.transferred_to_sample(points, actions, own_weight), own_weight)
+
+    def _scaled(self, given: TransferredInstances, own_weight: np.ndarray) -> TransferredInstances:
+        task = self._transfer.task
+        assert task is not None
+        check_transferred(given, self._transfer, own_weight, len(task.scaling.low), task.exploration_threshold)
+        return given._replace(effect=self._correspondence.effects_of_learner(given.effect))
+
+    def note_use(self, given: TransferredInstances) -> None:
+        self._transfer.note_use(given._replace(effect=self._correspondence.effects(given.effect)))

@@ -62,9 +62,6 @@ class FittedRMaxPolicy(BasePolicy):
         states, actions = (() if names is None else names for names in (state_names, action_names))
         task = Task(self.scales.scaling, int(action_space.n), states, actions, self.scales.bounds)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
-        if self.transfer is not None and self.transfer.use != "prior":
-            # What was used, and what that paid, cannot be computed anew from transitions in other coordinates.
-            self.scales.keep_bounds()
         self._renew_to_unit()
         self._first_action = int(action_space.start)
         self._settings = settings

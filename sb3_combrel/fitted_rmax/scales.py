@@ -39,11 +39,6 @@ class FoundScales:
         self._by_use = unbounded.copy()
         self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
 
-    def keep_bounds(self) -> None:
-        """From now on a variable that has bounds keeps them, and all correspond to others by the bounds in use."""
-        self._found &= self._by_use
-        self._by_use[:] = True
-
     @property
     def bounds(self) -> StateScaling:
         """The user's or the space's bounds, and for a variable without any those in use."""

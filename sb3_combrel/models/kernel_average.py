@@ -89,12 +89,13 @@ def weigh(instances, grid, kernel, threshold, pairs, near, found):
 
 
 @inlined
-def entry_distance(near, length, total, kernel):
-    """The squared distance within which a further instance would enter a list."""
+def entry_distance(near, length, total, kernel, threshold):
+    """The squared distance within which a further instance would enter a list, or count in :func:`weight_ever`."""
     breadth, min_weight, min_fraction = kernel
     least = min_weight
     if length > 0:
-        least = max(min_weight, min(near.weight[length - 1], min_fraction * total))
+        counts = min_fraction * min(total, threshold / (1.0 + min_fraction))
+        least = max(min_weight, min(near.weight[length - 1], counts))
     return -np.log(least) * breadth * breadth * (1 + 1e-12)
 
 
@@ -120,7 +121,7 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
         known = weight >= threshold
         pairs.weight[pair], pairs.known[pair] = weight, known
-        pairs.reach[pair] = entry_distance(near, length, total, kernel)
+        pairs.reach[pair] = entry_distance(near, length, total, kernel, threshold)
         pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
         joined = not known and transferred.length[done] > 0
         if known or joined:

@@ -52,6 +52,9 @@ def test_scale_into_box_is_to_unit_moved_into_the_box_if_that_is_fixed_and_notes
     np.testing.assert_array_equal(observed, [least, most])
     outside = (scaling.to_unit(states) != np.clip(scaling.to_unit(states), 0.0, 1.0)).sum(axis=0)
     np.testing.assert_array_equal(n_outside, [*outside, 100])
+    rounded = np.float32([[1.0, 5.0, 11.0]]) * (1.0 + 1e-7)
+    assert scale_into_box(rounded.astype(np.float64), *scales, True, observed, n_outside, units[:1])
+    np.testing.assert_array_equal(n_outside, [*outside, 101])
     assert not scale_into_box(scaling.to_raw(np.full((1, 3), 0.5)), *scales, True, nothing, n_outside, units[:1])
     assert scale_into_box(np.full((1, 3), np.nan), *scales, True, nothing, n_outside, units[:1])
 

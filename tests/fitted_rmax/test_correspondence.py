@@ -62,16 +62,21 @@ METHODS = {
     "prior": lambda: TIMBREL(wide_source(), SAME, use="prior"),
     "chosen": lambda: COMBREL(wide_source()),
 }
+INSTANCES = {
+    "given instances": lambda: TIMBREL(wide_source(), SAME, use="instances", breadth=0.01),
+    "chosen instances": lambda: COMBREL(wide_source(), "injective", use="instances", breadth=0.01),
+}
 
 
-@pytest.mark.parametrize("make", METHODS.values(), ids=METHODS)
+@pytest.mark.parametrize("make", (METHODS | INSTANCES).values(), ids=METHODS | INSTANCES)
 def test_a_source_fits_a_target_whose_scales_are_finer_than_its_bounds(make, tmp_path):
     model = learnt(make())
     scaling, seen = model.policy.scaling, model.transfer.task.scaling
     assert scaling.high[0] - scaling.low[0] < 4.0
     np.testing.assert_array_equal((seen.low[0], seen.high[0]), (-20.0, 20.0))
-    assert model.transfer.region_errors.task.scaling == seen
-    assert model.transfer.statistics()["transfer/prediction_error"] < 0.1
+    if model.transfer.use == "prior":
+        assert model.transfer.region_errors.task.scaling == seen
+        assert model.transfer.statistics()["transfer/prediction_error"] < 0.1
     model.save(tmp_path / "wide")
     assert same_parameters(model, FittedRMax.load(tmp_path / "wide"))
 
@@ -85,20 +90,55 @@ def test_what_a_source_predicts_is_the_same_in_raw_units():
         np.testing.assert_allclose(given.effect * (scaling.high - scaling.low), [[effect, 0.0]] * 5, atol=0.02)
 
 
-def test_with_transferred_instances_variables_keep_their_bounds():
+def test_transferred_instances_are_the_same_in_raw_units():
     model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
-    assert model.agent.correspondence.same
-    np.testing.assert_array_equal((model.policy.scaling.low[0], model.policy.scaling.high[0]), (-20.0, 20.0))
+    assert model.policy.scaling.high[0] - model.policy.scaling.low[0] < 4.0
+    agent, width = model.agent, model.policy.scaling.high - model.policy.scaling.low
+    points = np.arange(agent.grid.n_points)
+    units = agent.grid.points()[points]
+    for action, effect in enumerate((-STRIDE, STRIDE)):
+        actions, nothing = np.full(len(points), action), np.zeros(len(points))
+        for found in (
+            agent.model.transfer.transferred(units, actions, nothing),
+            agent.model.transfer.transferred_to_sample(points, actions, nothing),
+        ):
+            used = np.arange(found.weight.shape[1]) < found.length[: len(points), None]
+            assert used.sum() > 5
+            moved = found.effect[: len(points)][used] * width
+            np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-9)
+            assert (np.abs(moved[:, 0] - effect) < 0.02).mean() > 0.5
 
 
-def test_what_was_learned_of_a_source_stays_when_the_learner_is_scaled_anew():
-    model = learnt(METHODS["chosen"]())
+def test_what_a_method_hears_of_its_use_is_what_it_gave(monkeypatch):
+    given, used = [], []
+    transferred, note_use = TIMBREL.transferred, TIMBREL.note_use
+    monkeypatch.setattr(TIMBREL, "transferred", lambda self, *asked: given.append(transferred(self, *asked)) or given[-1])
+    monkeypatch.setattr(TIMBREL, "note_use", lambda self, found: used.append((given[-1], found)) or note_use(self, found))
+    model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
+    assert not model.agent.correspondence.same and len(used) > 10
+    for one, other in used[-10:]:
+        np.testing.assert_allclose(one.effect, other.effect, rtol=1e-9)
+        assert one.weight is other.weight
+
+
+def test_what_does_not_fit_is_said_of_the_method(monkeypatch):
+    model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
+    monkeypatch.setattr(TIMBREL, "transferred", lambda self, *asked: None)
+    with pytest.raises(ValueError, match="TIMBREL"):
+        model.agent.model.transfer.transferred(np.zeros((1, 2)), np.zeros(1, dtype=np.int64), np.zeros(1))
+
+
+@pytest.mark.parametrize("make", (METHODS["chosen"], INSTANCES["chosen instances"]), ids=("prior", "instances"))
+def test_what_was_learned_of_a_source_stays_when_the_learner_is_scaled_anew(make):
+    model = learnt(make())
     agent, transfer, bounds = model.agent, model.transfer, model.agent.task.shared_scaling
     before, n_instances = transfer.get_state(), agent.model.n_instances
     agent.rescale(StateScaling([-2.0, 0.0], [2.0, 2.0]), bounds)
     assert agent.model.n_instances == n_instances
     for name, array in transfer.get_state().items():
         np.testing.assert_array_equal(array, before[name], err_msg=name)
+    if transfer.use != "prior":
+        return
     states, actions = np.array([[0.5, 0.5]] * 2), np.arange(2)
     given = agent.model.transfer.prior(states, actions)
     np.testing.assert_allclose(given.effect[:, 0] * 4.0, [-STRIDE, STRIDE], atol=0.02)

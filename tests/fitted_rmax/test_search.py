@@ -9,8 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_combrel import FittedRMax
+from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.fitted_rmax import agent as agents
 from sb3_combrel.fitted_rmax.search import worth_after_visits
+from tests.helpers.own_method import Mine
 
 LIMIT, NEEDLE, RADIUS = 60, np.array([0.5, 0.55]), 0.03
 
@@ -79,6 +81,39 @@ def test_all_places_are_visited_again_and_again_where_there_is_nothing():
 def test_the_papers_kernel_average_is_what_it_is():
     average = searcher(needle=NOWHERE, degree=0).learn(300).agent
     assert average.planner.worth is average.planner.upper
+
+
+class Later(Mine):
+    """Transfers nothing before it has observed so many transitions, as a method does that first has to find a mapping."""
+
+    def __init__(self, first=10**6):
+        super().__init__()
+        self.first, self.n = first, 0
+
+    def observe(self, *transition):
+        super().observe(*transition)
+        self.n += 1
+
+    def transferred(self, states, actions, own_weight):
+        if self.n < self.first:
+            return TransferredInstances.empty(len(actions), states.shape[1])
+        return super().transferred(states, actions, own_weight)
+
+
+@pytest.mark.parametrize("degree", (0, 1))
+def test_a_method_that_transfers_nothing_changes_nothing(degree):
+    alone, beside = (searcher(NOWHERE, degree=degree, transfer=each).learn(300).agent for each in (None, Later()))
+    assert (alone.planner.worth is alone.planner.upper) == (degree == 0)
+    for one, other in zip(alone.model.transitions(), beside.model.transitions(), strict=True):
+        np.testing.assert_array_equal(np.hstack(one), np.hstack(other))
+    np.testing.assert_allclose(alone.planner.values, beside.planner.values, rtol=1e-9)
+
+
+def test_the_search_ends_where_instances_are_transferred():
+    model = searcher(NOWHERE, transfer=Later(100)).learn(99)
+    assert model.agent.planner.worth is not model.agent.planner.upper
+    agent = model.learn(2, reset_num_timesteps=False).agent
+    assert agent.planner.worth is agent.planner.upper and not agent.rewards.differ
 
 
 def test_a_search_that_is_saved_goes_on_as_the_one_that_was_not(tmp_path):

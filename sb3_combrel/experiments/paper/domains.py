@@ -57,9 +57,16 @@ class Domain:
         return STATE_NAMES[2], ACTION_NAMES[2]
 
 
-# Table 1 of the paper. It names no breadth for transferred instances: the only one that it names is taken for both.
+# Table 1 of the paper. It names no breadth for transferred instances: the only one that it names is taken for both. States are
+# scaled by the bounds of their variables, whether instances are transferred or not.
 _CAR_PAPER = Setting(
-    learner={"degree": 0, "model_breadth": 0.4, "min_fraction": 0.1, "min_weight": 0.01},
+    learner={
+        "degree": 0,
+        "model_breadth": 0.4,
+        "min_fraction": 0.1,
+        "min_weight": 0.01,
+        "bounds": [[-1.2, -1.2, -0.07, -0.07], [0.6, 0.6, 0.07, 0.07]],
+    },
     max_episode_steps=4000,
     mappings="paper_mountain_car",
     combrel={"breadth": 0.4, "n_neighbors": 3},
@@ -70,7 +77,14 @@ _CAR_BEST = Setting(learner={}, max_episode_steps=2000, mappings="signed_factore
 
 # Table 3.
 _ICUB_PAPER = Setting(
-    learner={"degree": 0, "model_breadth": 0.1, "min_fraction": 0.01, "min_weight": 0.01, **icub_arm.LEARNER},
+    learner={
+        "degree": 0,
+        "model_breadth": 0.1,
+        "min_fraction": 0.01,
+        "min_weight": 0.01,
+        "bounds": [[-95.5, 0.0, -37.0, 15.0], [10.0, 160.8, 80.0, 106.0]],
+        **icub_arm.LEARNER,
+    },
     max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
     mappings="paper_icub",
     combrel={"breadth": 0.1, "n_neighbors": 3},

@@ -61,6 +61,12 @@ def test_the_methods_that_exist(domain, setting):
     assert set(found) == EXISTING[domain, setting] and found == [name for name in m.METHODS if name in found]
 
 
+@pytest.mark.parametrize("domain", DOMAINS.values(), ids=DOMAINS)
+def test_the_papers_learner_scales_by_the_bounds_of_the_task(domain):
+    space = make_env(domain.target_id).observation_space
+    np.testing.assert_allclose(domain.settings[PAPER].learner["bounds"], (space.low, space.high), rtol=1e-6)
+
+
 @pytest.mark.parametrize(("domain", "setting"), EXISTING)
 def test_every_method_binds_to_its_target_and_learns(domain, setting, sources):
     chosen = DOMAINS[domain].settings[setting]
