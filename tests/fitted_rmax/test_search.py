@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_combrel import FittedRMax
-from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.fitted_rmax import agent as agents
 from sb3_combrel.fitted_rmax.search import worth_after_visits
 from tests.helpers.own_method import Mine
@@ -100,9 +100,18 @@ class Later(Mine):
         return super().transferred(states, actions, own_weight)
 
 
-@pytest.mark.parametrize("degree", (0, 1))
-def test_a_method_that_transfers_nothing_changes_nothing(degree):
-    alone, beside = (searcher(NOWHERE, degree=degree, transfer=each).learn(300).agent for each in (None, Later()))
+class SilentPrior(Later):
+    """A prior that says nothing."""
+
+    use = "prior"
+
+    def prior(self, states, actions):
+        return PriorPredictions.nothing(*states.shape)
+
+
+@pytest.mark.parametrize(("degree", "nothing"), [(0, Later), (1, Later), (1, SilentPrior)])
+def test_a_method_that_transfers_nothing_changes_nothing(degree, nothing):
+    alone, beside = (searcher(NOWHERE, degree=degree, transfer=each).learn(300).agent for each in (None, nothing()))
     assert (alone.planner.worth is alone.planner.upper) == (degree == 0)
     for one, other in zip(alone.model.transitions(), beside.model.transitions(), strict=True):
         np.testing.assert_array_equal(np.hstack(one), np.hstack(other))
