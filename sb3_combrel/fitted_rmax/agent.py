@@ -338,6 +338,12 @@ class FittedRMaxAgent:
             if self.transfer is not None and self.model.n_instances == 0:
                 self._plan(SWEEPS_AT_EPISODE_END)
 
+    def plan_anew(self) -> None:
+        """Plan from the upper bounds on: what values were before does not count."""
+        with self._lock:
+            self.planner.restore(self.planner.upper)
+            self._plan(SWEEPS_AT_EPISODE_END)
+
     def _plan(self, max_sweeps: int) -> None:
         """Update the rows of the pairs that changed, and sweep over the grid."""
         began = perf_counter() if self.timed else None
@@ -357,12 +363,16 @@ class FittedRMaxAgent:
     def _search(self) -> None:
         """Let places be worth what they are after the visits to them, as long as nothing has been found."""
         # Transferred instances tell what is where; a prior does so by its bound on values.
-        transferred = (self.mdp.arrays.modelled & ~self.model.known).any()
-        if not self.model.searches or self.rewards.differ or transferred or self.model.n_instances == 0:
+        if not self.model.searches or self.rewards.differ or self.transfers or self.model.n_instances == 0:
             self.planner.set_worth(None)
             return
         visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)
         self.planner.set_worth(worth_after_visits(self.planner.upper, visits, self.rewards.lowest, self.mdp.gamma))
+
+    @property
+    def transfers(self) -> bool:
+        """Whether there are pairs that transferred instances model."""
+        return bool((self.mdp.arrays.modelled & ~self.model.known).any())
 
     def _follow_rewards(self) -> None:
         """Plan with other optimism, or another discount, if what rewards have shown asks for it."""

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel.common.constants import BEYOND, TOO_WIDE
+from sb3_combrel.common.periodic import check_periods
 from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling, around_zero
 
 
@@ -17,27 +18,33 @@ class FoundScales:
     Those that the user gives stay as they are. Otherwise it begins with the observation space's, where these are finite; a
     variable without bounds, or one that uses less than half of them by the end of an episode, is scaled by the range of its
     observations, and again when one lies beyond. There is no margin: nobody has been there, and it would draw the agent.
-    Periodic variables keep their bounds.
+    Periodic variables keep their bounds; once instances are transferred, all that have some do: where everything has a model,
+    nothing draws the agent beyond the range of its observations.
 
     :param space: observation space
     :param bounds: of the user; None: to be found
     :param periodic: one bool for each state variable
-    :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, or the bounds do not fit it
+    :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, the bounds do not fit it, or a
+        periodic variable has none
     """
 
     def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray):
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
         self._found = ~periodic & (bounds is None)
-        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
+        # A space may hold a variable that never changes between bounds without a width.
+        unbounded = ~((np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND) & (low < high))
+        check_periods(periodic & unbounded)
         #: What the space allows, raw units.
-        self.low = np.where(low > -LARGEST_BOUND, low, -np.inf)
-        self.high = np.where(high < LARGEST_BOUND, high, np.inf)
+        self.low = np.where((low > -LARGEST_BOUND) & (low < high), low, -np.inf)
+        self.high = np.where((high < LARGEST_BOUND) & (low < high), high, np.inf)
         #: The least and the largest observation of each variable, raw units, shape (2, n_variables).
         self.observed = np.stack([np.full(len(low), np.inf), np.full(len(low), -np.inf)])
         # Variables that correspond to others by the bounds in use, as they have none of their own.
         self._by_use = unbounded.copy()
         self.scaling = StateScaling(np.where(unbounded, -1.0, low), np.where(unbounded, 1.0, high))
+        # Whether instances have been transferred.
+        self._whole = False
 
     @property
     def bounds(self) -> StateScaling:
@@ -45,11 +52,13 @@ class FoundScales:
         in_use = self.scaling
         return StateScaling(np.where(self._by_use, in_use.low, self.low), np.where(self._by_use, in_use.high, self.high))
 
-    def renewed(self, episode_ended: bool) -> StateScaling | None:
+    def renewed(self, episode_ended: bool, transfers: bool = False) -> StateScaling | None:
         """Return other scales if the observations ask for them, and None otherwise.
 
         :param episode_ended: only then is a variable scaled more finely
+        :param transfers: whether instances are transferred
         """
+        self._whole = self._whole or transfers
         least, most = self.observed
         low, high = self.scaling.low, self.scaling.high
         used, given = most - least, high - low
@@ -57,7 +66,8 @@ class FoundScales:
         beyond = (least < low - tolerated) | (most > high + tolerated)
         # A variable that never changes has no scale.
         too_wide = (given > TOO_WIDE * used) & (used > 0.0) if episode_ended else np.zeros(len(low), dtype=np.bool_)
-        renewed = self._found & (beyond | too_wide)
+        whole = self._found & ~self._by_use & self._whole
+        renewed = np.where(whole, (low > self.low) | (high < self.high), self._found & (beyond | too_wide))
         if not renewed.any():
             return None
         # A single observation has no range.
@@ -66,6 +76,7 @@ class FoundScales:
         # No farther than the space allows, unless an observation lies beyond that.
         low = np.where(renewed, np.maximum(wanted_low, np.minimum(self.low, least)), low)
         high = np.where(renewed, np.minimum(wanted_high, np.maximum(self.high, most)), high)
+        low, high = np.where(whole, self.low, low), np.where(whole, self.high, high)
         self.scaling = StateScaling(low, high)
         return self.scaling
 
@@ -78,14 +89,18 @@ class FoundScales:
         return beyond
 
     def get_state(self) -> np.ndarray:
-        """Bounds in use and range of the observations, float64, shape (4 * n_variables,), for :meth:`set_state`."""
+        """What :meth:`set_state` takes: bounds in use, range of the observations, and whether instances have been transferred.
+
+        :return: float64, shape (4 * n_variables + 1,)
+        """
         rows = np.vstack([self.scaling.low, self.scaling.high, self.observed])
         limit = np.finfo(np.float64).max
-        return np.nan_to_num(rows, posinf=limit, neginf=-limit).ravel()
+        return np.append(np.nan_to_num(rows, posinf=limit, neginf=-limit).ravel(), float(self._whole))
 
     def set_state(self, state: np.ndarray) -> None:
         """Take over what :meth:`get_state` returned."""
-        low, high, *observed = state.reshape(4, -1)
+        self._whole = bool(state[-1] > 0.5)
+        low, high, *observed = state[:-1].reshape(4, -1)
         limit = np.finfo(np.float64).max
         self.observed = np.where(np.abs(observed) == limit, np.copysign(np.inf, observed), observed)
         # Whatever a file says.

@@ -9,7 +9,9 @@ from hypothesis.extra.numpy import arrays
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.fitted_rmax.correspondence import Correspondence
+from sb3_combrel.fitted_rmax.scales import FoundScales
 
 numbers = st.floats(-100.0, 100.0)
 ranges = st.floats(0.1, 100.0)
@@ -62,21 +64,16 @@ METHODS = {
     "prior": lambda: TIMBREL(wide_source(), SAME, use="prior"),
     "chosen": lambda: COMBREL(wide_source()),
 }
-INSTANCES = {
-    "given instances": lambda: TIMBREL(wide_source(), SAME, use="instances", breadth=0.01),
-    "chosen instances": lambda: COMBREL(wide_source(), "injective", use="instances", breadth=0.01),
-}
 
 
-@pytest.mark.parametrize("make", (METHODS | INSTANCES).values(), ids=METHODS | INSTANCES)
+@pytest.mark.parametrize("make", METHODS.values(), ids=METHODS)
 def test_a_source_fits_a_target_whose_scales_are_finer_than_its_bounds(make, tmp_path):
     model = learnt(make())
     scaling, seen = model.policy.scaling, model.transfer.task.scaling
     assert scaling.high[0] - scaling.low[0] < 4.0
     np.testing.assert_array_equal((seen.low[0], seen.high[0]), (-20.0, 20.0))
-    if model.transfer.use == "prior":
-        assert model.transfer.region_errors.task.scaling == seen
-        assert model.transfer.statistics()["transfer/prediction_error"] < 0.1
+    assert model.transfer.region_errors.task.scaling == seen
+    assert model.transfer.statistics()["transfer/prediction_error"] < 0.1
     model.save(tmp_path / "wide")
     assert same_parameters(model, FittedRMax.load(tmp_path / "wide"))
 
@@ -90,45 +87,75 @@ def test_what_a_source_predicts_is_the_same_in_raw_units():
         np.testing.assert_allclose(given.effect * (scaling.high - scaling.low), [[effect, 0.0]] * 5, atol=0.02)
 
 
-def test_transferred_instances_are_the_same_in_raw_units():
+NARROW = StateScaling([-2.0, 0.0], [2.0, 2.0])
+
+
+@pytest.fixture
+def instances():
+    """What transfers instances to a learner that has them, and the same for one with narrower scales."""
     model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
-    assert model.policy.scaling.high[0] - model.policy.scaling.low[0] < 4.0
-    agent, width = model.agent, model.policy.scaling.high - model.policy.scaling.low
-    points = np.arange(agent.grid.n_points)
-    units = agent.grid.points()[points]
+    correspondence = Correspondence(NARROW, model.agent.task.shared_scaling)
+    return model.transfer, correspondence.of_learner(model.transfer)
+
+
+def test_once_instances_are_transferred_variables_take_all_of_their_bounds(tmp_path):
+    class Later(TIMBREL):
+        """Transfers from the 32nd transition on."""
+
+        n = 0
+
+        def observe(self, *transition):
+            super().observe(*transition)
+            self.n += 1
+
+        def transferred(self, states, actions, own_weight):
+            found = super().transferred(states, actions, own_weight)
+            return found if self.n >= 32 else TransferredInstances.empty(len(actions), states.shape[1])
+
+        def transferred_to_sample(self, points, actions, own_weight):
+            return self.transferred(self.task.sample_states[points], actions, own_weight)
+
+    model = FittedRMax(WideWalk(), transfer=Later(wide_source(), SAME, breadth=0.01), seed=0, resolution=3).learn(31)
+    assert model.policy.scaling.high[0] - model.policy.scaling.low[0] < 4.0 and not model.agent.transfers
+    model.learn(60, reset_num_timesteps=False)
+    for each in (model, model.learn(40, reset_num_timesteps=False)):
+        assert (each.policy.scaling.low[0], each.policy.scaling.high[0]) == (-20.0, 20.0)
+    kept = FoundScales(model.observation_space, None, np.zeros(2, dtype=bool))
+    kept.set_state(model.policy.scales.get_state())
+    assert kept.renewed(episode_ended=True) is None
+
+
+def test_transferred_instances_are_the_same_in_raw_units(instances):
+    states = np.column_stack([np.linspace(0.3, 0.7, 40), np.full(40, 0.5)])
+    points = np.arange(len(instances[0].task.sample_states))
     for action, effect in enumerate((-STRIDE, STRIDE)):
-        actions, nothing = np.full(len(points), action), np.zeros(len(points))
-        for found in (
-            agent.model.transfer.transferred(units, actions, nothing),
-            agent.model.transfer.transferred_to_sample(points, actions, nothing),
-        ):
-            used = np.arange(found.weight.shape[1]) < found.length[: len(points), None]
-            assert used.sum() > 5
-            moved = found.effect[: len(points)][used] * width
-            np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-9)
-            assert (np.abs(moved[:, 0] - effect) < 0.02).mean() > 0.5
+        for ask, at in ((instances[1].transferred, states), (instances[1].transferred_to_sample, points)):
+            found = ask(at, np.full(len(at), action), np.zeros(len(at)))
+            used = np.arange(found.weight.shape[1]) < found.length[: len(at), None]
+            moved = found.effect[: len(at)][used] * 4.0
+            assert len(moved) > 1 and (np.abs(moved - effect) < 0.02).any(axis=1).mean() > 0.5
 
 
-def test_what_a_method_hears_of_its_use_is_what_it_gave(monkeypatch):
-    given, used = [], []
-    transferred, note_use = TIMBREL.transferred, TIMBREL.note_use
-    monkeypatch.setattr(TIMBREL, "transferred", lambda self, *asked: given.append(transferred(self, *asked)) or given[-1])
-    monkeypatch.setattr(TIMBREL, "note_use", lambda self, found: used.append((given[-1], found)) or note_use(self, found))
-    model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
-    assert not model.agent.correspondence.same and len(used) > 10
-    for one, other in used[-10:]:
-        np.testing.assert_allclose(one.effect, other.effect, rtol=1e-9)
-        assert one.weight is other.weight
+def test_what_a_method_hears_of_its_use_is_what_it_gave(instances, monkeypatch):
+    method, of_learner = instances
+    used = []
+    monkeypatch.setattr(type(method), "note_use", lambda self, found: used.append(found))
+    asked = np.array([[0.5, 0.5]] * 2), np.arange(2), np.zeros(2)
+    of_learner.note_use(of_learner.transferred(*asked))
+    given = method.transferred(Correspondence(NARROW, method.task.scaling).states(asked[0]), *asked[1:])
+    np.testing.assert_allclose(used[0].effect, given.effect, rtol=1e-9)
+    np.testing.assert_array_equal(used[0].weight, given.weight)
 
 
-def test_what_does_not_fit_is_said_of_the_method(monkeypatch):
-    model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
+def test_what_does_not_fit_is_said_of_the_method(instances, monkeypatch):
     monkeypatch.setattr(TIMBREL, "transferred", lambda self, *asked: None)
     with pytest.raises(ValueError, match="TIMBREL"):
-        model.agent.model.transfer.transferred(np.zeros((1, 2)), np.zeros(1, dtype=np.int64), np.zeros(1))
+        instances[1].transferred(np.zeros((1, 2)), np.zeros(1, dtype=np.int64), np.zeros(1))
 
 
-@pytest.mark.parametrize("make", (METHODS["chosen"], INSTANCES["chosen instances"]), ids=("prior", "instances"))
+@pytest.mark.parametrize(
+    "make", (METHODS["chosen"], lambda: COMBREL(wide_source(), use="instances", breadth=0.01)), ids=("prior", "instances")
+)
 def test_what_was_learned_of_a_source_stays_when_the_learner_is_scaled_anew(make):
     model = learnt(make())
     agent, transfer, bounds = model.agent, model.transfer, model.agent.task.shared_scaling

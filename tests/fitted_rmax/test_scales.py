@@ -152,7 +152,7 @@ def test_given_bounds_and_those_of_periodic_variables_stay(observations, given_b
 def test_they_come_back_from_their_state_and_go_on(before, later):
     scales = FoundScales(UNBOUNDED, None, NOT_PERIODIC) if before is None else after(before)
     state = scales.get_state()
-    assert state.shape == (8,) and np.isfinite(state).all()
+    assert state.shape == (9,) and np.isfinite(state).all()
     restored = FoundScales(UNBOUNDED, None, NOT_PERIODIC)
     restored.set_state(state)
     for each in (scales, restored):
