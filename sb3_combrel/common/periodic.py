@@ -43,6 +43,15 @@ def periodic_flags(periodic: object, n_variables: int) -> tuple[bool, ...]:
     return tuple(bool(flag) for flag in flags)
 
 
+def check_periods(unbounded: NDArray[np.bool_]) -> None:
+    """:raises ValueError: if a variable is periodic and has no bounds, shape (n_variables,), by which its period were known"""
+    if unbounded.any():
+        raise ValueError(
+            f"periodic variables must have finite bounds, one period apart, got none for variable(s) "
+            f"{np.flatnonzero(unbounded).tolist()}: pass bounds=(low, high), such as -numpy.pi and numpy.pi for an angle"
+        )
+
+
 def flag_array(periodic: Sequence[bool] | NDArray[np.bool_] | None, n_variables: int) -> NDArray[np.bool_]:
     """Return the flags as an array for compiled code; None: no variable is periodic."""
     return np.zeros(n_variables, dtype=np.bool_) if periodic is None else np.array(periodic, dtype=np.bool_)

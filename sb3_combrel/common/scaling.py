@@ -70,7 +70,7 @@ class StateScaling:
         # A variable that never changes has no scale.
         around = np.where(most > least, 0.0, 0.5)
         found_low, found_high = around_zero(least - around, most + around)
-        unbounded = ~(np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND)
+        unbounded = ~((np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND) & (np.asarray(low) < high))
         return cls(np.where(unbounded, found_low, low), np.where(unbounded, found_high, high))
 
     @staticmethod

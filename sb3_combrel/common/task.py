@@ -17,7 +17,7 @@ class Task:
     :param state_names: names of the state variables, for display; by default s0, s1, ...
     :param action_names: names of the actions, for display; by default a0, a1, ...
     :param bounds: raw <-> the unit coordinates in which variables correspond to those of other tasks; None: ``scaling``
-    :raises ValueError: if there are names, but not one for each variable or action
+    :raises ValueError: if there are names, but not one for each variable or action, all different
     """
 
     scaling: StateScaling
@@ -32,6 +32,8 @@ class Task:
             is_list = isinstance(names, Sequence) and not isinstance(names, str)
             if not (is_list and len(names) in (0, n) and all(isinstance(name, str) for name in names)):
                 raise ValueError(f"{argument} must be {n} names or None, got {names!r}")
+            if len(set(names)) < len(names):
+                raise ValueError(f"{argument} must be different names, got {names!r}")
             object.__setattr__(self, argument, tuple(names or (f"{letter}{k}" for k in range(n))))
 
     @property

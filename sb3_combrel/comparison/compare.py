@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -223,7 +224,7 @@ def check_methods(methods: Any, baseline: Any) -> str:
 
 def check_seeds(seeds: Any) -> list[int]:
     """Return the seeds."""
-    if isinstance(seeds, Sequence) and not isinstance(seeds, str):
+    if isinstance(seeds, Sequence | np.ndarray) and not isinstance(seeds, str):
         numbers = [as_count("seeds", seed, min=0, max=MAX_SEED) for seed in seeds]
         if not numbers or len(set(numbers)) < len(numbers):
             raise ValueError(f"seeds must be different whole numbers, at least one, got {list(seeds)!r}")

@@ -131,6 +131,9 @@ class CompareResult:
         axes.legend(frameon=False)
         return figure
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         return "\n\n".join([self.sentence, *self.warnings, self.table])
 

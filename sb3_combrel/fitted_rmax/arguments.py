@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import reprlib
 from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
@@ -20,10 +21,18 @@ MAX_SEED = 2**32 - 1
 
 
 def policy_and_env(policy: Any, env: Any, aliases: Container[str]) -> tuple[Any, Any]:
-    """Policy and environment: of the constructor's first two arguments the policy may be the first, the second or none."""
+    """Policy and environment: of the constructor's first two arguments the policy may be the first, the second or none.
+
+    :raises ValueError: if none of two is a policy
+    """
     if _is_policy(policy, aliases):
         return policy, env
-    return (env if _is_policy(env, aliases) else DEFAULT_POLICY), policy
+    if env is None or _is_policy(env, aliases):
+        return (DEFAULT_POLICY if env is None else env), policy
+    raise ValueError(
+        "the first arguments must be an environment, or a policy and an environment, and others be given by name, such as "
+        f"transfer=COMBREL(source), got {reprlib.repr(policy)} and {reprlib.repr(env)}"
+    )
 
 
 def _is_policy(thing: Any, aliases: Container[str]) -> bool:
@@ -43,9 +52,11 @@ def check_actions(action_space: spaces.Space[Any]) -> None:
         message += f"; take a few of the continuous ones: env = gymnasium.wrappers.DiscretizeAction(env, bins={bins})"
     if isinstance(action_space, spaces.MultiDiscrete | spaces.MultiBinary) and len(action_space.shape) == 1:
         sizes = np.broadcast_to(getattr(action_space, "nvec", 2), action_space.shape).tolist()
+        start = np.broadcast_to(getattr(action_space, "start", 0), action_space.shape).tolist()
         message += (
             "; number the combinations: env = gymnasium.wrappers.TransformAction(env, lambda action: "
-            f"numpy.array(numpy.unravel_index(action, {tuple(sizes)})), gymnasium.spaces.Discrete({math.prod(sizes)}))"
+            f"numpy.array(numpy.unravel_index(action, {tuple(sizes)})){f' + {start}' if any(start) else ''}, "
+            f"gymnasium.spaces.Discrete({math.prod(sizes)}))"
         )
     raise ValueError(message)
 

@@ -163,12 +163,12 @@ class FittedRMax(PastData):
             environment,
             learning_rate=0.0,
             policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
+            stats_window_size=int(stats_window_size) if isinstance(stats_window_size, np.integer) else stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
             support_multi_env=True,
-            seed=seed,
+            seed=seed.item() if isinstance(seed, np.integer) else seed,
         )
         self.transfer = transfer
         self.model_breadth = model_breadth
@@ -216,6 +216,8 @@ class FittedRMax(PastData):
         # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
         self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
+        #: Unit coordinates of the last observations while it learns, shape (n_envs, n_variables).
+        self._last_states: np.ndarray | None = None
         self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
         # They are saved with what was learned from them.
         given, self.instances = self.instances, None
@@ -293,6 +295,7 @@ class FittedRMax(PastData):
                     break
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
         finally:
+            self._last_states = None
             callback.on_training_end()
         self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
         return self
@@ -303,16 +306,13 @@ class FittedRMax(PastData):
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Make one step of every environment; return False if a callback stops the learning."""
-        assert self.env is not None and isinstance(self._last_obs, np.ndarray)
+        assert self.env is not None and self._last_states is not None
         states = self._last_states
         choices = [self.agent.act(state, environment=e) for e, state in enumerate(states)]
         actions = np.array(choices) + self.policy._first_action
-        try:
-            new_obs, rewards, dones, infos = self.env.step(actions)
-        except BaseException:
-            # An interrupt, or a simulator's error: where the environment is now nobody knows. The next ``learn`` resets it.
-            self._last_obs = None
-            raise
+        # An interrupt, or a simulator's error: where the environment is now nobody knows. The next ``learn`` resets it.
+        self._last_obs = None
+        new_obs, rewards, dones, infos = self.env.step(actions)
         self.num_timesteps += self.env.num_envs
         self._update_info_buffer(infos, dones)
         raw_rewards = self._raw_rewards(rewards)
@@ -326,14 +326,17 @@ class FittedRMax(PastData):
         self._last_states = self.policy.note(np.asarray(new_obs)) if ended else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
-        # The end of an episode is processed even if a callback stops the learning at this step.
-        going_on = callback.on_step()
-        for e in ended:
-            self._end_episode(e, terminated[e])
-            if log_interval is not None and self._episode_num % log_interval == 0:
-                callback.on_rollout_end()
-                self.dump_logs()
-                callback.on_rollout_start()
+        try:
+            going_on = callback.on_step()
+        finally:
+            # Also if a callback stops the learning at this step, or raises.
+            before = self._episode_num
+            for e in ended:
+                self._end_episode(e, terminated[e])
+        if log_interval is not None and self._episode_num // log_interval > before // log_interval:
+            callback.on_rollout_end()
+            self.dump_logs()
+            callback.on_rollout_start()
         if self.policy.follow_scales(episode_ended=bool(ended)):
             self._last_states = self.policy.to_unit(np.asarray(new_obs))
         return going_on

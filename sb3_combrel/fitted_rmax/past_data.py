@@ -34,6 +34,7 @@ class PastData(SavedAlgorithm):
     """What :class:`~sb3_combrel.FittedRMax` does with experience that it has not made itself."""
 
     env: VecEnv | None
+    _last_states: np.ndarray | None
 
     def load_instances(self: SelfPastData, instances: Any, n_instances: int = 1000) -> SelfPastData:
         """Take in past transitions of the same task, as if the agent had made them: known at once, and planned with.
@@ -53,6 +54,9 @@ class PastData(SavedAlgorithm):
         """
         found = self._of_this_task(self._read_instances(instances, n_instances))
         self.policy.take_in(found.states, found.actions, found.rewards, found.next_states, found.terminated)
+        if self._last_states is not None:
+            # A callback has called this: scales may be other ones now.
+            self._last_states = self.policy.to_unit(np.asarray(self._last_obs))
         return self
 
     def source_instances(self) -> SourceInstances:
@@ -118,6 +122,11 @@ class PastData(SavedAlgorithm):
     def _act(self, controller: Callable[[np.ndarray], int] | Any, n_instances: int) -> SourceInstances:
         if self.env is None:
             raise ValueError("instances must be data where the model has no environment to act in: call set_env(env) first")
+        if self._last_states is not None:
+            raise ValueError(
+                "instances must be data while the model learns, as its environment is in use: record a controller in another, "
+                "load_instances(SourceInstances.record(controller, env, n_instances))"
+            )
         found = SourceInstances.record(controller, self.env, n_instances, self.seed)
         # The environment is in the middle of an episode of the controller's: the next ``learn`` begins one of its own.
         self._last_obs = None
@@ -135,6 +144,9 @@ class PastData(SavedAlgorithm):
             return type(self).load(path).source_instances()
         if path.is_file() or path.suffix == ".npz" or path.with_name(f"{path.name}.npz").is_file():
             return SourceInstances.load(path)
+        for suffix in (".zip", ".pkl"):
+            if (saved := path.with_name(f"{path.name}{suffix}")).is_file():
+                return self._read_file(saved, names)
         try:
             return SourceInstances.from_minari(str(path))
         except (FileNotFoundError, ImportError) as error:
@@ -150,6 +162,9 @@ class PastData(SavedAlgorithm):
             if found.n_variables > task.scaling.n_variables:
                 chosen = 'load_instances(SourceInstances.from_table(table, state_names=["x", ...]))'
                 other = f"; where a table has other columns too, name those of the state: {chosen}{other}"
+            first = int(self.action_space.start)  # type: ignore[attr-defined]
+            if first != 0 and found.n_actions == task.n_actions + first:
+                other = f"; actions are numbered from 0 on, those of the environment from {first}: subtract that{other}"
             raise ValueError(
                 f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
@@ -236,6 +251,12 @@ def _of_buffer(buffer: ReplayBuffer, task: Task) -> SourceInstances:
     states, next_states = column(buffer.observations), column(buffer.next_observations)
     limits = np.full(states.shape[1], -np.inf), np.full(states.shape[1], np.inf)
     scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
+    if not buffer.handle_timeout_termination and buffer.dones.any():
+        warnings.warn(
+            "the replay buffer has handle_timeout_termination=False and does not say which episodes a time limit ended: "
+            f"all {int(buffer.dones[rows].sum())} ends count as terminal states",
+            stacklevel=4,
+        )
     ended, truncated = column(buffer.dones)[:, 0] > 0.5, column(buffer.timeouts)[:, 0] > 0.5
     actions = column(buffer.actions)[:, 0].astype(np.int64) - int(buffer.action_space.start)
     return SourceInstances(

@@ -95,7 +95,7 @@ class FittedRMaxPolicy(BasePolicy):
         """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
         if self.scales.fixed or not (episode_ended or self.to_unit.went_beyond):
             return False
-        scaling = self.scales.renewed(episode_ended)
+        scaling = self.scales.renewed(episode_ended, self.agent.transfers)
         if scaling is not None:
             self._warn_beyond_space()
             self.agent.rescale(scaling, self.scales.bounds)
@@ -178,8 +178,13 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs.extend(problems)
         if not problems:
             arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
+            fixed = self.scales.scaling if self.scales.fixed else None
             self.scales.set_state(arrays.pop("scales"))
             self.agent.set_state(arrays, self.scales.scaling, self.scales.bounds)
+            if fixed is not None and fixed != self.scales.scaling:
+                # The user gives other bounds than those of the file.
+                self.scales.scaling = fixed
+                self.agent.rescale(fixed, fixed)
             self._renew_to_unit()
 
 

@@ -6,10 +6,10 @@ import copy
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -24,10 +24,14 @@ from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.unpickling import check_pickles
-from sb3_combrel.transfer.by_name import describe_transfer
+from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer
 
 # The digits of real numbers hardly compress: higher levels take longer and gain a hundredth.
 COMPRESSION = 1
+
+# Arguments by which what was learned is laid out: another model takes the instances. And those that values depend on.
+NOT_TO_CHANGE = {"degree", "max_instances", "model_breadth", "periodic", "resolution", "transfer"}
+OF_VALUES = {"gamma", "max_value"}
 
 SelfSavedAlgorithm = TypeVar("SelfSavedAlgorithm", bound="SavedAlgorithm")
 
@@ -97,21 +101,28 @@ class SavedAlgorithm(BaseAlgorithm):
         :param custom_objects: objects that replace those of the file
         :param print_system_info: whether to print system info from the saved model and the current system info
         :param force_reset: force a call to ``reset()`` before training
-        :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved.
-            Without ``seed=`` the random number generator continues from its saved state.
+        :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved;
+            ``instances=`` for more past data. Without ``seed=`` the random number generator continues from its saved state.
         :return: new model instance with loaded parameters
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if the file is damaged, was not saved by this class, or does not fit the other arguments
         """
+        check_argument_names(cls, kwargs)
         environment = maybe_make_env(env, verbose=0) if isinstance(env, str) else env
+        instances = kwargs.pop("instances", None)
+        changed = sorted(kwargs.keys() & NOT_TO_CHANGE)
         if "seed" in kwargs:
             kwargs["_generator_state"] = None
-        with _naming(path):
+        with _naming(path, changed):
             archive = _read(path)
             check_pickles(archive, custom_objects or ())
-            return super().load(
+            model = super().load(
                 archive, environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
             )
+        if kwargs.keys() & OF_VALUES:
+            model.policy.agent.plan_anew()
+        _check_room(model.policy.agent.model.instances.size, model)
+        return model if instances is None else cast(Any, model).load_instances(instances)
 
     def set_parameters(
         self,
@@ -151,6 +162,15 @@ class SavedAlgorithm(BaseAlgorithm):
         return ["policy"], []
 
 
+def _check_room(sizes: np.ndarray, model: Any) -> None:
+    """:raises ValueError: if a model has more instances of an action, of which there are ``sizes``, than it may keep"""
+    if model.max_instances is not None and sizes.max() > model.max_instances:
+        raise ValueError(
+            f"max_instances must be at least {sizes.max()}, as many as the model has of one action, got {model.max_instances}"
+            "; or make a new model with them: FittedRMax(env, instances=..., max_instances=...)"
+        )
+
+
 def _zipped_anew(archive: Any, compression: int) -> io.BytesIO:
     """The same archive with another compression; its checksums are compared."""
     content = io.BytesIO()
@@ -174,19 +194,26 @@ def _read(path: str | Path | io.BufferedIOBase) -> io.BytesIO:
 
 
 @contextmanager
-def _naming(path: object) -> Iterator[None]:
-    """:raises ValueError: that names the file, whatever reading it raised: of damaged content libraries raise anything"""
+def _naming(path: object, changed: Sequence[str] = ()) -> Iterator[None]:
+    """:param changed: arguments that a model may not be able to change
+    :raises ValueError: that names the file, whatever reading it raised: of damaged content libraries raise anything
+    """
     try:
         yield
     except (FileNotFoundError, PermissionError):
         raise
     except Exception as error:
         wrong = f"is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)})"
-        raise ValueError(f"{path} {wrong}{_other_version(path)}") from error
+        instead = (
+            f"; leave out {', '.join(changed)}, or make a new model with them: FittedRMax(env, instances={str(path)!r}, ...)"
+        )
+        raise ValueError(f"{path} {wrong}{instead if changed else ''}{_other_version(path)}") from error
 
 
 def _other_version(path: object) -> str:
     """Say that the file of a model was saved by another version of this package, if so."""
+    if isinstance(path, str | Path) and not Path(path).exists():
+        path = f"{path}.zip"
     try:
         with zipfile.ZipFile(path) as archive:  # type: ignore[call-overload]
             data = json.loads(archive.read("data"))

@@ -120,7 +120,10 @@ LOCAL = Backend()
 
 
 def run_missing(
-    jobs: Sequence[Job], output: Path | None = None, backend: Backend = LOCAL, console: Console | None = None
+    jobs: Sequence[Job],
+    output: str | os.PathLike[str] | None = None,
+    backend: Backend = LOCAL,
+    console: Console | None = None,
 ) -> list[Result]:
     """
     Carry out the jobs that have no result yet. One that fails does not stop the others, and is tried again by the next call.
@@ -139,15 +142,16 @@ def run_missing(
     names = Counter(job.name for job in jobs)
     if names.total() > len(names):
         raise ValueError(f"jobs must have different names, got {', '.join(name for name, n in names.items() if n > 1)} twice")
-    found = {} if output is None else _read_all(jobs, output)
+    folder = None if output is None else Path(output)
+    found = {} if folder is None else _read_all(jobs, folder)
     missing = [job for job in jobs if job.name not in found]
     if found:
         console.print(f"{len(found)} of {len(jobs)} runs were complete already.")
     with _progress(jobs, missing, console) as advance:
         for job, result in _carry_out(missing, backend):
             found[job.name] = result
-            if output is not None:
-                _write(job, result, output)
+            if folder is not None:
+                _write(job, result, folder)
             advance(job, result)
     return [found[job.name] for job in jobs]
 

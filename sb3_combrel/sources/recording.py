@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.common.scaling import Bounds
 from sb3_combrel.sources.transitions import (
     AnyEnv,
     TransitionLog,
@@ -22,6 +22,7 @@ from sb3_combrel.sources.transitions import (
     check_observation,
     count_actions,
     describe_origin,
+    limits_of_task,
     make_env,
     task_names,
 )
@@ -38,7 +39,7 @@ def record(
     task = env if isinstance(env, VecEnv) else make_env(env)
     venv = task if isinstance(task, VecEnv) else DummyVecEnv([lambda: task])
     try:
-        limits = StateScaling.limits_of(venv.observation_space, bounds)
+        limits = limits_of_task(venv, bounds)
         n_actions = count_actions(venv.action_space)
         log = TransitionLog()
         act = _actor(model, venv, seed, deterministic)

@@ -48,4 +48,6 @@ def checked_names(name: str, names: Sequence[str], n: int, letter: str) -> tuple
     """Names of ``n`` variables or actions; if none are given, the letter and a number."""
     if len(names) not in (0, n):
         raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{name} must be different names, got {tuple(names)}")
     return tuple(map(str, names)) if len(names) else tuple(f"{letter}{i}" for i in range(n))

@@ -7,10 +7,17 @@ from typing import Any
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.common.scaling import Bounds
 from sb3_combrel.sources.recording import log_step, raw_states
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.sources.transitions import TransitionLog, Transitions, count_actions, describe_origin, task_names
+from sb3_combrel.sources.transitions import (
+    TransitionLog,
+    Transitions,
+    count_actions,
+    describe_origin,
+    limits_of_task,
+    task_names,
+)
 
 
 class SourceRecorder(BaseCallback):
@@ -34,11 +41,12 @@ class SourceRecorder(BaseCallback):
 
     def _on_training_start(self) -> None:
         # Refuse spaces now, not after hours of learning.
-        self._limits = StateScaling.limits_of(self.training_env.observation_space, self.bounds)
+        self._limits = limits_of_task(self.training_env, self.bounds)
         self._n_actions = count_actions(self.training_env.action_space)
         self._names = task_names(self.training_env)
         self._origin = describe_origin(self.training_env, type(self.model).__name__, self.model.seed)
         self._states = raw_states(self.training_env, self.model._last_obs)  # type: ignore[attr-defined]
+        self._n_seen = self.model.num_timesteps
 
     def _on_step(self) -> bool:
         missing = {"actions", "new_obs", "rewards", "dones", "infos"} - set(self.locals)
@@ -46,6 +54,12 @@ class SourceRecorder(BaseCallback):
             raise ValueError(
                 f"{type(self).__name__} cannot record {type(self.model).__name__}: its callbacks have no {sorted(missing)}; "
                 "record the trained model with SourceInstances.record(model, env)"
+            )
+        n_new, self._n_seen = self.num_timesteps - self._n_seen, self.num_timesteps
+        if n_new != self.training_env.num_envs:
+            raise ValueError(
+                f"{type(self).__name__} must be called at every step, got one call for {n_new} steps: pass it to "
+                "learn(callback=...) itself; fewer instances are kept with max_instances=..."
             )
         step = (self.locals["new_obs"], self.locals["rewards"], self.locals["dones"], self.locals["infos"])
         self._states = log_step(self.log, self.training_env, self._states, self.locals["actions"], step)

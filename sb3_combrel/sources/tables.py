@@ -37,6 +37,11 @@ def read_table(
     for name in (ACTION, REWARD, *(state_names or ())):
         _require(frame, name)
     names = _state_names(frame) if state_names is None else tuple(state_names)
+    _check_names(names)
+    if not names:
+        raise ValueError(
+            f"the table has no column of a state variable, its columns are {[str(name) for name in frame.columns]}"
+        )
     frame = frame.reset_index(drop=True)
     steps, next_states = _with_next_states(frame, names)
     states = _numbers(steps, names)
@@ -84,6 +89,16 @@ def _state_names(frame: pd.DataFrame) -> tuple[str, ...]:
             f"them, or, if they are no state variables, name those that are: from_table(table, state_names={names[:1]} ...)"
         )
     return tuple(names)
+
+
+def _check_names(names: Sequence[str]) -> None:
+    """:raises ValueError: if a state variable has the name of another column"""
+    taken = [name for name in names if name in _NO_STATES or name.startswith(NEXT)]
+    if taken:
+        raise ValueError(
+            f"state variables in a table must have other names than {sorted(_NO_STATES)} and no {NEXT!r} in front, got {taken}"
+            ": give them others, dataclasses.replace(source, state_names=(...))"
+        )
 
 
 def _require(frame: pd.DataFrame, name: str, others: Sequence[str] = ()) -> None:
@@ -203,6 +218,7 @@ def as_frame(source: Any) -> pd.DataFrame:
     """The table of source instances, see :meth:`SourceInstances.to_table`."""
     import pandas as pd
 
+    _check_names(source.state_names)
     data: dict[str, Any] = {name: source.states[:, k] for k, name in enumerate(source.state_names)}
     data |= {ACTION: source.actions, REWARD: source.rewards}
     data |= {f"{NEXT}{name}": source.next_states[:, k] for k, name in enumerate(source.state_names)}

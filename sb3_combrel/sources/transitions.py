@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.checks import as_count
-from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.periodic import check_periods, flag_array
+from sb3_combrel.common.scaling import Bounds, Limits, StateScaling
 from sb3_combrel.common.version import __version__
 
 Floats = NDArray[np.float64]
@@ -117,6 +118,16 @@ def count_actions(space: spaces.Space[Any]) -> int:
     if not isinstance(space, spaces.Discrete):
         raise ValueError(f"the action space must be Discrete, got {space}")
     return int(space.n)
+
+
+def limits_of_task(env: VecEnv, bounds: Bounds | None) -> Limits:
+    """Bounds of the states of a task: those given, or those of its space, some of which may be infinite.
+
+    :raises ValueError: if the space is no one-dimensional Box, the bounds do not fit it, or a periodic variable has none
+    """
+    low, high = StateScaling.limits_of(env.observation_space, bounds)
+    check_periods(~(np.isfinite(low) & np.isfinite(high)) & flag_array(task_names(env).get("periodic"), len(low)))
+    return low, high
 
 
 def make_env(env: str | gym.Env[Any, Any]) -> gym.Env[Any, Any]:

@@ -53,6 +53,8 @@ def explain(
     """
     if output is not None:
         check_matplotlib("leave output out")
+    if not isinstance(model, FittedRMax | str | os.PathLike):
+        raise ValueError(f"model must be a FittedRMax model or the path of its file, got {model!r}")
     if not isinstance(model, FittedRMax):
         model = _load(Path(model))
     agent = model.agent

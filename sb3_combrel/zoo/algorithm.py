@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from stable_baselines3.common.type_aliases import GymEnv
 
@@ -12,7 +12,8 @@ from sb3_combrel.fitted_rmax.arguments import check_actions
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.planning.grid import fitting_grid
-from sb3_combrel.transfer.by_name import check_argument_names
+from sb3_combrel.transfer.base import Transfer
+from sb3_combrel.transfer.by_name import check_argument_names, make_transfer
 
 MAX_PAIRS = 2_000_000
 """State-action pairs of the grid beyond which "finer" is not applied: about 1.5 GB."""
@@ -25,7 +26,8 @@ class ZooFittedRMax(FittedRMax):
     factor of two a variable (if that takes less than about 1.5 GB).
 
     :param policy: "FittedRMaxPolicy"; must be given, as RL-Zoo needs it to continue with a trained agent
-    :param transfer_kwargs: arguments of the transfer method that replace those in ``transfer``, one by one
+    :param transfer_kwargs: arguments of the transfer method that a study has drawn; they replace those in ``transfer``, one by
+        one, where that transfers instances (``use: instances``): a prior has none that a study draws
     :param kwargs: all other arguments of :class:`~sb3_combrel.FittedRMax`
     :raises ValueError: if ``policy`` is missing, or an argument is unknown or out of range
     """
@@ -46,7 +48,10 @@ class ZooFittedRMax(FittedRMax):
     def _setup_model(self) -> None:
         # Not in the constructor: when RL-Zoo resumes, load() sets the arguments after it.
         if self.transfer_kwargs:
-            self.transfer = with_arguments(self.transfer, self.transfer_kwargs)
+            changed = with_arguments(self.transfer, self.transfer_kwargs)
+            given = cast(Transfer, make_transfer(self.transfer))
+            check_argument_names(type(given), self.transfer_kwargs)
+            self.transfer = changed if given.arguments().get("use") == "instances" else self.transfer
         self.transfer_kwargs = None
         if isinstance(self.resolution, str):
             self.resolution = self._relative_resolution(self.resolution)

@@ -23,7 +23,6 @@ def sample_fitted_rmax_params(trial: Trial, *_: Any) -> dict[str, Any]:
     return convert_fitted_rmax_params(
         {
             "model_breadth": trial.suggest_float("model_breadth", 0.05, 0.5, log=True),
-            "min_fraction": trial.suggest_float("min_fraction", 0.01, 0.3, log=True),
             "exploration_threshold": trial.suggest_float("exploration_threshold", 0.3, 3.0, log=True),
             "planning_tolerance": trial.suggest_float("planning_tolerance", 1e-4, 0.1, log=True),
             "resolution": trial.suggest_categorical("resolution", [None, "coarser", "finer"]),
@@ -32,12 +31,12 @@ def sample_fitted_rmax_params(trial: Trial, *_: Any) -> dict[str, Any]:
 
 
 def sample_timbrel_params(trial: Trial, *_: Any) -> dict[str, Any]:
-    """Draw the same, and the breadth of transferred instances."""
+    """Draw the same, and the breadth of transferred instances, which counts where these are transferred."""
     return {**sample_fitted_rmax_params(trial), "transfer_kwargs": {"breadth": _transfer_breadth(trial)}}
 
 
 def sample_combrel_params(trial: Trial, *_: Any) -> dict[str, Any]:
-    """Draw the same, and arguments of COMBREL."""
+    """Draw the same, and arguments of COMBREL with instances."""
     sampled = sample_fitted_rmax_params(trial)
     of_transfer = {
         "breadth": _transfer_breadth(trial),

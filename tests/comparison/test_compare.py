@@ -28,7 +28,7 @@ METHODS = {"none": None, "TIMBREL": TIMBREL(walk_source(), InterTaskMapping((0, 
 @pytest.fixture(scope="module")
 def result():
     with pytest.warns(UserWarning, match="Only 2 seeds"):
-        return compare(Walk, METHODS, seeds=[3, 1], steps=150, controls=False, **LEARNER)
+        return compare(Walk, METHODS, seeds=np.array([3, 1]), steps=150, controls=False, **LEARNER)
 
 
 def test_each_run_is_that_of_the_learner_with_its_seed(result):

@@ -60,7 +60,7 @@ def toys(folder, n=3, group="toys", method="a", **kwargs):
 
 def test_results_come_in_the_order_of_the_jobs_and_a_later_call_finds_them(tmp_path):
     jobs = toys(tmp_path)
-    found = runner.run_missing(jobs, tmp_path / "out", HERE)
+    found = runner.run_missing(jobs, str(tmp_path / "out"), HERE)
     assert [result.steps for result in found] == [[0, 2], [1, 2], [2, 2]]
     assert runner.run_missing(jobs[::-1], tmp_path / "out", HERE) == found[::-1]
     assert [job.attempts() for job in jobs] == [1, 1, 1]

@@ -177,6 +177,8 @@ def test_the_files_are_the_dashboards_pictures(saved, tmp_path, drawn):
 
 def test_a_file_says_the_same_as_the_model_with_the_names_of_the_environment(saved):
     model, path = saved
+    with pytest.raises(ValueError, match="model must be a FittedRMax model or the path of its file, got 5"):
+        explain(5)
     report = explain(path)
     assert str(report) == str(explain(model)) == str(explain(path.with_suffix("")))
     assert [each.target_action for each in report.mappings] == list(NamedWalk.action_names)

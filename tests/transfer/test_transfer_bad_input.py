@@ -11,7 +11,7 @@ from helpers.oscillators import episodes
 from helpers.own_method import Mine
 from helpers.walk import small, walk_source
 
-from sb3_combrel import COMBREL, TIMBREL, FittedRMax
+from sb3_combrel import COMBREL, MASTER, TIMBREL, FittedRMax
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet
 
 
@@ -131,7 +131,12 @@ def test_an_argument_out_of_its_range_is_refused_at_once_by_name_and_value(metho
         (lambda s: TIMBREL(s, {"copies": []}), 'factored mappings need use="prior"'),
         (lambda s: TIMBREL(s, "random", mappings="signed_factored"), 'factored mappings need use="prior"'),
         (lambda s: TIMBREL(s, "pool", use="prior"), 'mapping must be a mapping or "random"'),
-        (lambda s: TIMBREL(s, TWO, use="prior", relevance=True), "relevance must be False"),
+        (lambda s: TIMBREL(s, TWO, use="prior", relevance=True), "relevance=True must be left out"),
+        (
+            lambda s: TIMBREL(s, TWO, use="prior", breadth=0.2, breadth_decay=0.5),
+            "breadth=0.2, breadth_decay=0.5 must be left",
+        ),
+        (lambda s: MASTER(s, use="prior", breadth=0.2), "breadth=0.2 must be left out"),
         (lambda s: TIMBREL(s, f.copies_mapping(3), use="prior"), "state must have 4 entries"),
         (lambda s: TIMBREL(s, {"copies": [{"state": [0, 1, None, 2], "action": [0] * 5}]}, use="prior"), "from 0 to 1"),
         (lambda s: TIMBREL(s, {"copies": []}, use="prior"), "at least one"),

@@ -57,7 +57,8 @@ def test_what_a_study_draws_replaces_what_the_configuration_says(algo, source):
     trial = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)).ask()
     drawn = ALGORITHMS[algo](trial, 2, 1, {})
     assert drawn == convert_fitted_rmax_params(trial.params)
-    given = {f"sb3_combrel.{algo.upper()}": {"source": source, "n_neighbors": 99} if algo == "combrel" else {"source": source}}
+    of_combrel = {"source": source, "n_neighbors": 99, "use": "instances"}
+    given = {f"sb3_combrel.{algo.upper()}": of_combrel if algo == "combrel" else {"source": source}}
     entry = {"policy": "FittedRMaxPolicy", **drawn, "transfer": None if algo == "fitted_rmax" else given, "resolution": 1}
     if algo == "timbrel":
         given["sb3_combrel.TIMBREL"]["mapping"] = "random"
@@ -65,6 +66,14 @@ def test_what_a_study_draws_replaces_what_the_configuration_says(algo, source):
     assert len(changed) == {"fitted_rmax": 0, "timbrel": 1, "combrel": 6}[algo]
     assert {name: getattr(model.transfer, name) for name in changed} == changed
     assert model.agent.model_settings.model_breadth == trial.params["model_breadth"]
+
+
+@pytest.mark.parametrize("given", [{}, {"use": "prior"}, {"mappings": "factored"}])
+def test_a_study_leaves_a_prior_as_the_configuration_has_it(given, source):
+    drawn = ALGORITHMS["combrel"](optuna.create_study().ask(), 2, 1, {})
+    entry = {"policy": "FittedRMaxPolicy", **drawn, "transfer": {"sb3_combrel.COMBREL": {"source": source, **given}}}
+    transfer = ZooFittedRMax(env=gym.make(CAR), **{**entry, "resolution": 1}).transfer
+    assert transfer.use == "prior" and transfer.n_neighbors == 3
 
 
 def test_a_drawn_grid_is_relative_to_the_one_that_suits_the_task_and_stays_within_memory():

@@ -77,6 +77,26 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, capsys, entry, change, 
     assert written.startswith("sb3_combrel.zoo: ") and message in written and "Traceback" not in written
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "must have an entry for each task"),
+        ("MountainCar-v0: 5", "MountainCar-v0 must have settings by name, such as n_timesteps: 5000, got 5"),
+        ("MountainCar-v0:\n - a", "must have settings by name"),
+        (
+            "MountainCar-v0:\n  planning_tolerance: 1e-3",
+            "planning_tolerance must be a number, got '1e-3', which is text: YAML",
+        ),
+    ],
+)
+def test_a_configuration_that_is_none_is_said_in_one_sentence(tmp_path, capsys, content, message):
+    conf = tmp_path / "bad.yml"
+    conf.write_text(content)
+    assert call("train", *train_args(tmp_path, conf=conf)) == 1
+    written = capsys.readouterr().err
+    assert written.startswith("sb3_combrel.zoo: ") and message in written and "Traceback" not in written
+
+
 def test_a_configuration_of_this_package_is_found_where_none_is_named():
     ours = [str(CONFIGS / f"{algo}.yml") for algo in ("combrel", "dqn")]
     assert with_configuration(["--algo", "combrel", "--env", "CartPole-v1"])[-2:] == ["--conf-file", ours[0]]
@@ -187,7 +207,7 @@ class TestChain:
         url = f"sqlite:///{tmp_path / 'study.db'}"
         optuna.create_study(storage=url, study_name="car", direction="maximize")
         source = {"env": CAR, "n_instances": 50, "total_timesteps": 200}
-        transfer = {"sb3_combrel.COMBREL": {"source": source, "n_neighbors": 99}}
+        transfer = {"sb3_combrel.COMBREL": {"source": source, "n_neighbors": 99, "use": "instances"}}
         conf = write_config(tmp_path / "combrel.yml", transfer=transfer)
         of_study = ("--storage", url, "--study-name", "car")
         tuning = ("-optimize", "--n-trials", 2, "--n-evaluations", 2, "--n-startup-trials", 1, "--no-optim-plots")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, fields
-from typing import Any
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,8 +21,6 @@ from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 #: Variables of the target may be mirrored ones of the source.
 DEFAULT_OF_PRIOR = "signed_factored"
-# Arguments of COMBREL that have a meaning for a prior as well.
-_OF_PRIOR = ("source", "mappings", "max_transitions", "transfer_terminals", "use", "source_breadth")
 
 
 @dataclass(repr=False, eq=False)
@@ -82,6 +80,8 @@ class COMBREL(MappingTransfer):
 
     mappings: MappingsLike | None = None  # type: ignore[assignment]
     _: KW_ONLY
+    of_prior: ClassVar[tuple[str, ...]] = (*MappingTransfer.of_prior, "max_transitions")
+
     n_neighbors: int = 3
     neighbors: str = "action"
     choice: str = "best"
@@ -105,16 +105,10 @@ class COMBREL(MappingTransfer):
         check_either("choice", self.choice, "best", "drawn")
         check_either("measured", self.measured, "online", "first_episode")
         # With nothing given that says which, both depend on the target's model.
-        of_instances = [each for each in fields(self) if each.init and each.name not in _OF_PRIOR]
-        if self.mappings is None and self.use is None:
-            if not any(np.any(getattr(self, each.name) != each.default) for each in of_instances):
-                self._left_open = {"mappings": None, "use": None}
+        if self.mappings is None and self.use is None and not self._of_instances():
+            self._left_open = {"mappings": None, "use": None}
         if self.use is None:
             self.use = "prior" if self.mappings is not None and is_factored(self.mappings) else "instances"
-        meaningless = [each for each in of_instances if np.any(getattr(self, each.name) != each.default)]
-        if self.use == "prior" and meaningless:
-            given = ", ".join(f"{each.name}={getattr(self, each.name)!r}" for each in meaningless)
-            raise ValueError(f'{given} must be left out with use="prior": it has a meaning for use="instances" alone')
         if self.mappings is None:
             self.mappings = DEFAULT_OF_PRIOR if self.use == "prior" else "injective"
         super().__post_init__()

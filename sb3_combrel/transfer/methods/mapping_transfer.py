@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import partial
 from typing import Any, ClassVar
 
@@ -77,6 +77,8 @@ class MappingTransfer(Transfer):
 
     #: Whether relevance, where it is asked for, is the order in which instances are added.
     ranks_by_relevance: ClassVar[bool] = True
+    #: Arguments that have a meaning with ``use="prior"`` as well.
+    of_prior: ClassVar[tuple[str, ...]] = ("source", "mappings", "transfer_terminals", "use", "source_breadth")
 
     source: SourceLike
     mappings: MappingsLike
@@ -96,8 +98,9 @@ class MappingTransfer(Transfer):
         check_either("use", self.use, "instances", "prior")
         if self.use == "instances" and is_factored(self.mappings):
             raise ValueError(f'factored mappings need use="prior", got use="instances" with {self.mappings!r}')
-        if self.use == "prior" and self.relevance:
-            raise ValueError(f'relevance must be False with use="prior": no instances are transferred, got {self.relevance!r}')
+        meaningless = ", ".join(f"{name}={getattr(self, name)!r}" for name in self._of_instances())
+        if self.use == "prior" and meaningless:
+            raise ValueError(f'{meaningless} must be left out with use="prior": it has a meaning for use="instances" alone')
         check_source(self.source)
         check_mappings(self.mappings)
         check_positive("source_breadth", self.source_breadth)
@@ -116,6 +119,11 @@ class MappingTransfer(Transfer):
             raise ValueError(f'relevance must be True, False or "{NEAR}", got {self.relevance!r}')
         self.transfer_terminals = bool(self.transfer_terminals)
         self.relevance = NEAR if is_near else bool(self.relevance)
+
+    def _of_instances(self) -> list[str]:
+        """Arguments that differ from their defaults, and have no meaning for a prior."""
+        given = (each for each in fields(self) if each.init and each.name not in self.of_prior)
+        return [each.name for each in given if np.any(getattr(self, each.name) != each.default)]
 
     def __getattr__(self, name: str) -> Any:
         self._check_bound(name)  # called only for what is not there otherwise

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -60,6 +61,8 @@ class MASTER(MappingTransfer):
     :raises ValueError: if an argument is out of range; when learning starts, if source or mappings do not fit the target
     """
 
+    of_prior: ClassVar[tuple[str, ...]] = (*MappingTransfer.of_prior, "n_random_steps")
+
     mappings: MappingsLike = "injective"
     _: KW_ONLY
     n_random_steps: int = DEFAULT_RANDOM_STEPS
@@ -73,7 +76,7 @@ class MASTER(MappingTransfer):
         if is_factored(self.mappings):
             raise ValueError(f"mappings must be a set of which one mapping is chosen, no factored ones, got {self.mappings!r}")
         if self.use is None:
-            if self.breadth == MappingTransfer.breadth and self.breadth_decay == MappingTransfer.breadth_decay:
+            if not self._of_instances():
                 self._left_open = {"use": None}
             self.use = "instances"
         super().__post_init__()

@@ -47,6 +47,8 @@ class TIMBREL(MappingTransfer):
 
     always_shown: ClassVar[tuple[str, ...]] = ("mapping",)
 
+    of_prior: ClassVar[tuple[str, ...]] = (*MappingTransfer.of_prior, "mapping")
+
     mapping: str | InterTaskMapping | FactoredMapping | Sequence[InterTaskMapping] | dict[str, Any] = "random"
     mappings: MappingsLike = field(default="injective", kw_only=True)
 

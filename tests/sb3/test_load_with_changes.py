@@ -1,0 +1,69 @@
+"""Arguments that are changed when a model is loaded are followed, or refused."""
+
+import numpy as np
+import pytest
+from helpers.walk import Walk, small, walk_source
+from stable_baselines3 import DQN
+
+from sb3_combrel import COMBREL, FittedRMax
+
+
+@pytest.fixture
+def file(tmp_path):
+    small(Walk(limit=100)).learn(200).save(tmp_path / "walk")
+    return tmp_path / "walk"
+
+
+@pytest.mark.parametrize("change", [{"gamma": 0.9}, {"max_value": 3.0}])
+def test_values_follow_another_gamma_or_bound(file, change):
+    loaded = FittedRMax.load(file, **change).agent
+    values = loaded.planner.values.copy()
+    for _ in range(20):
+        loaded.planner.sweep(1000)
+    np.testing.assert_allclose(values, loaded.planner.values, atol=0.01)
+    assert not np.allclose(values, FittedRMax.load(file).agent.planner.values, atol=0.01)
+
+
+def test_scales_follow_other_bounds(file):
+    bounds = [-1.0, 0.0], [2.0, 2.0]
+    loaded, plain = FittedRMax.load(file, env=Walk(), bounds=bounds), FittedRMax.load(file)
+    np.testing.assert_array_equal((loaded.policy.scaling.low, loaded.policy.scaling.high), bounds)
+    one, other = loaded.source_instances(), plain.source_instances()
+    np.testing.assert_allclose(one.states, other.states, atol=1e-9)
+    actions = [each.predict(np.float32([0.5, 1.0]), deterministic=True)[0] for each in (loaded, plain)]
+    assert actions == [1, 1] and loaded.learn(20).agent.model.n_instances == 220
+
+
+def test_what_was_learned_of_a_source_is_learned_anew_by_other_bounds(tmp_path):
+    small(transfer=COMBREL(walk_source()), bounds=([-1.0, 0.0], [1.0, 2.0])).learn(100).save(tmp_path / "walk")
+    loaded = FittedRMax.load(tmp_path / "walk", bounds=([-1.5, 0.0], [1.5, 2.0]))
+    assert loaded.transfer.task.scaling == loaded.policy.scaling and loaded.transfer.mapping_counts() is not None
+
+
+def test_more_instances_are_taken_in(file):
+    loaded = FittedRMax.load(file, env=Walk(), instances=walk_source())
+    assert loaded.agent.model.n_instances == 200 + len(walk_source())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_valu": 3.0}, "did you mean 'max_value'"),
+        ({"max_instances": 10}, "max_instances must be at least"),
+        ({"resolution": 2}, "leave out resolution, or make a new model with them: FittedRMax"),
+        ({"transfer": COMBREL(walk_source())}, "leave out transfer, or make a new model with them"),
+    ],
+)
+def test_what_cannot_be_changed_is_refused(file, change, message):
+    with pytest.raises(ValueError, match=message):
+        FittedRMax.load(file, **change)
+
+
+def test_a_model_of_another_algorithm_is_named_without_its_suffix(tmp_path):
+    DQN("MlpPolicy", Walk(), buffer_size=10).save(tmp_path / "dqn")
+    with pytest.raises(ValueError, match="it is a model of another algorithm"):
+        FittedRMax.load(tmp_path / "dqn")
+
+
+def test_the_file_of_a_model_is_found_without_its_suffix(file):
+    assert small().load_instances(file).agent.model.n_instances == 200
