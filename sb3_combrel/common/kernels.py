@@ -157,17 +157,25 @@ def nearest_instances(instances, action, state, farthest, items, distances):
 
 
 @inlined
-def near_instances(instances, action, state, kernel, indices, weights):
+def reach_of(kernel):
+    """The squared distance beyond which instances weigh less than ``min_weight``; see :func:`near_instances`."""
+    breadth, min_weight, _ = kernel
+    return -np.log(min_weight) * breadth * breadth
+
+
+@inlined
+def near_instances(instances, action, state, farthest, kernel, indices, weights):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
 
     One is kept while its weight is at least ``min_fraction`` of the sum of those before it.
 
+    :param farthest: squared distance beyond which none is kept, no more than the kernel's :func:`reach_of`
     :param kernel: (breadth, min_weight, min_fraction)
     :param indices: int32, receives them, ``list_room(min_fraction)`` long; ``weights``: exp(-d^2 / breadth^2)
     """
-    breadth, min_weight, min_fraction = kernel
+    breadth, _, min_fraction = kernel
     scale = -1.0 / (breadth * breadth)
-    near = nearest_instances(instances, action, state, np.log(min_weight) / scale, indices, weights)
+    near = nearest_instances(instances, action, state, farthest, indices, weights)
     total = 0.0
     for k in range(near):
         weights[k] = np.exp(weights[k] * scale)

@@ -254,10 +254,11 @@ class GridModel(Model):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
         actions, points = np.divmod(pairs, self.grid.n_points)
-        own_weight = self._weigh(pairs)
-        # Of what is known the full threshold, so that no method has work with it: grid points may be known with less.
-        full = self.settings.exploration_threshold
-        own_weight = np.where(own_weight >= self._rules[1], np.maximum(full, own_weight), own_weight)
+        # Of what is known the full threshold, so that no method has work with it: grid points may be known with less. And what
+        # is known stays known, unless an instance has gone.
+        full, unsure = self.settings.exploration_threshold, np.flatnonzero(~self.known[pairs])
+        own_weight, found = np.full(len(pairs), full), self._weigh(pairs[unsure])
+        own_weight[unsure] = np.where(found >= self._rules[1], np.maximum(full, found), found)
         given = self._giver.transferred_to_sample(points, actions, own_weight)
         self._check(given, own_weight)
         return given

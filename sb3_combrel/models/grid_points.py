@@ -92,9 +92,10 @@ def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predi
     if why != ENDED and distance > pairs.reach[pair] * (1.0 + ROUNDING):
         return False
     if why == WENT:
-        # Another one, farther away, may take its place.
+        # Another one, farther away, may take its place, and what is left may be too little.
         pairs.reach[pair] = widest
         pairs.n_new[pair] += 1
+        pairs.known[pair] = False
         return True
     if why == ENDED:
         return pairs.known[pair]

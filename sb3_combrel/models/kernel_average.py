@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, squared_distance
+from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, reach_of, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel, add_to_row, total_weight
@@ -58,7 +58,8 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
     instances, near, prediction = Instances(*instances), NearList(*near), Prediction(*prediction)
     least = np.inf
     for action in range(len(instances.size)):
-        length, total = near_instances(instances, action, state, kernel, near.item, near.weight)
+        farthest = reach_of(kernel)
+        length, total = near_instances(instances, action, state, farthest, kernel, near.item, near.weight)
         reward = 0.0
         n = 0
         for k in range(length):
@@ -77,15 +78,22 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
 
 
 @compiled
-def weigh(instances, grid, kernel, threshold, pairs, near, found):
-    """Write the weight of the instances of pairs to ``found``; plain tuples."""
-    instances, grid, near = Instances(*instances), GridArrays(*grid), NearList(*near)
+def weigh(instances, pairs, grid, kernel, threshold, which, near, found):
+    """Write the weight of the instances of some pairs, ``which``, to ``found``; plain tuples."""
+    instances, pairs, grid, near = Instances(*instances), PairArrays(*pairs), GridArrays(*grid), NearList(*near)
     n_points = grid.shape[0] * grid.strides[0]
-    for k in range(len(pairs)):
-        action = pairs[k] // n_points
-        unit_coordinates_of(pairs[k] % n_points, grid, near.at)
-        _, total = near_instances(instances, action, near.at, kernel, near.item, near.weight)
-        found[k] = weight_ever(instances, action, near.at, kernel, threshold, total)
+    for k in range(len(which)):
+        _, total = near_pair(which[k], instances, pairs, grid, kernel, near)
+        found[k] = weight_ever(instances, which[k] // n_points, near.at, kernel, threshold, total)
+
+
+@inlined
+def near_pair(pair, instances, pairs, grid, kernel, near):
+    """Find the instances that the kernel keeps at a pair: see ``near_instances``; ``near.at`` receives its state."""
+    n_points = grid.shape[0] * grid.strides[0]
+    unit_coordinates_of(pair % n_points, grid, near.at)
+    # Instances only come nearer, but for those that are removed (see grid_points.look_at).
+    return near_instances(instances, pair // n_points, near.at, pairs.reach[pair], kernel, near.item, near.weight)
 
 
 @inlined
@@ -116,8 +124,7 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         pair = which[done]
         point = pair % n_points
         action = pair // n_points
-        unit_coordinates_of(point, grid, near.at)
-        length, total = near_instances(instances, action, near.at, kernel, near.item, near.weight)
+        length, total = near_pair(pair, instances, pairs, grid, kernel, near)
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
         known = weight >= threshold
         pairs.weight[pair], pairs.known[pair] = weight, known
@@ -172,7 +179,8 @@ class KernelAverage(GridModel):
 
     def _weigh(self, pairs: np.ndarray) -> np.ndarray:
         found, threshold = np.empty(len(pairs)), self.exploration_threshold
-        _weigh.call(self._plain_experience[0], self.grid.plain, self._weights, threshold, pairs, self._near, found)
+        model = self._plain_experience[0], self._plain_pairs, self.grid.plain, self._weights
+        _weigh.call(*model, threshold, pairs, self._near, found)
         return found
 
     def _predict_own(self, state: np.ndarray) -> float:

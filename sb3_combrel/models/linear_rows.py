@@ -132,13 +132,14 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
 
 
 @compiled
-def weigh(instances, grid, kernel, pairs, fit, at, found):
-    """Write the weight of the instances of pairs to ``found``; ``at``: work space; plain tuples."""
-    instances, grid, kernel, fit = Instances(*instances), GridArrays(*grid), Kernel(*kernel), LocalFit(*fit)
+def weigh(instances, pairs, grid, kernel, which, fit, at, found):
+    """Write the weight of the instances of some pairs, ``which``, to ``found``; ``at``: work space; plain tuples."""
+    instances, pairs, grid = Instances(*instances), PairArrays(*pairs), GridArrays(*grid)
+    kernel, fit = Kernel(*kernel), LocalFit(*fit)
     n_points = grid.shape[0] * grid.strides[0]
-    for k in range(len(pairs)):
-        unit_coordinates_of(pairs[k] % n_points, grid, at)
-        length = find_nearest(at, pairs[k] // n_points, kernel.reach, instances, fit)
+    for k in range(len(which)):
+        unit_coordinates_of(which[k] % n_points, grid, at)
+        length = find_nearest(at, which[k] // n_points, pairs.reach[which[k]], instances, fit)
         found[k] = known_weight(fit, length, kernel)
 
 

@@ -105,7 +105,8 @@ class LocalLinear(GridModel):
 
     def _weigh(self, pairs: np.ndarray) -> np.ndarray:
         found, at = np.empty(len(pairs)), np.empty(self.grid.n_variables)
-        _weigh.call(self._plain_experience[0], self.grid.plain, self._plain_kernel, pairs, self._fit, at, found)
+        model = self._plain_experience[0], self._plain_pairs, self.grid.plain, self._plain_kernel
+        _weigh.call(*model, pairs, self._fit, at, found)
         return found
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
