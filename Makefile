@@ -88,13 +88,14 @@ learner: $(VENV)/.installed-demo
 
 # A later call goes on with what is there; see docs/results/protocol.md.
 TRANSFERRED := $(BIN)/python -m sb3_combrel.experiments.suite.command --evaluation-episodes 20 --first-seed 22000
+PARTS := effects:transfer=COMBREL-effects bound:transfer=COMBREL-bound
 COMPARED := default COMBREL:transfer=COMBREL random:transfer=random oracle:transfer=oracle
 MISLEADING := noise-small noise noise-large shuffled mirrored wrong-goal wrong-rewards scaled-rewards few other-domain
 RECORDED := uniform scripted random last-policy never-neutral noisy 3000 10000
 ON_THE_ARM := default COMBREL:transfer=COMBREL random:transfer=random own-dynamics:transfer=own-dynamics
 of = $(foreach name,$(1),from-$(name):transfer=COMBREL@$(name))
 transfer: $(VENV)/.installed-demo
-	$(TRANSFERRED) --output transfer/4d --tasks MountainCar4D --seeds 0-29 --variants $(COMPARED) $(call of,$(MISLEADING))
+	$(TRANSFERRED) --output transfer/4d --tasks MountainCar4D --seeds 0-29 --variants $(COMPARED) $(PARTS) $(call of,$(MISLEADING))
 	$(TRANSFERRED) --output transfer/recorded --tasks MountainCar4D --seeds 0-9 --variants $(call of,$(RECORDED))
 	$(TRANSFERRED) --output transfer/6d --tasks MountainCar6D --seeds 0-9 --variants $(COMPARED)
 	$(TRANSFERRED) --output transfer/cart-pole --tasks CartPole-long --seeds 0-19 --variants $(COMPARED)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from sb3_combrel.common.compiled import EntryPoint, compiled
 from sb3_combrel.common.periodic import flag_array
@@ -15,6 +18,16 @@ from sb3_combrel.common.scaling import StateScaling
 ROUNDING = 1e-6
 # Share of observations outside the bounds that is worth a warning.
 MANY_OUTSIDE = 0.01
+
+
+def with_own_arrays(env: Any) -> Any:
+    """An environment whose observations are copies: some return one array, and change it at the next step or reset.
+
+    A vectorised one stays as it is, and one whose observations are no arrays.
+    """
+    if not isinstance(env, gym.Env) or not isinstance(env.observation_space, spaces.Box):
+        return env
+    return gym.wrappers.TransformObservation(env, np.array, env.observation_space)
 
 
 @compiled

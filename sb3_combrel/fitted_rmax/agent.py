@@ -302,35 +302,48 @@ class FittedRMaxAgent:
             self._plan(SWEEPS_AT_EPISODE_END)
 
     def rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
-        """Compute all anew in other unit coordinates.
+        """Compute all anew in other unit coordinates; an interrupt, or an error, leaves all as it was.
 
         :param scaling: raw <-> unit coordinates from now on; ``bounds``: as of :class:`~sb3_combrel.common.task.Task`
         """
         with self._lock:
-            before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
-            # What a transfer method has learned is about the bounds.
-            same = self.transfer is not None and bounds == self.task.shared_scaling
-            learned = self.transfer.get_state() if self.transfer is not None and same else {}
-            self.task = replace(self.task, scaling=scaling, bounds=bounds)
-            self._bind()
-            self._build(self.mdp.width)
-            if self.transfer is not None and learned:
-                self.transfer.set_state(learned)
-            self._widen(min(0.0, lowest) / LONGEST_PLAN)
-            self._take_in_all(
-                [
-                    (
-                        scaling.to_unit(before.to_raw(state)),
-                        action,
-                        reward,
-                        scaling.to_unit(before.to_raw(next_state)),
-                        terminated,
-                    )
-                    for state, action, reward, next_state, terminated in transitions
-                ],
-                observed=bool(learned),
-            )
-            self._plan(SWEEPS_AT_EPISODE_END)
+            attributes, generator = dict(vars(self)), self.rng.bit_generator.state
+            of_transfer = {} if self.transfer is None else self.transfer.get_state()
+            try:
+                self._rescale(scaling, bounds)
+            except BaseException:
+                vars(self).update(attributes)
+                if self.transfer is not None:
+                    self._bind()
+                    self.transfer.set_state(of_transfer)
+                self.rng.bit_generator.state = generator
+                raise
+
+    def _rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
+        before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
+        # What a transfer method has learned is about the bounds.
+        same = self.transfer is not None and bounds == self.task.shared_scaling
+        learned = self.transfer.get_state() if self.transfer is not None and same else {}
+        self.task = replace(self.task, scaling=scaling, bounds=bounds)
+        self._bind()
+        self._build(self.mdp.width)
+        if self.transfer is not None and learned:
+            self.transfer.set_state(learned)
+        self._widen(min(0.0, lowest) / LONGEST_PLAN)
+        self._take_in_all(
+            [
+                (
+                    scaling.to_unit(before.to_raw(state)),
+                    action,
+                    reward,
+                    scaling.to_unit(before.to_raw(next_state)),
+                    terminated,
+                )
+                for state, action, reward, next_state, terminated in transitions
+            ],
+            observed=bool(learned),
+        )
+        self._plan(SWEEPS_AT_EPISODE_END)
 
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
@@ -19,13 +20,21 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
+from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import DEFAULT_POLICY, MAX_SEED, check_actions, check_policy, check_type, policy_and_env
 from sb3_combrel.fitted_rmax.past_data import PastData
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.progress import ProgressWatch
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
-from sb3_combrel.fitted_rmax.vec_envs import names_of, periodic_of, refuse_normalized_observations, true_outcomes
+from sb3_combrel.fitted_rmax.vec_envs import (
+    joined_names,
+    names_of,
+    periodic_of,
+    refuse_normalized_observations,
+    true_outcomes,
+    warn_of_shared,
+)
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 
@@ -196,7 +205,7 @@ class FittedRMax(PastData):
         if self.env is not None:
             refuse_normalized_observations(self.env)
             # Saved with the model, for one that is loaded without an environment.
-            self._names = names_of(self.env)
+            self._names = joined_names(self._names, names_of(self.env))
             self.periodic = periodic_of(self.env) if self.periodic is None else self.periodic
         if self.seed is None:
             # A script that seeds numpy is then reproducible, as with the other algorithms.
@@ -345,7 +354,15 @@ class FittedRMax(PastData):
         # Only now is the logger set up, and known whether there is a log.
         for add in self.default_callbacks:
             callback = add(callback, self.logger)
-        return super()._init_callback(callback, progress_bar)
+        made = super()._init_callback(callback, progress_bar)
+        assert self.env is not None
+        warn_of_shared(self.env, made)
+        return made
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # An environment may change the array that it has returned, and at an episode's end two observations are needed.
+        return BaseAlgorithm._wrap_env(with_own_arrays(env), verbose, monitor_wrapper)
 
     def _raw_rewards(self, rewards: np.ndarray) -> list[float]:
         """Return the environment's own rewards: a normalization that drifts would mix scales in one model."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import reprlib
 import warnings
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.scaling import LARGEST_BOUND, StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
 from sb3_combrel.sources.recipes import is_table
@@ -28,6 +29,8 @@ KINDS = (
     "SourceInstances, a file (.npz, .csv or a saved model's .zip), a pandas DataFrame, a Minari dataset or its id, a replay "
     "buffer, a model, or a controller: a function of the state that returns an action"
 )
+# Warnings: an angle that spans more periods, and a value that lies beyond nearly all others by more ranges of theirs.
+MANY_PERIODS, MANY_RANGES = 10, 20
 
 
 class PastData(SavedAlgorithm):
@@ -70,7 +73,11 @@ class PastData(SavedAlgorithm):
             raise ValueError("the model has no experience yet: call learn(total_timesteps) or load_instances(...) first")
         states, actions, rewards, next_states, terminated = map(np.array, zip(*transitions, strict=True))
         scaling, task = agent.task.scaling, agent.task
-        origin = {} if self.env is None else describe_origin(self.env, type(self).__name__, self.seed)
+        try:
+            origin = {} if self.env is None else describe_origin(self.env, type(self).__name__, self.seed)
+        except OSError:
+            # The workers of a vectorised environment that has been closed do not answer.
+            origin = {}
         return SourceInstances(
             *(scaling.to_raw(states), actions, rewards, scaling.to_raw(next_states), terminated, scaling.low, scaling.high),
             *(task.n_actions, tuple(task.state_names), tuple(task.action_names), origin, tuple(map(bool, agent.periodic))),
@@ -140,7 +147,7 @@ class PastData(SavedAlgorithm):
             )
         if is_table(path):
             return SourceInstances.from_table(path, **names)
-        if path.suffix.lower() == ".zip":
+        if _is_saved_model(path):
             return type(self).load(path).source_instances()
         if path.is_file() or path.suffix == ".npz" or path.with_name(f"{path.name}.npz").is_file():
             return SourceInstances.load(path)
@@ -158,16 +165,22 @@ class PastData(SavedAlgorithm):
         """The instances with the variables and actions in the task's own order; a ValueError if they are of another task."""
         task = self.policy.agent.task
         other = "; for experience of another task there is transfer=COMBREL(source)"
+        first = int(self.action_space.start)  # type: ignore[attr-defined]
         if found.n_variables != task.scaling.n_variables or found.n_actions > task.n_actions:
             if found.n_variables > task.scaling.n_variables:
                 chosen = 'load_instances(SourceInstances.from_table(table, state_names=["x", ...]))'
                 other = f"; where a table has other columns too, name those of the state: {chosen}{other}"
-            first = int(self.action_space.start)  # type: ignore[attr-defined]
             if first != 0 and found.n_actions == task.n_actions + first:
                 other = f"; actions are numbered from 0 on, those of the environment from {first}: subtract that{other}"
             raise ValueError(
                 f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
+            )
+        if first > 0 and _are_numbered(found.action_names) and found.actions.min() >= first:
+            warnings.warn(
+                f"the instances have actions from {found.actions.min()} to {found.actions.max()}, which count from 0 on; "
+                f"those of the environment count from {first}: if the instances do so too, subtract that",
+                stacklevel=3,
             )
         columns = _columns_of_variables(found.state_names, tuple(task.state_names), other)
         self._check_units(found.states, columns)
@@ -196,6 +209,35 @@ class PastData(SavedAlgorithm):
                     f"instances must be in the units of the task, got {name} from {least:.4g} to {most:.4g}; the observation "
                     f"space has it from {low[k]:.4g} to {high[k]:.4g}"
                 )
+            _warn_of_values(name, states[:, columns[k]], width, bool(periodic[k]))
+
+
+def _warn_of_values(name: str, values: np.ndarray, width: float, periodic: bool) -> None:
+    """Warn of an angle in other units, and, where the space has no bounds, of a value far from all others."""
+    if periodic and np.ptp(values) > MANY_PERIODS * width:
+        wrong = f"{name} from {values.min():.4g} to {values.max():.4g}, many periods of {width:.4g}"
+        warnings.warn(f"the instances have {wrong}: convert it if its units are others than the task's, degrees", stacklevel=5)
+    if not width < LARGEST_BOUND and (far := _far_beyond(values)) is not None:
+        warnings.warn(
+            f"the instances have {name}={far:.4g}, far from nearly all others, and variables without bounds are scaled by the "
+            "range of what is observed: leave such rows out if they are errors of a sensor",
+            stacklevel=5,
+        )
+
+
+def _far_beyond(values: np.ndarray) -> float | None:
+    """The value that lies farthest beyond nearly all others, if by many times their range."""
+    low, high = np.percentile(values, [1.0, 99.0])
+    beyond = np.maximum(low - values, values - high)
+    return float(values[beyond.argmax()]) if beyond.max() > MANY_RANGES * (high - low) > 0.0 else None
+
+
+def _is_saved_model(path: Path) -> bool:
+    """Whether a file is that of a saved model, whatever its name ends in."""
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        return path.suffix.lower() == ".zip"
+    with zipfile.ZipFile(path) as archive:
+        return "data" in archive.namelist()
 
 
 def _are_numbered(names: Sequence[str]) -> bool:

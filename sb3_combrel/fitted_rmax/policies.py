@@ -84,12 +84,20 @@ class FittedRMaxPolicy(BasePolicy):
     def take_in(
         self, states: np.ndarray, actions: np.ndarray, rewards: np.ndarray, next_states: np.ndarray, terminated: np.ndarray
     ) -> None:
-        """Learn from n past transitions, in their order; raw units, actions from 0 on. See :meth:`FittedRMaxAgent.take_in`."""
-        for observations in (states, next_states):
-            self.note(observations)
-        self.follow_scales(episode_ended=True)
-        each = self.to_unit(states), actions.tolist(), rewards.tolist(), self.to_unit(next_states), terminated.tolist()
-        self.agent.take_in(list(zip(*each, strict=True)))
+        """Learn from n past transitions, in their order, or from none; raw units, actions from 0 on."""
+        before = self._learned()
+        # As Stable-Baselines3 hands over an environment's: rewards that differ by their rounding alone tell no states apart.
+        rewards = rewards.astype(np.float32).astype(np.float64)
+        try:
+            for observations in (states, next_states):
+                self.note(observations)
+            self.follow_scales(episode_ended=True)
+            each = self.to_unit(states), actions.tolist(), rewards.tolist(), self.to_unit(next_states), terminated.tolist()
+            self.agent.take_in(list(zip(*each, strict=True)))
+        except BaseException:
+            # An interrupt must not leave a part of them behind, which a second attempt would double.
+            self._replace_learned(before)
+            raise
 
     def follow_scales(self, episode_ended: bool) -> bool:
         """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
@@ -97,9 +105,14 @@ class FittedRMaxPolicy(BasePolicy):
             return False
         scaling = self.scales.renewed(episode_ended, self.agent.transfers)
         if scaling is not None:
-            self._warn_beyond_space()
-            self.agent.rescale(scaling, self.scales.bounds)
-            self._renew_to_unit()
+            try:
+                self._warn_beyond_space()
+                self.agent.rescale(scaling, self.scales.bounds)
+            except BaseException:
+                self.scales.scaling = self.agent.task.scaling
+                raise
+            finally:
+                self._renew_to_unit()
         return scaling is not None
 
     def _warn_beyond_space(self) -> None:
@@ -179,13 +192,20 @@ class FittedRMaxPolicy(BasePolicy):
         if not problems:
             arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
             fixed = self.scales.scaling if self.scales.fixed else None
-            self.scales.set_state(arrays.pop("scales"))
-            self.agent.set_state(arrays, self.scales.scaling, self.scales.bounds)
+            self._replace_learned(arrays)
             if fixed is not None and fixed != self.scales.scaling:
                 # The user gives other bounds than those of the file.
                 self.scales.scaling = fixed
                 self.agent.rescale(fixed, fixed)
-            self._renew_to_unit()
+                self._renew_to_unit()
+
+    def _replace_learned(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take over what :meth:`_learned` returned, in place of what was learned."""
+        self.scales.set_state(arrays["scales"])
+        self.agent.set_state(
+            {name: arrays[name] for name in arrays if name != "scales"}, self.scales.scaling, self.scales.bounds
+        )
+        self._renew_to_unit()
 
 
 def _misfit(name: str, tensor: Any, expected: np.ndarray) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
@@ -16,10 +18,41 @@ def names_of(env: VecEnv) -> dict[str, Any]:
     return {name: names for name, names in found.items() if names is not None}
 
 
+def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any]:
+    """The names of a saved model, if any, and of its new environment; a ValueError if both have some, and they differ."""
+    for key, names in of_env.items():
+        if names != saved.get(key, names):
+            raise ValueError(f"env must have the {key} of the model, {saved[key]}, got {names}")
+    return {**saved, **of_env}
+
+
 def periodic_of(env: VecEnv) -> list[bool] | None:
     """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
-    flags = _list_of(env, "periodic", (env.observation_space.shape or (0,))[0], (bool, np.bool_))
+    n_variables = (env.observation_space.shape or (0,))[0]
+    flags = _list_of(env, "periodic", n_variables, (bool, np.bool_))
+    if flags is None and env.has_attr("periodic"):
+        warnings.warn(
+            f"the environment's periodic={env.get_attr('periodic', 0)[0]!r} is not one bool for each of the {n_variables} "
+            "variables of the observations, and is ignored: pass FittedRMax(env, periodic=[...])",
+            stacklevel=4,
+        )
     return None if flags is None else [bool(flag) for flag in flags]
+
+
+def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
+    """Warn if a callback evaluates in the environment that is learned in: its episodes would be mixed up with the others."""
+    parts = [getattr(callback, "callback", None), *getattr(callback, "callbacks", ())]
+    for part in parts:
+        if isinstance(part, BaseCallback):
+            warn_of_shared(env, part)
+    evaluated = getattr(callback, "eval_env", None)
+    own = {id(each.unwrapped) for each in getattr(env.unwrapped, "envs", ())}
+    if evaluated is not None and any(id(each.unwrapped) in own for each in getattr(evaluated.unwrapped, "envs", ())):
+        warnings.warn(
+            f"{type(callback).__name__} evaluates in the environment that the model learns in: after each evaluation it "
+            "takes a state of that for the one that its own action has led to; give it an environment of its own",
+            stacklevel=4,
+        )
 
 
 def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[Any] | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.common.scaling import Bounds
 from sb3_combrel.sources.transitions import (
     AnyEnv,
@@ -36,7 +37,7 @@ def record(
 ) -> Transitions:
     """Let a behaviour act in a task; for the parameters see :meth:`SourceInstances.record`."""
     n_instances = as_transition_count("n_instances", n_instances)
-    task = env if isinstance(env, VecEnv) else make_env(env)
+    task = env if isinstance(env, VecEnv) else with_own_arrays(make_env(env))
     venv = task if isinstance(task, VecEnv) else DummyVecEnv([lambda: task])
     try:
         limits = limits_of_task(venv, bounds)

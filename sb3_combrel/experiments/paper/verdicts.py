@@ -47,11 +47,18 @@ CLAIMS: Sequence[Claim] = (
     Claim("COMBREL better than TIMBREL, most frequent mapping", _ROBOT, m.COMBREL_PLAIN, m.TIMBREL_FREQUENT),
     Claim("COMBREL better than TIMBREL, random mapping", _ROBOT, m.COMBREL_PLAIN, m.TIMBREL_RANDOM),
     Claim("COMBREL better without relevance than with it", _CAR, m.COMBREL_PLAIN, m.COMBREL_RELEVANCE),
-    Claim("With relevance COMBREL better than TIMBREL", _CAR, m.COMBREL_RELEVANCE, m.TIMBREL_RELEVANCE),
+    Claim("With relevance COMBREL better than TIMBREL with relevance", _CAR, m.COMBREL_RELEVANCE, m.TIMBREL_RELEVANCE),
     Claim("TIMBREL better with a random mapping than with the most frequent", _ROBOT, m.TIMBREL_RANDOM, m.TIMBREL_FREQUENT),
     Claim("COMBREL better than TIMBREL, most frequent mapping", _ROBOT, m.COMBREL_PLAIN, m.TIMBREL_FREQUENT, WINDOWS, _LATER),
     Claim("COMBREL better than TIMBREL, random mapping", _ROBOT, m.COMBREL_PLAIN, m.TIMBREL_RANDOM, WINDOWS, _LATER),
-    Claim("With relevance COMBREL better than TIMBREL", _CAR, m.COMBREL_RELEVANCE, m.TIMBREL_RELEVANCE, WINDOWS, _RELEVANT),
+    Claim(
+        "With relevance COMBREL better than TIMBREL with relevance",
+        _CAR,
+        m.COMBREL_RELEVANCE,
+        m.TIMBREL_RELEVANCE,
+        WINDOWS,
+        _RELEVANT,
+    ),
     *(
         Claim(f"COMBREL better than {words}", domain, m.COMBREL_PLAIN, other, CONTROL)
         for domain in (_CAR, _ROBOT)

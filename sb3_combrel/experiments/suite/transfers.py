@@ -10,13 +10,30 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+import numpy as np
+
 from sb3_combrel import COMBREL, MASTER, TIMBREL, FactoredMapping, InterTaskMapping, MappingExperts, SourceInstances
+from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.experiments.suite.tasks import CAR_2D, CART_POLE, TORSO, Source, Task
 from sb3_combrel.experiments.tasks import cart_pole, icub_arm
 from sb3_combrel.experiments.tasks.car_sources import RECORDINGS, q_learning
 from sb3_combrel.experiments.tasks.misleading_sources import MISLEADING
 from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.transfer.base import Transfer
+
+
+class EffectsAlone(COMBREL):
+    """COMBREL whose source does not bound values."""
+
+    def value_bound(self) -> np.ndarray | None:
+        return None
+
+
+class BoundAlone(COMBREL):
+    """COMBREL whose source bounds values, and says nothing of effects."""
+
+    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
+        return PriorPredictions.nothing(len(actions), states.shape[1])
 
 
 def _misled(change: Callable[[SourceInstances], SourceInstances]) -> Callable[[SourceInstances, str], Transfer]:
@@ -57,6 +74,8 @@ _ORACLES_OF: dict[str, Mapping[str, object]] = {"oracle": ORACLES, "oracle-insta
 #: From the name on the command line to a function of (source instances, name of the task).
 TRANSFERS: dict[str, Callable[[SourceInstances, str], Transfer]] = {
     "COMBREL": lambda source, task: COMBREL(source),
+    "COMBREL-effects": lambda source, task: EffectsAlone(source),
+    "COMBREL-bound": lambda source, task: BoundAlone(source),
     "COMBREL-instances": lambda source, task: COMBREL(source, "injective", use="instances"),
     "MASTER": lambda source, task: MASTER(source),
     "MappingExperts": lambda source, task: MappingExperts(source),
