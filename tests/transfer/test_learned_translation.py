@@ -13,7 +13,7 @@ from helpers.ring import Ring
 
 from sb3_combrel import TIMBREL, FittedRMax, InterTaskMapping, SparseCodingMapping, ThreeWayRBM
 from sb3_combrel.transfer.methods import three_way_rbm as machines
-from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, triplets
 from sb3_combrel.transfer.methods.sparse_coding import fit_regression, sparse_codes
 
 METHODS = [SparseCodingMapping, ThreeWayRBM]
@@ -30,7 +30,8 @@ class Swapping(LearnedTranslation):
 
     def learn_translation(self, source, target, instances):
         self.given = source, target
-        return Triplets(instances.state[:, ::-1], self.task.n_actions - 1 - instances.action, instances.effect[:, ::-1])
+        states, actions, effects = np.split(instances, [2, instances.shape[1] - 2], axis=1)
+        return np.hstack([states[:, ::-1], actions[:, ::-1], effects[:, ::-1]])
 
 
 def observe(method, transitions):
@@ -43,16 +44,26 @@ def random_transitions(n, d, n_actions, seed=0):
     return rng.random((n, d)), rng.integers(n_actions, size=n), 0.1 * rng.normal(size=(n, d))
 
 
-def test_triplets_and_columns_are_each_other():
+def test_a_triplet_has_a_column_for_each_action():
     states, actions, effects = random_transitions(9, 2, 4)
-    columns = Triplets(states, actions, effects).columns(4)
-    for row, state, action, effect in zip(columns, states, actions, effects, strict=True):
+    for row, state, action, effect in zip(triplets(states, actions, effects, 4), states, actions, effects, strict=True):
         assert row.tolist() == [*state, *[float(a == action) for a in range(4)], *effect]
-    # Of columns that are predicted the largest decides.
-    blurred = columns + 0.2 * np.random.default_rng(1).random(columns.shape)
-    blurred[:, [0, 1, 6, 7]] = columns[:, [0, 1, 6, 7]]
-    for ours, theirs in zip(Triplets.of_columns(blurred, 4), (states, actions, effects), strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_of_the_columns_of_actions_the_largest_decides():
+    class Blurring(Swapping):
+        def learn_translation(self, source, target, instances):
+            found = super().learn_translation(source, target, instances)
+            found[:, 2:5] += 0.2 * np.random.default_rng(1).random((len(found), 3))
+            return found
+
+    source = random_source(np.random.default_rng(0), 60, 2, 3)
+    task = target_task(np.random.default_rng(0).random((5, 2)), 3)
+    made = [bound(method(source, n_random_steps=12), task) for method in (Swapping, Blurring)]
+    for method in made:
+        observe(method, random_transitions(12, 2, 3))
+    np.testing.assert_array_equal(made[0].translated.actions, 2 - source.actions)
+    np.testing.assert_array_equal(made[1].translated.actions, made[0].translated.actions)
 
 
 def test_standardised_columns_have_mean_0_and_deviation_1_or_do_not_vary():
@@ -98,11 +109,9 @@ def test_it_samples_first_then_translates_once():
     observe(method, (states[11:12], actions[11:12], effects[11:12]))
     assert [len(changed_pairs(method)) for _ in range(2)] == [15, 0]
     of_source, of_target = method.given
-    assert [len(of_source.state), len(of_target.state)] == [40, 12]
-    np.testing.assert_array_equal(of_target.state, states[:12])
-    np.testing.assert_array_equal(of_target.action, actions[:12])
-    np.testing.assert_allclose(of_target.effect, effects[:12])
-    drawn = {tuple(row) for row in of_source.state}
+    assert [len(of_source), len(of_target)] == [40, 12]
+    np.testing.assert_allclose(of_target, triplets(states[:12], actions[:12], effects[:12], 3))
+    drawn = {tuple(row) for row in of_source[:, :2]}
     assert len(drawn) == 40 and drawn <= {tuple(row) for row in source.scaling.to_unit(source.states)}
     before = method.translated
     observe(method, (states[12:], actions[12:], effects[12:]))

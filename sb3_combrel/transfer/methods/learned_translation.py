@@ -22,23 +22,13 @@ MIN_SAMPLES = 10  # with fewer samples there is nothing to learn a mapping from
 DEFAULT_SAMPLE_STEPS = 200
 
 
-class Triplets(NamedTuple):
-    """Transitions of one task without rewards, in its unit coordinates."""
+def triplets(states: np.ndarray, actions: np.ndarray, effects: np.ndarray, n_actions: int) -> np.ndarray:
+    """Return transitions of one task as numbers, in its unit coordinates: state, one column for each action, and effect.
 
-    state: np.ndarray  # float64, shape (n, n_variables)
-    action: np.ndarray  # int64, shape (n,)
-    effect: np.ndarray  # next state minus state, float64, shape (n, n_variables)
-
-    def columns(self, n_actions: int) -> np.ndarray:
-        """Return them as numbers, state, action (one column each) and effect: shape (n, 2 * n_variables + n_actions)."""
-        return np.hstack([self.state, np.eye(n_actions)[self.action], self.effect])
-
-    @classmethod
-    def of_columns(cls, columns: np.ndarray, n_actions: int) -> Triplets:
-        """Undo :meth:`columns`; of the columns of actions the largest decides."""
-        d = (columns.shape[1] - n_actions) // 2
-        actions = columns[:, d : d + n_actions].argmax(axis=1).astype(np.int64)
-        return cls(columns[:, :d].copy(), actions, columns[:, d + n_actions :].copy())
+    :param effects: next state minus state, shape (n, n_variables), as ``states``; ``actions``: int64, shape (n,)
+    :return: float64, shape (n, 2 * n_variables + n_actions)
+    """
+    return np.hstack([states, np.eye(n_actions)[actions], effects])
 
 
 class Standard(NamedTuple):
@@ -97,8 +87,11 @@ class LearnedTranslation(Transfer):
         self.transfer_terminals = bool(self.transfer_terminals)
 
     @abstractmethod
-    def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        """Learn a mapping from samples; return the source's ``instances`` in target coordinates, to be clipped."""
+    def learn_translation(self, source: np.ndarray, target: np.ndarray, instances: np.ndarray) -> np.ndarray:
+        """Learn a mapping from samples; return the source's ``instances`` as the target's, to be clipped.
+
+        All are rows of :func:`triplets`; of the columns of actions that are returned the largest decides.
+        """
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
@@ -137,17 +130,20 @@ class LearnedTranslation(Transfer):
         began = perf_counter()
         source, d = self._source, self._bound_task.n_variables
         states = source.scaling.to_unit(source.states)
-        instances = Triplets(states, source.actions, source.scaling.to_unit(source.next_states) - states)
+        effects = source.scaling.to_unit(source.next_states) - states
+        instances = triplets(states, source.actions, effects, source.n_actions)
         rows = np.sort(self.rng.permutation(len(source))[: self.n_source_samples])
-        target = Triplets(self._samples[:, :d], self._samples[:, d].astype(np.int64), self._samples[:, d + 1 :])
-        found = self.learn_translation(Triplets(*(column[rows] for column in instances)), target, instances)
+        seen_states, seen_actions, seen_effects = np.split(self._samples, [d, d + 1], axis=1)
+        target = triplets(seen_states, seen_actions[:, 0].astype(np.int64), seen_effects, self._bound_task.n_actions)
+        found = self.learn_translation(instances[rows], target, instances)
+        found_states, found_actions, found_effects = np.split(found, [d, found.shape[1] - d], axis=1)
         # Nothing is known of states outside the box, nor of effects beyond those seen.
-        states = np.clip(found.state, 0.0, 1.0)
-        after = np.clip(states + np.clip(found.effect, target.effect.min(axis=0), target.effect.max(axis=0)), 0.0, 1.0)
-        self._transfer_rows(np.column_stack([states, found.action, after]))
+        states = np.clip(found_states, 0.0, 1.0)
+        effects = np.clip(found_effects, seen_effects.min(axis=0), seen_effects.max(axis=0))
+        self._transfer_rows(np.column_stack([states, found_actions.argmax(axis=1), np.clip(states + effects, 0.0, 1.0)]))
         self._seconds = perf_counter() - began
 
-    def _transfer_rows(self, rows: np.ndarray) -> None:
+    def _transfer_rows(self, rows: np.ndarray) -> TIMBREL:
         task, source, d = self._bound_task, self._source, self._bound_task.n_variables
         self._rows = rows
         states, after = task.scaling.to_raw(rows[:, :d]), task.scaling.to_raw(rows[:, d + 1 :])
@@ -159,6 +155,7 @@ class LearnedTranslation(Transfer):
         names = ("breadth", "breadth_decay", "transfer_terminals")
         self._timbrel = TIMBREL(self.translated, identity, **{name: getattr(self, name) for name in names})
         self._timbrel.bind(task, self.rng)
+        return self._timbrel
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         if self._timbrel is None:
@@ -201,9 +198,8 @@ class LearnedTranslation(Transfer):
 
     def _state_of_timbrel(self) -> dict[str, np.ndarray]:
         """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
-        timbrel = self._timbrel
+        timbrel, task = self._timbrel, self._bound_task
         if timbrel is None:
-            task = self._bound_task
             timbrel = TIMBREL(self._source, InterTaskMapping((0,) * task.n_variables, (0,) * task.n_actions))
             timbrel.bind(task, np.random.default_rng(0))
         return {f"timbrel_{name}": array for name, array in timbrel.get_state().items()}
@@ -212,6 +208,5 @@ class LearnedTranslation(Transfer):
         self._samples = state["samples"].copy()
         if len(state["translated"]) != len(self._source):
             return
-        self._transfer_rows(state["translated"].copy())
-        assert self._timbrel is not None
-        self._timbrel.set_state({name.removeprefix("timbrel_"): array for name, array in state.items()})
+        timbrel = self._transfer_rows(state["translated"].copy())
+        timbrel.set_state({name.removeprefix("timbrel_"): array for name, array in state.items()})

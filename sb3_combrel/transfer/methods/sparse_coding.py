@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_positive
-from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -101,21 +101,18 @@ class SparseCodingMapping(LearnedTranslation):
         check_count("n_atoms", self.n_atoms, none_allowed=True)
         check_positive("sparsity", self.sparsity)
 
-    def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
+    def learn_translation(self, source: np.ndarray, target: np.ndarray, instances: np.ndarray) -> np.ndarray:
         from scipy.spatial import cKDTree
 
-        n_target, n_source = self._bound_task.n_actions, self._source.n_actions
         seed = int(self.rng.integers(2**31))
-        source_columns, target_columns = source.columns(n_source), target.columns(n_target)
-        of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
-        from_rows, to_rows = of_source.to(source_columns), of_target.to(target_columns)
+        of_source, of_target = Standard.of(source), Standard.of(target)
+        from_rows, to_rows = of_source.to(source), of_target.to(target)
         n_atoms = 2 * to_rows.shape[1] if self.n_atoms is None else self.n_atoms
         codes = sparse_codes(from_rows, to_rows, n_atoms, self.sparsity, seed)
         _, nearest = cKDTree(codes.target).query(codes.source)
         regression = fit_regression(from_rows, to_rows[nearest], seed)
         self.regression_error = float(((regression.predict(from_rows) - to_rows[nearest]) ** 2).mean())
-        found = regression.predict(of_source.to(instances.columns(n_source)))
-        return Triplets.of_columns(of_target.back(found), n_target)
+        return of_target.back(regression.predict(of_source.to(instances)))
 
     def statistics(self) -> dict[str, float]:
         return {**super().statistics(), "transfer/regression_error": self.regression_error}

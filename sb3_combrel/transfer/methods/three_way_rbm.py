@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard, Triplets
+from sb3_combrel.transfer.methods.learned_translation import LearnedTranslation, Standard
 
 STEP_SIZE = 0.01
 FIRST_DEVIATION = 0.1
@@ -58,15 +58,12 @@ class ThreeWayRBM(LearnedTranslation):
         for name in ("n_hidden", "n_factors", "n_updates"):
             check_count(name, getattr(self, name))
 
-    def learn_translation(self, source: Triplets, target: Triplets, instances: Triplets) -> Triplets:
-        n_target, n_source = self._bound_task.n_actions, self._source.n_actions
-        source_columns, target_columns = source.columns(n_source), target.columns(n_target)
-        of_source, of_target = Standard.of(source_columns), Standard.of(target_columns)
+    def learn_translation(self, source: np.ndarray, target: np.ndarray, instances: np.ndarray) -> np.ndarray:
+        of_source, of_target = Standard.of(source), Standard.of(target)
         sizes: dict[str, Any] = {"n_hidden": self.n_hidden, "n_factors": self.n_factors, "n_updates": self.n_updates}
         seed = int(self.rng.integers(2**63))
-        machine = train(of_source.to(source_columns), of_target.to(target_columns), seed=seed, **sizes)
-        found = reconstruct(machine, of_source.to(instances.columns(n_source)))
-        return Triplets.of_columns(of_target.back(found), n_target)
+        machine = train(of_source.to(source), of_target.to(target), seed=seed, **sizes)
+        return of_target.back(reconstruct(machine, of_source.to(instances)))
 
 
 class Machine(NamedTuple):
