@@ -27,14 +27,14 @@ TASK = naive.target_task(np.random.default_rng(0).random((4, 2)), 2)
 def play(method, total, steps=1, environment=0, truncated=False):
     """An episode of so many steps that returns ``total``; how many of them an expert decided, and who acted."""
     method.environment = environment
-    state, decided = np.full(2, 0.5 + 0.001 * len(method._episodes)), 0
+    state, decided = np.full(2, 0.5 + 0.001 * len(method._ended)), 0
     for step in range(steps):
         decided += method.action(state) is not None
         after = state + 1e-6
         method.observe(state, 0, total / steps, after, step == steps - 1 and not truncated)
         state = after
     method.end_episode(truncated)
-    return decided, method._episodes[-1][0]
+    return decided, method._ended[-1].arm
 
 
 def line_source(stride, reward_at_goal, n=400):
@@ -203,17 +203,15 @@ def test_an_episode_that_was_broken_off_counts_for_nothing():
     assert method.action(np.array([0.2, 0.5])) is not None
     method.observe(np.array([0.2, 0.5]), 0, -5.0, np.array([0.3, 0.5]), True)
     method.end_episode(False)
-    assert method._episodes[1:] == [(1, -5.0, 1, 1)]
+    assert [(each.arm, each.total, each.steps, each.acted) for each in method._ended[1:]] == [(1, -5.0, 1, 1)]
 
 
 def test_returns_are_those_of_the_episodes_of_each_environment_and_the_agent_learns_from_every_step():
     model = small(make_vec_env(Walk, n_envs=3, seed=0), transfer=MappingExperts(walk_source())).learn(300)
     method = model.policy.transfer
     # In the buffer the last digits are rounded.
-    np.testing.assert_allclose(
-        [total for _, total, *_ in method._episodes], [info["r"] for info in model.ep_info_buffer], atol=1e-5
-    )
-    assert sum(steps for *_, steps, _ in method._episodes) == sum(info["l"] for info in model.ep_info_buffer)
+    np.testing.assert_allclose([each.total for each in method._ended], [info["r"] for info in model.ep_info_buffer], atol=1e-5)
+    assert sum(each.steps for each in method._ended) == sum(info["l"] for info in model.ep_info_buffer)
     assert model.agent.model.n_instances == 300
     assert len(method.experts) == 8 and all(n > 0 for *_, n in method.describe())
     assert model.agent.model.transfer is None

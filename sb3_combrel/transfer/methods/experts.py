@@ -16,7 +16,6 @@ from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
-DEFAULT_MAX_EXPERTS = 10
 MAX_MAPPINGS = 2**53  # numbers of mappings are saved as float64
 AGENT = 0  #: the number of the learning agent among those who may act; the experts come after it
 
@@ -29,8 +28,8 @@ class Expert(NamedTuple):
 
 
 @dataclass
-class Playing:
-    """An episode that is going on: who acts (agent or expert), sum of rewards, steps, and how many an expert decided."""
+class Episode:
+    """An episode: who acts (agent or expert), sum of rewards, steps, and how many of them an expert decided."""
 
     arm: int
     total: float = 0.0
@@ -81,7 +80,7 @@ class MappingExperts(Transfer):
     source: SourceLike
     mappings: MappingsLike = "injective"
     _: KW_ONLY
-    max_experts: int = DEFAULT_MAX_EXPERTS
+    max_experts: int = 10
     exploration: float = 0.2
     patience: float | None = 1.0
     gamma: float = 0.99
@@ -118,9 +117,8 @@ class MappingExperts(Transfer):
         self._typical = [np.median(source.scaling.to_unit(source.states), axis=0) for source in self.sources]
         self._numbers = np.empty(0, dtype=np.int64)
         self.experts: list[Expert] = []
-        # Of each episode that has ended: who acted, its return, its steps, how many of them an expert decided.
-        self._episodes: list[tuple[int, float, int, int]] = []
-        self._playing: dict[int, Playing] = {}
+        self._ended: list[Episode] = []
+        self._playing: dict[int, Episode] = {}  # by number of the environment
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         return TransferredInstances.empty(len(actions), states.shape[1])
@@ -135,7 +133,7 @@ class MappingExperts(Transfer):
             del self._playing[self.environment]
             playing = None
         if playing is None:
-            playing = self._playing[self.environment] = Playing(self._choose())
+            playing = self._playing[self.environment] = Episode(self._choose())
         if playing.arm == AGENT or playing.acted >= self._most_steps():
             return None
         action = self.expert_action(playing.arm, state)
@@ -147,9 +145,7 @@ class MappingExperts(Transfer):
         source, mapping = self.experts[number - 1]
         seen = mapping.target_to_source(state, self.sources[source].n_variables)
         q = self._policies[source].q_values(np.where(np.isnan(seen), self._typical[source], seen))
-        available = np.zeros(len(q), dtype=np.bool_)
-        available[list(mapping.action)] = True
-        q = np.where(available, q, -np.inf)
+        q[~np.isin(np.arange(len(q)), mapping.action)] = -np.inf
         best = int(q.argmax())
         if q[best] == -np.inf:
             return None
@@ -159,7 +155,7 @@ class MappingExperts(Transfer):
     def _most_steps(self) -> float:
         if self.patience is None:
             return np.inf
-        return self.patience * next((steps for arm, _, steps, _ in reversed(self._episodes) if arm == AGENT), np.inf)
+        return self.patience * next((each.steps for each in reversed(self._ended) if each.arm == AGENT), np.inf)
 
     def _choose(self) -> int:
         if len(self._numbers) == 0:
@@ -191,62 +187,62 @@ class MappingExperts(Transfer):
     def end_episode(self, truncated: bool) -> None:
         playing = self._playing.pop(self.environment, None)
         if playing is not None:
-            self._episodes.append((playing.arm, playing.total, playing.steps, playing.acted))
+            self._ended.append(playing)
 
     def mean_returns(self) -> np.ndarray:
         """Return the mean return of the agent, of the later half of its episodes, and of each expert; NaN before the first."""
         return np.array([mean_return(k, of_arm) if of_arm else np.nan for k, of_arm in enumerate(self._returns())])
 
     def _returns(self) -> list[list[float]]:
-        return [[total for arm, total, *_ in self._episodes if arm == k] for k in range(1 + len(self.experts))]
+        return [[each.total for each in self._ended if each.arm == k] for k in range(1 + len(self.experts))]
 
     def describe(self) -> list[tuple[str, float, int]]:
         """Return the name, the mean return and the number of episodes of all who may act, the agent first."""
         names = ["agent", *(repr(mapping) for _, mapping in self.experts)]
-        arms, means = [arm for arm, *_ in self._episodes], self.mean_returns().tolist()
-        return [(name, mean, arms.count(k)) for k, (name, mean) in enumerate(zip(names, means, strict=True))]
+        numbers = map(len, self._returns())
+        return list(zip(names, self.mean_returns().tolist(), numbers, strict=True))
 
     def _best(self) -> int:
         means = self.mean_returns()
         return AGENT if np.isnan(means).all() else int(np.nanargmax(means))
 
-    def _acted(self) -> list[tuple[int, int]]:
-        """Who acted in each episode, those that go on too, and in how many steps an expert did."""
-        ended = [(arm, acted) for arm, *_, acted in self._episodes]
-        return ended + [(playing.arm, playing.acted) for playing in self._playing.values()]
+    def _all_episodes(self) -> list[Episode]:
+        """The episodes that have ended, and those that go on."""
+        return [*self._ended, *self._playing.values()]
 
     def mapping_steps(self) -> int:
         """Return how many steps of the target experts have taken that are not the best of all who may act."""
         best = self._best()
-        return sum(steps for arm, steps in self._acted() if arm != best)
+        return sum(each.acted for each in self._all_episodes() if each.arm != best)
 
     def statistics(self) -> dict[str, float]:
         means, best = self.mean_returns(), self._best()
         return {
             "transfer/experts": len(self.experts),
             "transfer/best_expert": best,
-            "transfer/expert_steps": sum(steps for _, steps in self._acted()),
+            "transfer/expert_steps": sum(each.acted for each in self._all_episodes()),
             "transfer/steps_to_find_mapping": self.mapping_steps(),
-            "transfer/expert_episodes": sum(arm != AGENT for arm, *_ in self._episodes),
+            "transfer/expert_episodes": sum(each.arm != AGENT for each in self._ended),
             "transfer/agent_return": float(means[AGENT]),
             "transfer/best_return": float(means[best]),
         }
 
     def get_state(self) -> dict[str, np.ndarray]:
+        episodes = [(each.arm, each.total, each.steps, each.acted) for each in self._ended]
         going = [(number, one, one.state) for number, one in self._playing.items() if one.state is not None]
         playing = [(number, one.arm, one.total, one.steps, one.acted, *state) for number, one, state in going]
         return {
             "experts": self._numbers[:, None].astype(np.float64),
-            "episodes": np.array(self._episodes, dtype=np.float64).reshape(-1, 4),
+            "episodes": np.array(episodes, dtype=np.float64).reshape(-1, 4),
             "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self._bound_task.n_variables),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         self._set_experts(state["experts"][:, 0].astype(np.int64))
         for arm, total, steps, acted in state["episodes"].tolist():
-            self._episodes.append((int(arm), total, int(steps), int(acted)))
+            self._ended.append(Episode(int(arm), total, int(steps), int(acted)))
         for environment, arm, total, steps, acted, *reached in state["playing"].tolist():
-            self._playing[int(environment)] = Playing(int(arm), total, int(steps), int(acted), np.array(reached))
+            self._playing[int(environment)] = Episode(int(arm), total, int(steps), int(acted), np.array(reached))
 
 
 def mean_return(arm: int, returns: list[float]) -> float:
