@@ -16,11 +16,14 @@ from sb3_combrel.sources.transitions import Floats, Transitions
 if TYPE_CHECKING:
     import pandas as pd
 
+    from sb3_combrel.sources.source_instances import SourceInstances
+
 # Importing pandas takes a while, and only who has a table needs it.
 Table: TypeAlias = "str | os.PathLike[str] | pd.DataFrame"
 ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE = "action", "reward", "terminated", "done", "truncated", "episode"
 NEXT, INDEX = "next_", "Unnamed: "
 _NO_STATES = {ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE}
+_TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0", "nan", "", "none")
 
 
 def read_table(
@@ -46,7 +49,8 @@ def read_table(
     steps, next_states = _with_next_states(frame, names)
     states = _numbers(steps, names)
     actions = _actions(steps, action_names)
-    n_actions = _n_actions(actions, action_names, n_actions)
+    if n_actions is None:
+        n_actions = len(action_names) or int(actions.max(initial=0)) + 1
     every = (-np.inf, np.inf) if bounds is None else bounds
     limits = tuple(np.broadcast_to(np.asarray(side, dtype=np.float64), (len(names),)) for side in every)
     scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))  # type: ignore[arg-type]
@@ -156,23 +160,12 @@ def _flags(frame: pd.DataFrame, name: str) -> np.ndarray:
     """A column of true and false, or 1 and 0; all false if there is none, and where nothing is written."""
     if name not in frame.columns:
         return np.zeros(len(frame), dtype=np.bool_)
-    meaning = {
-        "true": True,
-        "false": False,
-        "1": True,
-        "0": False,
-        "1.0": True,
-        "0.0": False,
-        "nan": False,
-        "": False,
-        "none": False,
-    }
-    flags = frame[name].astype(str).str.strip().str.lower().map(meaning)
-    wrong = np.flatnonzero(flags.isna())
+    words = frame[name].astype(str).str.strip().str.lower()
+    wrong = np.flatnonzero(~words.isin((*_TRUE, *_FALSE)))
     if len(wrong):
         row = wrong[0]
         raise ValueError(f"column {name!r} must be true or false, got {frame[name].tolist()[row]!r} in row {frame.index[row]}")
-    return flags.to_numpy(dtype=np.bool_)
+    return words.isin(_TRUE).to_numpy(dtype=np.bool_)
 
 
 def _terminated(frame: pd.DataFrame) -> np.ndarray:
@@ -208,13 +201,7 @@ def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:
     return numbers.astype(np.int64)
 
 
-def _n_actions(actions: np.ndarray, action_names: Sequence[str], n_actions: int | None) -> int:
-    if n_actions is not None:
-        return n_actions
-    return len(action_names) if len(action_names) else int(actions.max(initial=0)) + 1
-
-
-def as_frame(source: Any) -> pd.DataFrame:
+def as_frame(source: SourceInstances) -> pd.DataFrame:
     """The table of source instances, see :meth:`SourceInstances.to_table`."""
     import pandas as pd
 
