@@ -16,6 +16,8 @@ from sb3_combrel.sources.transitions import Transitions, count_actions
 if TYPE_CHECKING:
     from minari import MinariDataset
 
+    from sb3_combrel.sources.source_instances import SourceInstances
+
 _METADATA_KEY = "sb3_combrel"
 
 
@@ -37,8 +39,8 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     return Transitions(*columns, scaling.low, scaling.high, n_actions, origin=kept.get("origin", unnamed), **names)
 
 
-def write_dataset(source: Transitions, dataset_id: str, **metadata: Any) -> MinariDataset:
-    """Store transitions as a local Minari dataset; see :meth:`SourceInstances.to_minari`."""
+def write_dataset(source: SourceInstances, dataset_id: str, **metadata: Any) -> MinariDataset:
+    """Store instances as a local Minari dataset; see :meth:`SourceInstances.to_minari`."""
     minari = _import_minari()
     from minari.data_collector import EpisodeBuffer
 

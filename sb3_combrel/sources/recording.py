@@ -100,35 +100,34 @@ def _actor(
     model: Behaviour | None, env: VecEnv, seed: int | None, deterministic: bool
 ) -> Callable[[Any, NDArray[Any], NDArray[np.bool_]], NDArray[Any]]:
     """A function from (states as the model sees them, raw states, episode starts) to the actions of all environments."""
+    first, n_actions = int(env.action_space.start), count_actions(env.action_space)  # type: ignore[attr-defined]
     if model is None:
         rng = np.random.default_rng(seed)
-        first = int(env.action_space.start)  # type: ignore[attr-defined]
-        n_actions = count_actions(env.action_space)
         return lambda seen, states, starts: first + rng.integers(n_actions, size=len(states))
+    possible = range(first, first + n_actions)
     predict_action = getattr(model, "predict", None)
     if predict_action is None:
         if not callable(model):
             raise ValueError(f"model must be an SB3 model or policy, a function of the state, or None, got {model!r}")
         function = model
-        return lambda seen, states, starts: np.array([_checked(function(state), env, state) for state in states])
+        return lambda seen, states, starts: np.array([_checked(function(state), possible, state) for state in states])
     memory: list[Any] = [None]
 
     def predict(seen: Any, states: NDArray[Any], starts: NDArray[np.bool_]) -> NDArray[Any]:
         # Recurrent policies carry a hidden state from step to step.
         actions, memory[0] = predict_action(seen, state=memory[0], episode_start=starts, deterministic=deterministic)
-        return np.array([_checked(action, env, state) for action, state in zip(actions, states, strict=True)])
+        return np.array([_checked(action, possible, state) for action, state in zip(actions, states, strict=True)])
 
     return predict
 
 
-def _checked(action: Any, env: VecEnv, state: NDArray[Any]) -> int:
+def _checked(action: Any, possible: range, state: NDArray[Any]) -> int:
     """What a behaviour has returned, or an array of it alone, as a number; ``ValueError`` if it is no action of the task."""
-    first, n_actions = int(env.action_space.start), count_actions(env.action_space)  # type: ignore[attr-defined]
     number = np.asarray(action)
-    if number.size == 1 and number.dtype.kind in "iuf" and number.item() in range(first, first + n_actions):
+    if number.size == 1 and number.dtype.kind in "iuf" and number.item() in possible:
         return int(number.item())
     raise ValueError(
-        f"model must return a whole number from {first} to {first + n_actions - 1}, got {reprlib.repr(action)} in the state "
+        f"model must return a whole number from {possible[0]} to {possible[-1]}, got {reprlib.repr(action)} in the state "
         f"{state.tolist()}; of a continuous action return the number of the nearest of those that the task has"
     )
 

@@ -26,14 +26,12 @@ from sb3_combrel.sources import minari_datasets, recording, tables
 from sb3_combrel.sources.q_learning import learn_q_learning
 from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
-from sb3_combrel.sources.transitions import LEARNERS, Transitions, as_transition_count, count_actions
+from sb3_combrel.sources.transitions import LEARNERS, Floats, as_transition_count, count_actions
 
 if TYPE_CHECKING:
     import pandas as pd
     from minari import MinariDataset
     from stable_baselines3.common.vec_env import VecEnv
-
-Floats = NDArray[np.float64]
 
 _MAX_ACTIONS = 1_000_000  # each action has a name
 _FORMAT, _VERSION = "sb3_combrel.SourceInstances", 1
@@ -246,8 +244,7 @@ class SourceInstances:
         :param metadata: arguments of ``minari.create_dataset_from_buffers`` such as ``author``
         :raises ImportError: if Minari is missing
         """
-        transitions = Transitions(*(getattr(self, name) for name in Transitions._fields))
-        return minari_datasets.write_dataset(transitions, dataset_id, **metadata)
+        return minari_datasets.write_dataset(self, dataset_id, **metadata)
 
     @property
     def scaling(self) -> StateScaling:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.checks import as_count
-from sb3_combrel.common.periodic import check_periods, flag_array
+from sb3_combrel.common.periodic import check_periods, flag_array, periodic_flags
 from sb3_combrel.common.scaling import Bounds, Limits, StateScaling
 from sb3_combrel.common.version import __version__
 
@@ -142,9 +143,9 @@ def task_names(env: AnyEnv) -> dict[str, tuple[Any, ...]]:
     given = {name: _attribute(env, name) for name in ("state_names", "action_names")}
     names = {name: tuple(value) for name, value in given.items() if value is not None}
     periodic = _attribute(env, "periodic")
-    is_list = isinstance(periodic, Sequence | np.ndarray) and len(periodic) == (env.observation_space.shape or (0,))[0]
-    if is_list and all(isinstance(flag, bool | np.bool_) for flag in periodic):
-        names["periodic"] = tuple(map(bool, periodic))
+    if periodic is not None:
+        with suppress(ValueError):
+            names["periodic"] = periodic_flags(periodic, (env.observation_space.shape or (0,))[0])
     return names
 
 
