@@ -33,10 +33,9 @@ def read_dataset(dataset: str | MinariDataset, bounds: Bounds | None = None) -> 
     states, actions, rewards, next_states, terminated = map(np.concatenate, zip(*parts, strict=True))
     kept = json.loads(data.storage.metadata.get(_METADATA_KEY, "{}"))
     unnamed = {"env": None if data.env_spec is None else data.env_spec.id, "recorder": "Minari dataset", "dataset": data.id}
-    names: dict[str, Any] = {name: tuple(each) for name, each in kept.get("names", {}).items()}
-    scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
+    names = {name: tuple(each) for name, each in kept.get("names", {}).items()}
     columns = states, actions - int(data.action_space.start), rewards, next_states, terminated
-    return Transitions(*columns, scaling.low, scaling.high, n_actions, origin=kept.get("origin", unnamed), **names)
+    return Transitions.within(limits, columns, n_actions, names, kept.get("origin", unnamed))
 
 
 def write_dataset(source: SourceInstances, dataset_id: str, **metadata: Any) -> MinariDataset:

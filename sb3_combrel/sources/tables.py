@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from sb3_combrel.common.scaling import Bounds, StateScaling
+from sb3_combrel.common.scaling import Bounds
 from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.sources.transitions import Floats, Transitions
 
@@ -51,15 +51,12 @@ def read_table(
     actions = _actions(steps, action_names)
     if n_actions is None:
         n_actions = len(action_names) or int(actions.max(initial=0)) + 1
-    every = (-np.inf, np.inf) if bounds is None else bounds
-    limits = tuple(np.broadcast_to(np.asarray(side, dtype=np.float64), (len(names),)) for side in every)
-    scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))  # type: ignore[arg-type]
+    low, high = (-np.inf, np.inf) if bounds is None else bounds
+    limits = np.full(len(names), low, dtype=np.float64), np.full(len(names), high, dtype=np.float64)
+    columns = states, actions, _numbers(steps, [REWARD])[:, 0], next_states, _terminated(steps)
+    given = {"state_names": names, "action_names": tuple(action_names)}
     origin = {"env": None, "recorder": os.path.basename(table) if isinstance(table, str | os.PathLike) else "table"}
-    return Transitions(
-        *(states, actions, _numbers(steps, [REWARD])[:, 0], next_states, _terminated(steps)),
-        *(scaling.low, scaling.high, n_actions, names, tuple(action_names)),
-        origin=origin,
-    )
+    return Transitions.within(limits, columns, n_actions, given, origin)
 
 
 def _read(table: Table) -> pd.DataFrame:

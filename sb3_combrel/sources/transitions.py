@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -45,6 +45,16 @@ class Transitions(NamedTuple):
     origin: Mapping[str, Any] = MappingProxyType({})
     periodic: tuple[bool, ...] = ()
 
+    @classmethod
+    def within(
+        cls, limits: Limits, columns: Iterable[Any], n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
+    ) -> Transitions:
+        """Take the first five fields, ``columns``, with names, and (low, high) of the states; what is infinite is found."""
+        states, actions, rewards, next_states, terminated = columns
+        scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
+        bounds = scaling.low, scaling.high
+        return cls(states, actions, rewards, next_states, terminated, *bounds, n_actions, origin=origin, **names)
+
 
 #: By name, what learns a source task: called with the environment or its id, the seed, how long, and a dict of arguments.
 LEARNERS: dict[str, Callable[[str | gym.Env[Any, Any], int | None, int, dict[str, Any]], Transitions]] = {}
@@ -76,21 +86,14 @@ class TransitionLog:
         if position < self.max_instances:
             self._rows[position] = row
 
-    def transitions(
-        self, limits: tuple[Floats, Floats], n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]
-    ) -> Transitions:
-        """What is in the log; ``ValueError`` if that is nothing.
-
-        :param limits: (low, high) of the states; what is infinite is found from them
-        """
+    def transitions(self, limits: Limits, n_actions: int, names: Mapping[str, Any], origin: Mapping[str, Any]) -> Transitions:
+        """What is in the log, see :meth:`Transitions.within`; ``ValueError`` if that is nothing."""
         if not self._rows:
             raise ValueError("nothing has been recorded yet: no step was taken in the source task")
         _, *columns = zip(*sorted(self._rows, key=lambda row: row[0]), strict=True)
         kinds = np.float64, np.int64, np.float64, np.float64, np.bool_
         arrays: list[Any] = [np.array(column, dtype=kind) for column, kind in zip(columns, kinds, strict=True)]
-        scaling = StateScaling.from_observed(limits, np.concatenate([arrays[0], arrays[3]]))
-        fields: dict[str, Any] = {**dict(zip(Transitions._fields, arrays, strict=False)), **names}
-        return Transitions(**fields, low=scaling.low, high=scaling.high, n_actions=n_actions, origin=origin)
+        return Transitions.within(limits, arrays, n_actions, names, origin)
 
 
 def check_observation(observation: Any, when: str) -> None:
