@@ -25,7 +25,7 @@ from sb3_combrel.sources.transitions import (
     task_names,
 )
 
-Transition = Callable[[NDArray[Any], int, float, NDArray[Any], bool], object]
+TransitionCallback = Callable[[NDArray[Any], int, float, NDArray[Any], bool], object]
 """Called with each step: state, action (from 0 on), reward, next state (raw units), and whether that is terminal."""
 
 _MAX_TILES = 10_000_000
@@ -34,7 +34,7 @@ _MAX_TILES = 10_000_000
 class TileCoding:
     """Overlapping grids over the unit cube; each state lies in one tile of each grid (Sutton and Barto, Section 9.5.4)."""
 
-    def __init__(self, n_variables: int, n_tilings: int = 8, n_tiles: int = 8) -> None:
+    def __init__(self, n_variables: int, n_tilings: int, n_tiles: int) -> None:
         check_count("n_tilings", n_tilings, max=_MAX_TILES)
         check_count("n_tiles", n_tiles, max=_MAX_TILES)
         # One more tile along each variable than asked for, as the grids are shifted.
@@ -105,7 +105,7 @@ class QLearning:
         self._first_action = int(self.action_space.start)  # type: ignore[attr-defined]
         self._rng = np.random.default_rng(seed)
 
-    def learn(self, total_timesteps: int, callback: Transition | None = None) -> QLearning:
+    def learn(self, total_timesteps: int, callback: TransitionCallback | None = None) -> QLearning:
         """Act and learn. Each call begins with a new episode; the last one may stay unfinished.
 
         :param total_timesteps: number of steps in the environment; a float such as 1e5 may be given
@@ -120,7 +120,7 @@ class QLearning:
             seed = None
         return self
 
-    def _episode(self, max_steps: int, callback: Transition | None, seed: int | None) -> int:
+    def _episode(self, max_steps: int, callback: TransitionCallback | None, seed: int | None) -> int:
         """Run one episode of at most ``max_steps``; returns its number of steps."""
         state, _ = self.env.reset(seed=seed)
         check_observation(state, f"at the reset before episode {len(self.episode_lengths) + 1}")
