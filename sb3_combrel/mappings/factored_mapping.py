@@ -39,7 +39,7 @@ class FactoredMapping:
     copies: tuple[InterTaskMapping, ...]
 
     def __init__(self, copies: Iterable[InterTaskMapping | Mapping[str, Any]]) -> None:
-        if isinstance(copies, str | Mapping | InterTaskMapping) or not isinstance(copies, Iterable):
+        if isinstance(copies, str | Mapping) or not isinstance(copies, Iterable):
             raise ValueError(f"copies must be a list of inter-task mappings, one a copy of the source, got {copies!r}")
         mappings = tuple(as_mapping(each, "copies") for each in copies)
         if not mappings:

@@ -66,10 +66,8 @@ def with_mirrored(state_mappings: Ints) -> tuple[Ints, Ints]:
 
 
 def _count_state_mappings(n_source: int, n_target: int, once: bool, allow_none: bool) -> int:
-    if once:
+    if once or n_source >= n_target:
         return perm(max(n_source, n_target), min(n_source, n_target))
-    if n_source >= n_target:
-        return perm(n_source, n_target)
     # Inclusion and exclusion over the source variables that are left out.
     choices = n_source + allow_none
     return sum((-1) ** k * comb(n_source, k) * (choices - k) ** n_target for k in range(n_source + 1))
