@@ -89,14 +89,14 @@ class SoftHomomorphism(Transfer):
                 f"SoftHomomorphism needs at most {MAX_MAPPINGS:,} mappings of states, got {n_mappings:,} of {d} target to "
                 f"{source.n_variables} source variables; {advice}a source with fewer variables"
             )
-        self._model = SourceModel(stacked_instances([source]), float(self.source_breadth))
-        self._mean = source.scaling.to_unit(source.states).mean(axis=0)
+        model = SourceModel(stacked_instances([source]), float(self.source_breadth))
+        mean = source.scaling.to_unit(source.states).mean(axis=0)
         self._readings = soft.all_readings(source.n_variables, d, self.mirrored)
         copies = max(1, d // source.n_variables) if self.n_copies is None else self.n_copies
         shape = copies, source.n_variables, 1 + int(self._readings.number.max())
         self._shape = Logits(np.zeros(shape), np.zeros((copies, task.n_actions, source.n_actions)))
         self._logits: Logits | None = None
-        self._mixture = soft.MixturePredictions(self._model, self._readings, self._mean, task.sample_states)
+        self._mixture = soft.MixturePredictions(model, self._readings, mean, task.sample_states)
         self._periodic = np.array(task.periodic)
         self._transitions = RecordedTransitions(d)
         self._evidence = PriorEvidence(task.n_actions, d)
@@ -153,7 +153,7 @@ class SoftHomomorphism(Transfer):
         rows = np.arange(n) if n <= MAX_FITTED else np.sort(self.rng.choice(n, MAX_FITTED, replace=False))
         size = np.abs(seen.effects[:n]).mean(axis=0)
         scale = np.maximum(size, max(1e-2 * float(size.max()), 1e-6))
-        data = soft.FitData(self._all_predictions(seen.states[rows]), seen.actions[rows], seen.effects[rows], scale)
+        data = soft.FitData(self._mixture.predict_each(seen.states[rows]), seen.actions[rows], seen.effects[rows], scale)
         found = self._state_mappings()
         self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, int(self.rng.integers(2**63))))
         if self._state_mappings() != found:
@@ -166,17 +166,6 @@ class SoftHomomorphism(Transfer):
     def _use(self, logits: Logits) -> None:
         self._logits = logits
         self._mixture.set_terms(soft.most_probable(*soft.probabilities(logits, self._readings), MAX_TERMS, MASS))
-
-    def _all_predictions(self, states: np.ndarray) -> np.ndarray:
-        """What each mapping with each source action predicts, shape (n, n_mappings, n_source_actions, n_target_variables)."""
-        n, m, d = len(states), len(self._readings.variable), states.shape[1]
-        mapping = np.tile(np.arange(m), n)
-        at = soft.to_source(np.repeat(states, m, axis=0), self._readings, mapping, self._mean)
-        found = np.empty((n, m, self._source.n_actions, d))
-        for b in range(self._source.n_actions):
-            effects = self._model.predict(at, np.full(len(at), b, dtype=np.int64)).effect
-            found[:, :, b] = soft.to_target(effects, self._readings, mapping, d).reshape(n, m, d)
-        return found
 
     def _state_mappings(self) -> list[int]:
         """The most probable mapping of states of each copy, in any order of the copies; none before the first fit."""

@@ -174,6 +174,17 @@ class MixturePredictions:
                 array[rows] = part
         return found
 
+    def predict_each(self, states: np.ndarray) -> np.ndarray:
+        """Return what each mapping with each source action predicts, shape as of :attr:`FitData.predicted`."""
+        n, m, d = len(states), len(self.readings.variable), states.shape[1]
+        mapping = np.tile(np.arange(m), n)
+        at = to_source(np.repeat(states, m, axis=0), self.readings, mapping, self.mean)
+        found = np.empty((n, m, len(self.model.instances.size), d))
+        for b in range(found.shape[2]):
+            effects = self.model.predict(at, np.full(len(at), b, dtype=np.int64)).effect
+            found[:, :, b] = to_target(effects, self.readings, mapping, d).reshape(n, m, d)
+        return found
+
     def _predict_some(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
         terms, (n, d) = self.terms, states.shape
         count = np.diff(terms.first)[actions]
