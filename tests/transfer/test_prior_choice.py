@@ -208,7 +208,7 @@ def test_what_is_drawn_is_allowed_and_of_every_kind():
 def evidence_of(copies, copy, u, states, effects):
     """The evidence for a copy with a source action of each transition and variable, 0 for variables that it does not have."""
     uses = copies.uses(np.array([[copy]]), np.array([[u]]))
-    weights = copies.predict(uses, copies.work_space(uses), states, np.zeros(len(states), dtype=np.int64))[2]
+    weights = copies.predict(uses, states, np.zeros(len(states), dtype=np.int64))[2]
     predicted = predicted_by(copies, copy, u, states)
     scales = equations.running_scales(effects, SMALLEST_ERROR)
     each = equations.evidence(effects, np.nan_to_num(predicted), scales, weights)

@@ -13,7 +13,7 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
-from sb3_combrel.transfer.prior.copy_predictions import CopyTable, UsePredictions, Uses, join_many, predict_pairs
+from sb3_combrel.transfer.prior.copy_predictions import CopyTable, Uses, join_many, predict_pairs
 from sb3_combrel.transfer.prior.copy_sums import CopySums, add_transition, add_used
 from sb3_combrel.transfer.source_model import SourceModel
 
@@ -115,34 +115,29 @@ class Copies:
         complete = np.logical_and((copies >= 0).any(axis=1), ((copies < 0) | (actions >= 0)).all(axis=1))
         return Uses(pairs[:, 0].copy(), pairs[:, 1].copy(), of_action, np.asarray(complete))
 
-    def work_space(self, uses: Uses) -> UsePredictions:
-        """Make what :meth:`predict` works in."""
-        n = len(uses.copy)
-        # The last row is for a state as a copy has it.
-        return UsePredictions(np.zeros(n, dtype=np.bool_), np.empty((n + 1, self.model.n_variables)), np.empty((n + 1, 2)))
-
-    def predict(self, uses: Uses, found: UsePredictions, states: np.ndarray, actions: np.ndarray) -> Predicted:
-        """Predict pairs of the target, in work space ``found``.
+    def predict(self, uses: Uses, states: np.ndarray, actions: np.ndarray) -> Predicted:
+        """Predict pairs of the target.
 
         :return: effects, shape (n, n_target_variables), 0 for variables in no copy; mean rewards; and the least weights of all
             copies, 0 for actions that are not complete
         """
         n, d = states.shape
         predicted = np.empty((n, d)), np.empty(n), np.empty(n)
-        plain_uses = tuple(uses)
         if n < MANY:
-            _predict_pairs.call(self.model.plain, self._plain_table, plain_uses, (states, actions), predicted, tuple(found))
+            n_uses, k = len(uses.copy), self.model.n_variables
+            row, done = np.arange(n_uses), np.empty(n_uses, dtype=np.bool_)
+            scratch = np.empty(k), row, done, np.empty((n_uses, k)), np.empty((n_uses, 2))
+            _predict_pairs.call(self.model.plain, self._plain_table, tuple(uses), (states, actions), predicted, scratch)
         else:
-            rows, effects, outcomes = self._predict_distinct(uses, states, actions)
-            here = rows, effects, outcomes, found.effect, found.outcome
-            _join_many.call(self._plain_table, plain_uses, actions, here, predicted)
+            found = self._predict_distinct(uses, states, actions)
+            _join_many.call(self._plain_table, tuple(uses), actions, found, predicted)
         return predicted
 
     def _predict_distinct(
         self, uses: Uses, states: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Predict each different state of each use once; the number of each pair's prediction, and the predictions."""
-        rows = np.zeros((len(uses.copy), len(actions)), dtype=np.int64)
+        """Predict each different state of each use once; the number of each pair's predictions, and the predictions."""
+        rows = np.zeros((len(actions), len(uses.copy)), dtype=np.int64)
         effects, outcomes, n = [np.empty((0, self.model.n_variables))], [np.empty((0, 2))], 0
         for use, (copy, action) in enumerate(zip(uses.copy.tolist(), uses.action.tolist(), strict=True)):
             asked = np.flatnonzero((uses.of_action == use).any(axis=1)[actions])
@@ -150,7 +145,7 @@ class Copies:
             chosen, inverse = distinct_rows(states[np.ix_(asked, variables)])
             at = self.as_copy(copy, states[asked[chosen]])
             found = self.model.predict(at, np.full(len(at), action, dtype=np.int64))
-            rows[use, asked] = n + inverse
+            rows[asked, use] = n + inverse
             effects.append(found.effect)
             outcomes.append(np.column_stack([found.reward, found.weight]))
             n += len(at)

@@ -29,14 +29,6 @@ class Uses(NamedTuple):
     complete: np.ndarray  # bool, shape (n_target_actions,): whether every copy of the action has a source action
 
 
-class UsePredictions(NamedTuple):
-    """What each use predicts at one state: work space of :func:`predict_pairs`."""
-
-    done: np.ndarray  # bool, shape (n_uses,)
-    effect: np.ndarray  # float64, shape (n_uses + 1, n_source_variables): the last row is for a state as a copy has it
-    outcome: np.ndarray  # float64, shape (n_uses + 1, 2): reward, weight
-
-
 @inlined
 def see_state(table, copy, state, at):
     """Write to ``at`` a target state as ``copy`` has it: the mean where several target variables are one of its own."""
@@ -48,33 +40,39 @@ def see_state(table, copy, state, at):
 
 
 @compiled
-def predict_pairs(source, table, uses, pairs, predicted, found):
-    """Predict target states and actions, ``pairs``, see :func:`join_copies`; the structures are plain tuples."""
+def predict_pairs(source, table, uses, pairs, predicted, scratch):
+    """Predict target states and actions, ``pairs``, see :func:`join_copies`; the structures are plain tuples.
+
+    :param scratch: work space: a state as a copy has it; of each use its number, whether it has predicted the present state,
+        and what: effects, shape (n_uses, n_source_variables), rewards and weights, shape (n_uses, 2)
+    """
     instances, kernel, fit, away = source_arrays(source)
-    table, uses, found = CopyTable(*table), Uses(*uses), UsePredictions(*found)
+    table, uses = CopyTable(*table), Uses(*uses)
     states, actions = pairs
-    at = found.effect[len(uses.copy)]
+    at, row, done, effects, outcomes = scratch
     before = 0
-    found.done[:] = False
+    done[:] = False
     for i in range(len(actions)):
         for v in range(states.shape[1]):
             if states[i, v] != states[before, v]:
-                found.done[:] = False
+                done[:] = False
         before = i
         for c in range(uses.of_action.shape[1]):
             use = uses.of_action[actions[i], c]
-            if use >= 0 and not found.done[use]:
-                copy = uses.copy[use]
-                see_state(table, copy, states[i], at)
-                effect, outcome = found.effect[use], found.outcome[use]
-                outcome[0], _, outcome[1] = predict_source(instances, kernel, fit, away, uses.action[use], at, effect)
-                found.done[use] = True
-        join_copies(table, uses, actions[i], i, found.effect, found.outcome, predicted)
+            if use >= 0 and not done[use]:
+                see_state(table, uses.copy[use], states[i], at)
+                found = predict_source(instances, kernel, fit, away, uses.action[use], at, effects[use])
+                outcomes[use, 0], _, outcomes[use, 1] = found
+                done[use] = True
+        join_copies(table, uses, actions[i], i, row, effects, outcomes, predicted)
 
 
 @inlined
-def join_copies(table, uses, action, i, effects, outcomes, predicted):
-    """Write to ``predicted``, see ``Copies.predict``, what all copies predict of pair ``i``; the others: of each use."""
+def join_copies(table, uses, action, i, row, effects, outcomes, predicted):
+    """Write to ``predicted``, see ``Copies.predict``, what all copies predict of pair ``i``.
+
+    ``row`` is the place of each use in ``effects`` and ``outcomes``.
+    """
     effect, reward, weight = predicted
     effect[i, :] = 0.0
     n = 0
@@ -85,12 +83,12 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
         if use < 0:
             continue
         n += 1
-        total += outcomes[use, 0]
-        least = min(least, outcomes[use, 1])
+        total += outcomes[row[use], 0]
+        least = min(least, outcomes[row[use], 1])
         for v in range(effect.shape[1]):
             k = table.variable[uses.copy[use], v]
             if k >= 0:
-                effect[i, v] = table.sign[uses.copy[use], v] * effects[use, k]
+                effect[i, v] = table.sign[uses.copy[use], v] * effects[row[use], k]
     reward[i] = total / n if n > 0 else 0.0
     weight[i] = least if n > 0 and uses.complete[action] else 0.0
 
@@ -99,18 +97,10 @@ def join_copies(table, uses, action, i, effects, outcomes, predicted):
 def join_many(table, uses, actions, found, predicted):
     """:func:`join_copies` for many pairs.
 
-    :param found: of each use and pair the number of its prediction, int64, shape (n_uses, n); effects and outcomes of these,
-        shape (n_predictions, ...); and room for those of one pair
+    :param found: of each pair and use the number of its prediction, int64, shape (n, n_uses); effects and outcomes of these,
+        shape (n_predictions, ...)
     """
     table, uses = CopyTable(*table), Uses(*uses)
-    rows, effects, outcomes, effect_here, outcome_here = found
+    rows, effects, outcomes = found
     for i in range(len(actions)):
-        for c in range(uses.of_action.shape[1]):
-            use = uses.of_action[actions[i], c]
-            if use >= 0:
-                row = rows[use, i]
-                for k in range(effects.shape[1]):
-                    effect_here[use, k] = effects[row, k]
-                for k in range(2):
-                    outcome_here[use, k] = outcomes[row, k]
-        join_copies(table, uses, actions[i], i, effect_here, outcome_here, predicted)
+        join_copies(table, uses, actions[i], i, rows[i], effects, outcomes, predicted)

@@ -34,8 +34,7 @@ class _Sample:
         effects = self.effects[rows]
         predicted = np.zeros_like(effects)
         if choice is not None:
-            uses = self.copies.uses(*choice)
-            predicted = self.copies.predict(uses, self.copies.work_space(uses), self.states[rows], self.actions[rows])[0]
+            predicted = self.copies.predict(self.copies.uses(*choice), self.states[rows], self.actions[rows])[0]
         error, moved = float(((effects - predicted) ** 2).sum()), float((effects**2).sum())
         compliance = prediction_compliances(effects, predicted, self.scale)
         return float(compliance.mean()), error / moved if moved > 0.0 else np.nan

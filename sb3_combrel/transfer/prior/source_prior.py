@@ -119,13 +119,13 @@ class SourcePrior:
     def _raw(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
         """Predictions and coverage. Those of many pairs at once are stored: their weights change more often."""
         if len(actions) < MANY:
-            return self.copies.predict(self._used, self._work_space, states, actions)
+            return self.copies.predict(self._used, states, actions)
         asked = len(actions), int(actions[0]), int(actions[-1])
         if asked in self._stored:
             last_states, last_actions, predicted = self._stored[asked]
             if np.array_equal(last_actions, actions) and np.array_equal(last_states, states):
                 return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
-        predicted = self.copies.predict(self._used, self._work_space, states, actions)
+        predicted = self.copies.predict(self._used, states, actions)
         if len(self._stored) > self.task.n_actions:
             self._stored.clear()
         self._stored[asked] = states.copy(), actions.copy(), predicted
@@ -164,7 +164,7 @@ class SourcePrior:
     def _check(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, recorded: bool) -> None:
         """Compare a transition with what was predicted of it."""
         actions = np.array([action], dtype=np.int64)
-        predicted = self.copies.predict(self._used, self._work_space, np.ascontiguousarray(state)[None], actions)
+        predicted = self.copies.predict(self._used, np.ascontiguousarray(state)[None], actions)
         [predicted_effect], [expected], [weight] = predicted
         self._compare(state, action, effect, predicted_effect, float(weight))
         self.evidence.note(action, effect, predicted_effect, self._own, (reward, float(expected)), float(weight))
@@ -263,7 +263,6 @@ class SourcePrior:
     def _set_choice(self, choice: Choice) -> None:
         self.choice = self.bounding = choice
         self._used = self.copies.uses(*choice)
-        self._work_space = self.copies.work_space(self._used)
         self._stored.clear()
 
     def _replay(self) -> None:
