@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -24,8 +23,8 @@ class PriorCandidates:
     def __init__(self, copies: Copies, task: TargetTask):
         self.copies = copies
         self.task = task
-        self._uses: Counter[tuple[int, ...]] = Counter()
-        self._listed: list[tuple[int, ...]] = []
+        # By candidate, in the order of their numbers: for how many transitions it was in use.
+        self._uses: dict[tuple[int, ...], int] = {}
 
     def note_use(self, action: int, moves: Moves) -> None:
         """Take in that a target action that is made of ``moves`` was in use for a transition."""
@@ -33,22 +32,21 @@ class PriorCandidates:
 
     def number(self, action: int, moves: Moves) -> int:
         """Return the number of a target action that is made of ``moves``."""
-        return self._listed.index(self._key(action, moves))
+        key = self._key(action, moves)
+        return list(self._uses).index(key)
 
     def _key(self, action: int, moves: Moves) -> tuple[int, ...]:
         key = (action, *(number for pair in moves for number in pair))
-        if key not in self._uses:
-            self._listed.append(key)
-            self._uses[key] = 0
+        self._uses.setdefault(key, 0)
         return key
 
     def _made_of(self, candidate: int) -> tuple[int, Moves]:
-        action, *rest = self._listed[candidate]
+        action, *rest = list(self._uses)[candidate]
         return action, list(zip(rest[::2], rest[1::2], strict=True))
 
     def uses(self) -> dict[int, int]:
         """Return for how many of the target's transitions each candidate was in use."""
-        return {number: self._uses[key] for number, key in enumerate(self._listed) if self._uses[key]}
+        return {number: n for number, n in enumerate(self._uses.values()) if n}
 
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""
@@ -71,7 +69,7 @@ class PriorCandidates:
 
     def source_action_names(self) -> list[str]:
         """Return the names of the source actions, or of several at once, of all candidates, each name once."""
-        return list(dict.fromkeys(self.parts(number).source_action for number in range(len(self._listed))))
+        return list(dict.fromkeys(self.parts(number).source_action for number in range(len(self._uses))))
 
     def describe_choice(self, choice: Choice | None) -> str:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
@@ -95,7 +93,7 @@ class PriorCandidates:
 
     def names(self) -> list[str]:
         """Return what :meth:`describe_moves` says of all candidates, each once, in the order in which they came up."""
-        return list(dict.fromkeys(self.describe_moves(number) for number in range(len(self._listed))))
+        return list(dict.fromkeys(self.describe_moves(number) for number in range(len(self._uses))))
 
     def describe_copies(self, choice: Choice) -> str:
         """Name the copies of a choice: "(x, vx) and (y, vy)", or "no copy at all"."""
@@ -115,13 +113,11 @@ class PriorCandidates:
     def get_state(self) -> np.ndarray:
         """Return all candidates and their uses, one a row, float64, shape (n, 2 * n_variables + 2)."""
         d = self.task.n_variables
-        rows = [[self._uses[key], *key, *[-1] * (2 * d + 1 - len(key))] for key in self._listed]
+        rows = [[n, *key, *[-1] * (2 * d + 1 - len(key))] for key, n in self._uses.items()]
         return np.array(rows, dtype=np.float64).reshape(-1, 2 * d + 2)
 
     def set_state(self, rows: np.ndarray) -> None:
         """Take over what :meth:`get_state` returned."""
-        self._listed, self._uses = [], Counter()
+        self._uses = {}
         for n, *key in rows.astype(np.int64).tolist():
-            kept = tuple(key[: 1 + 2 * sum(number >= 0 for number in key[1::2])])
-            self._listed.append(kept)
-            self._uses[kept] = n
+            self._uses[tuple(key[: 1 + 2 * sum(number >= 0 for number in key[1::2])])] = n
