@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 
@@ -53,22 +54,18 @@ class Copies:
         self.source = source
         self.state = state
         self.sign = sign
-        used = [tuple(np.unique(row[row >= 0]).tolist()) for row in state]
-        first: dict[tuple[int, tuple[int, ...]], int] = {}
-        n_actions = 0
-        keys = list(zip(source.tolist(), used, strict=True))
-        for key in keys:
-            if key not in first:
-                first[key] = n_actions
-                n_actions += sources[key[0]].n_actions
-        self.model = SourceModel(_seen_through(sources, list(first)), breadth)
+        # Copies with the same variables of the same source have its actions in common.
+        parts = [(s, tuple(np.unique(row[row >= 0]).tolist())) for s, row in zip(source.tolist(), state, strict=True)]
+        different = list(dict.fromkeys(parts))
+        first = dict(zip(different, accumulate((sources[s].n_actions for s, _ in different), initial=0), strict=False))
+        self.model = SourceModel(_seen_through(sources, different), breadth)
         n_variables = self.model.n_variables
         count = (state[:, :, None] == np.arange(n_variables)).sum(axis=1)
         self.table = CopyTable(
             variable=np.ascontiguousarray(state, dtype=np.int64),
             sign=np.ascontiguousarray(sign, dtype=np.float64),
             share=1.0 / np.maximum(count, 1),
-            first=np.array([first[key] for key in keys], dtype=np.int64),
+            first=np.array([first[part] for part in parts], dtype=np.int64),
             n_actions=np.array([sources[s].n_actions for s in source], dtype=np.int64),
         )
         self._plain_table = tuple(self.table)
@@ -76,14 +73,9 @@ class Copies:
         self.most_actions = int(self.table.n_actions.max())
         #: Actions that some instance of each copy's source has taken, bool, shape (n_copies, most_actions).
         self.taken = np.array([np.isin(np.arange(self.most_actions), each.actions) for each in sources])[source]
-        radius = np.full((len(source), self.most_actions), np.inf)
-        self._scratch = (
-            np.empty(n_variables),
-            np.empty(n_variables),
-            np.empty(state.shape[1]),
-            np.zeros(state.shape[1]),
-            radius,
-        )
+        at, predicted = np.empty(n_variables), np.empty(n_variables)
+        scale, last = np.empty(state.shape[1]), np.zeros(state.shape[1])
+        self._scratch = at, predicted, scale, last, np.full((len(source), self.most_actions), np.inf)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -100,9 +92,8 @@ class Copies:
     def measure_used(self, uses: Uses, action: int, effect: np.ndarray, predicted: Predicted, sums: CopySums) -> None:
         """Add a target transition to the sums, for what makes up its action alone; ``predicted``: by :meth:`predict`."""
         effects, _, [weight] = predicted
-        _add_used.call(
-            self._plain_table, tuple(uses), (action, effect, effects[0], float(weight)), tuple(sums), self._scratch[2]
-        )
+        transition = action, effect, effects[0], float(weight)
+        _add_used.call(self._plain_table, tuple(uses), transition, tuple(sums), np.empty(len(effect)))
 
     def uses(self, copies: np.ndarray, actions: np.ndarray) -> Uses:
         """List what makes up each target action; ``copies`` and ``actions`` as of ``Choice``."""
