@@ -190,7 +190,7 @@ def test_what_is_drawn_is_allowed_and_of_every_kind():
     allowed = np.zeros((len(copies), 5, 3), dtype=bool)
     allowed[[2, 4], :, 1] = allowed[4, 2] = True
     rng = np.random.default_rng(0)
-    drawn = [prior_choice.draw_mapping(copies, allowed, rng) for _ in range(50)]
+    drawn = [prior_choice.draw_mapping(allowed, rng) for _ in range(50)]
     assert {(int(c), int(u)) for each in drawn for c, u in zip(each.copies[2], each.actions[2], strict=True)} == {
         *((2, 1), (4, 0), (4, 1), (4, 2))
     }

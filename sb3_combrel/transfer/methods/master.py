@@ -83,14 +83,14 @@ class MASTER(MappingTransfer):
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> LeastErrorSelector:
         check_action_mappings(parts.candidates.sets)
-        copies = copies_of(parts.candidates, parts.task, float(self.source_breadth))
+        copies = copies_of(parts.candidates, float(self.source_breadth))
         self._least_error = LeastErrorSelector(parts, copies, self.n_random_steps)
         return self._least_error
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         candidates = Candidates(self.source, self.mappings, task)
         check_action_mappings(candidates.sets)
-        copies = copies_of(candidates, task, float(self.source_breadth))
+        copies = copies_of(candidates, float(self.source_breadth))
         choose = self._chooser(copies, candidates.sets)
         steps = {"max_transitions": self.n_random_steps, "first_renewal": self.n_random_steps}
         return SourcePrior(copies, task, choose, whole=True, transfer_terminals=self.transfer_terminals, **steps)

@@ -19,9 +19,9 @@ def best_ending(copies: Copies, sums: CopySums, choice: Choice, transitions: Rec
     Effects that are their own mirror image do not tell a copy from its images (``images_of``), but ends do. A target of
     several copies ends when all of them have ended.
     """
-    used, scores = choice.copies[0][choice.copies[0] >= 0].tolist(), scores_of(copies, sums)
+    used, scores = choice.same_copies(), scores_of(copies, sums)
     options = [[copy, *images_of(copies, scores, copy)] if copies.is_whole(copy) else [copy] for copy in used]
-    if not (choice.copies == choice.copies[0]).all() or all(len(each) == 1 for each in options):
+    if all(len(each) == 1 for each in options):
         return choice
     actions, _ = best_actions(copies, sums)
     foretold = {copy: _foretold(copies, copy, actions[copy], transitions) for copy in itertools.chain(*options)}

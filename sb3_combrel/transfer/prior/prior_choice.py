@@ -27,6 +27,11 @@ class Choice(NamedTuple):
         """Whether another choice is the same."""
         return other is not None and all(np.array_equal(one, two) for one, two in zip(self, other, strict=True))
 
+    def same_copies(self) -> list[int]:
+        """Return the copies that every target action moves; none if not all move the same."""
+        first = self.copies[0]
+        return first[first >= 0].tolist() if (self.copies == first).all() else []
+
     def moves(self, action: int) -> list[tuple[int, int]]:
         """Return the copies that a target action moves, and the source actions by which it does."""
         pairs = zip(self.copies[action].tolist(), self.actions[action].tolist(), strict=True)
@@ -155,7 +160,7 @@ def best_division(members: np.ndarray, scores: np.ndarray) -> list[int]:
     return list(found[full][1])
 
 
-def draw_mapping(copies: Copies, allowed: np.ndarray, rng: np.random.Generator) -> Choice:
+def draw_mapping(allowed: np.ndarray, rng: np.random.Generator) -> Choice:
     """Draw for each target action one of the pairs of state mapping and source action that are ``allowed``."""
     drawn = [rng.choice(np.argwhere(allowed[:, a])) for a in range(allowed.shape[1])]
     chosen = np.array(drawn, dtype=np.int64)
@@ -174,7 +179,7 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
     ways = _count_divisions(masks, n_variables)
     taken, chosen = 0, []
     while taken < (1 << n_variables) - 1:
-        options = _options(taken, masks, ways)
+        _, options = _best_continuations(taken, masks, ways)
         counts = np.array([n for *_, n in options], dtype=np.float64)
         mask, copy, _ = options[int(rng.choice(len(options), p=counts / counts.sum()))]
         taken |= mask
@@ -194,29 +199,20 @@ def _count_divisions(masks: list[int], n_variables: int) -> Ways:
     full = (1 << n_variables) - 1
     ways: Ways = {full: (0, 0, 1)}
     for taken in range(full - 1, -1, -1):
-        best, n = (n_variables + 1, 0), 0
-        for mask, copy in _continuations(taken, masks):
-            left, more, count = ways[taken | mask]
-            cost = (left + (copy < 0), more + (copy >= 0))
-            if cost < best:
-                best, n = cost, 0
-            n += count if cost == best else 0
-        ways[taken] = (*best, n)
+        (left, n_copies), options = _best_continuations(taken, masks, ways)
+        ways[taken] = left, n_copies, sum(n for *_, n in options)
     return ways
 
 
-def _continuations(taken: int, masks: list[int]) -> list[tuple[int, int]]:
-    """The copies that have the first variable that is not taken, and no other that is; or that it stays (copy -1)."""
+def _best_continuations(taken: int, masks: list[int], ways: Ways) -> tuple[tuple[int, int], list[tuple[int, int, int]]]:
+    """What the best divisions of the rest leave out and how many copies they have; how they go on, and in how many ways each.
+
+    By a copy that has the first variable that is not taken, and no other that is; or it stays (copy -1).
+    """
     first = ~taken & (taken + 1)
     fit = [(mask, copy) for copy, mask in enumerate(masks) if mask & first and not mask & (taken | (first - 1))]
-    return [*fit, (first, -1)]
-
-
-def _options(taken: int, masks: list[int], ways: Ways) -> list[tuple[int, int, int]]:
-    """The continuations of the best divisions, and how many of these each has."""
-    left, more, _ = ways[taken]
-    return [
-        (mask, copy, ways[taken | mask][2])
-        for mask, copy in _continuations(taken, masks)
-        if (ways[taken | mask][0] + (copy < 0), ways[taken | mask][1] + (copy >= 0)) == (left, more)
-    ]
+    found: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+    for mask, copy in [*fit, (first, -1)]:
+        left, n_copies, n = ways[taken | mask]
+        found.setdefault((left + (copy < 0), n_copies + (copy >= 0)), []).append((mask, copy, n))
+    return min(found.items())

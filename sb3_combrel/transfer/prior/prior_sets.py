@@ -68,9 +68,9 @@ def make_prior(
         copies, choose = _given(mappings, *parts)
     else:
         candidates = Candidates(source, mappings, task)
-        copies = copies_of(candidates, task, breadth)
+        copies = copies_of(candidates, breadth)
         allowed = _allowed(candidates, copies)
-        choose = draw_mapping(copies, allowed, drawn) if drawn else partial(choose_mapping, copies, allowed=allowed)
+        choose = draw_mapping(allowed, drawn) if drawn else partial(choose_mapping, copies, allowed=allowed)
     return SourcePrior(
         copies,
         task,
@@ -149,18 +149,16 @@ def _of_mappings(
     return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
 
 
-def copies_of(candidates: Candidates, task: TargetTask, breadth: float) -> Copies:
+def copies_of(candidates: Candidates, breadth: float) -> Copies:
     """Return all state mappings of a set, for each source, in the order of the candidates' mapping table."""
     number = np.repeat(np.arange(len(candidates.sets)), [each.n_state_mappings for each in candidates.sets])
-    table = candidates.table
-    return Copies(candidates.sources, number, table.variable, table.sign, breadth, task.exploration_threshold)
+    table, threshold = candidates.table, candidates.task.exploration_threshold
+    return Copies(candidates.sources, number, table.variable, table.sign, breadth, threshold)
 
 
 def _allowed(candidates: Candidates, copies: Copies) -> np.ndarray:
     """Which state mapping and source action a set has for each target action: see ``best_actions``."""
-    arrays = candidates.arrays
-    n_actions = len(arrays.first) - 1
-    allowed = np.zeros((len(copies), n_actions, copies.most_actions), dtype=np.bool_)
-    for number, origin in enumerate(candidates.origins):
-        allowed[arrays.row[number], origin.target_action, origin.source_action] = True
+    allowed = np.zeros((len(copies), candidates.task.n_actions, copies.most_actions), dtype=np.bool_)
+    _, target_action, _, source_action = np.array(candidates.origins).T
+    allowed[candidates.arrays.row, target_action, source_action] = True
     return allowed

@@ -53,10 +53,10 @@ class ValueBound:
         None if nothing bounds them: if actions are taken for those of different copies or for some that the source's instances
         lack, no copy has all variables of its source, or several copies do not cost the same at every step.
         """
-        used = choice.copies[0][choice.copies[0] >= 0].tolist()
+        used = choice.same_copies()
         if not self._copies.taken[choice.copies, choice.actions][(choice.copies >= 0) & (choice.actions >= 0)].all():
             return None
-        if not (choice.copies == choice.copies[0]).all() or (len(used) > 1 and not self._costs_are_alike(used)):
+        if len(used) > 1 and not self._costs_are_alike(used):
             return None
         bounds = [self._bound(copy) for copy in used if self._copies.is_whole(copy)]
         return np.minimum.reduce(bounds) if bounds else None
@@ -72,8 +72,8 @@ class ValueBound:
         states, returns, to_go = np.array([state for state, *_ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
             returns[i] = to_go = episode[i][1] + self._gamma * to_go
-        used = choice.copies[0][choice.copies[0] >= 0].tolist()
-        bounds = np.minimum.reduce([self._bound_in_cells(copy, states) for copy in used if self._copies.is_whole(copy)])
+        whole = filter(self._copies.is_whole, choice.same_copies())
+        bounds = np.minimum.reduce([self._bound_in_cells(copy, states) for copy in whole])
         return float((returns - bounds).max(initial=0.0))
 
     def _bound_in_cells(self, copy: int, states: np.ndarray) -> np.ndarray:
