@@ -118,10 +118,6 @@ class RegionErrors:
         error, moved = (sum(number * number for number in each.tolist()) for each in (effect - predicted, effect))
         self.sums[action, self._variables, part] += 1.0, error, moved, error > moved
 
-    def forget(self) -> None:
-        """Forget all transitions."""
-        self.sums[:] = 0.0
-
     @property
     def of_actions(self) -> np.ndarray:
         """Sums by target action: number, squared error, squared effect, number that are worse; shape (n_actions, 4)."""
@@ -129,14 +125,11 @@ class RegionErrors:
 
     def errors(self) -> np.ndarray:
         """Return the mean squared error over that of "no change", by target action, NaN where nothing moved."""
-        sums = self.of_actions
-        moved = sums[:, _EFFECT] > NO_MOVEMENT
-        return np.where(moved, sums[:, _ERROR] / np.where(moved, sums[:, _EFFECT], 1.0), np.nan)
+        return _ratio(self.of_actions)
 
     def error(self) -> float:
         """Return the same over all actions."""
-        _, error, effect, _ = self.of_actions.sum(axis=0).tolist()
-        return error / effect if effect > NO_MOVEMENT else np.nan
+        return float(_ratio(self.of_actions.sum(axis=0)))
 
     def contradictions(self) -> tuple[Contradiction, ...]:
         """Return the parts in which predictions are worse than "no change", the largest excess of squared error first."""
@@ -150,10 +143,8 @@ class RegionErrors:
 
         NaN where too few transitions were compared; infinite where nothing moved and the source says that something does.
         """
-        n, error, effect, _ = np.moveaxis(self.sums, -1, 0)
-        still = effect <= NO_MOVEMENT
-        ratio = np.where(still, np.where(error > NO_MOVEMENT, np.inf, np.nan), error / np.where(still, 1.0, effect))
-        return np.where(n >= MIN_IN_PART, ratio, np.nan)
+        nothing_moved = np.where(self.sums[..., _ERROR] > NO_MOVEMENT, np.inf, np.nan)
+        return np.where(self.sums[..., _N] >= MIN_IN_PART, _ratio(self.sums, nothing_moved), np.nan)
 
     def edges(self) -> dict[str, np.ndarray]:
         """Return, by state variable, where its parts begin and end, raw units, each of shape (N_PARTS + 1,)."""
@@ -166,17 +157,25 @@ class RegionErrors:
         :param evidence: for the ends and rewards of transferred instances; None for a prior, which has none
         """
         totals = self.of_actions.sum(axis=0)
-        found: dict[str, Any] = {"n_compared": int(totals[_N]), "n_worse": int(totals[_WORSE])}
-        found["contradictions"] = self.contradictions()
+        found: dict[str, Any] = {
+            "n_compared": int(totals[_N]),
+            "n_worse": int(totals[_WORSE]),
+            "contradictions": self.contradictions(),
+        }
         if evidence is not None:
             found["ends"] = evidence.confirmed, evidence.contradicted
             found["rewards"] = evidence.rewards_right, evidence.rewards_wrong
         return found
 
     def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
-        n, error, effect, _ = self.sums[action, variable, part].tolist()
+        n, error = int(self.sums[action, variable, part, _N]), float(self.by_part()[action, variable, part])
         low, high = (float(bound[variable]) for bound in (self.task.scaling.low, self.task.scaling.high))
         width = (high - low) / N_PARTS
         names = self.task.action_names[action], self.task.state_names[variable]
-        ratio = error / effect if effect > NO_MOVEMENT else np.inf
-        return Contradiction(*names, low=low + part * width, high=low + (part + 1) * width, n_compared=int(n), error=ratio)
+        return Contradiction(*names, low=low + part * width, high=low + (part + 1) * width, n_compared=n, error=error)
+
+
+def _ratio(sums: np.ndarray, nothing_moved: float | np.ndarray = np.nan) -> np.ndarray:
+    """The squared error over that of "no change", from :attr:`RegionErrors.sums`; where nothing moved something else."""
+    moved = sums[..., _EFFECT] > NO_MOVEMENT
+    return np.where(moved, sums[..., _ERROR] / np.where(moved, sums[..., _EFFECT], 1.0), nothing_moved)

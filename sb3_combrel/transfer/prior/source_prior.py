@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -50,7 +49,7 @@ class SourcePrior:
         *,
         whole: bool,
         max_transitions: int,
-        transfer_terminals: bool = True,
+        transfer_terminals: bool,
         first_renewal: int = FIRST_RENEWAL,
     ):
         self.task = task
@@ -111,7 +110,8 @@ class SourcePrior:
         if self.choice is None:
             return PriorPredictions.nothing(len(actions), self.task.n_variables)
         effect, _, coverage = self._raw(np.ascontiguousarray(states, dtype=np.float64), actions)
-        return PriorPredictions(effect, np.where(self._in_copies()[actions], self.evidence.weights(coverage, actions), 0.0))
+        weight = np.where(self._in_copies()[actions], self.evidence.weights(coverage, actions), 0.0)
+        return PriorPredictions(effect.copy(), weight)
 
     def note_prediction(self, effect: np.ndarray, leverage: float) -> None:
         self._own = effect, leverage
@@ -124,12 +124,12 @@ class SourcePrior:
         if asked in self._stored:
             last_states, last_actions, predicted = self._stored[asked]
             if np.array_equal(last_actions, actions) and np.array_equal(last_states, states):
-                return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
+                return predicted
         predicted = self.copies.predict(self._used, states, actions)
         if len(self._stored) > self.task.n_actions:
             self._stored.clear()
         self._stored[asked] = states.copy(), actions.copy(), predicted
-        return tuple(array.copy() for array in predicted)  # type: ignore[return-value]
+        return predicted
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         """Take in a transition of the target; ``effect``: next state minus state, unit coordinates, shape (n_variables,)."""
@@ -137,7 +137,7 @@ class SourcePrior:
         recorded = self.n_observed <= self.max_transitions
         if recorded:
             self.transitions.add(state, action, reward, effect, terminated)
-            if self._is_measured(self.n_observed):
+            if self.n_observed <= self._all_measured or self.n_observed % MEASURED_LATER == 0:
                 self.copies.measure(state, action, effect, self.sums)
         if self.choice is not None:
             self._check(state, action, reward, effect, recorded)
@@ -156,10 +156,6 @@ class SourcePrior:
     def _leads_to(self, last: tuple[np.ndarray, float, np.ndarray], state: np.ndarray) -> bool:
         apart = differences(last[0] + last[2], state, self._periodic)
         return float(np.abs(apart).max()) < SAME_STATE
-
-    def _is_measured(self, number: Any) -> Any:
-        """Whether recorded transitions with these numbers, from 1 on, are compared with what all copies predict."""
-        return (number <= self._all_measured) | (number % MEASURED_LATER == 0)
 
     def _check(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, recorded: bool) -> None:
         """Compare a transition with what was predicted of it."""
@@ -215,8 +211,6 @@ class SourcePrior:
         return chosen and bool((found >= 0.0).all()) and self.evidence.explains_rewards()
 
     def end_episode(self, truncated: bool) -> None:
-        if self.n_observed == 0:
-            return
         version = self.version
         if truncated and self.n_observed <= self.max_transitions:
             self.transitions.note_time_limit()
@@ -267,7 +261,7 @@ class SourcePrior:
 
     def _replay(self) -> None:
         """Count anew what confirms and contradicts what is predicted through another mapping."""
-        self.errors.forget()
+        self.errors.sums[:] = 0.0
         n, seen = self.transitions.n, self.transitions
         effect, _, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
         for i in range(n):
@@ -306,15 +300,11 @@ class SourcePrior:
         """As how many of the target's own instances the source counts, by target action; NaN where it is taken for nothing."""
         return np.where(self._in_copies().any(axis=1), self.evidence.strength_of_actions(), np.nan)
 
-    def mean_strength(self) -> float:
-        """The mean of :meth:`strengths`; 0 if no action is taken for anything."""
-        found = self.strengths()
-        return float(np.nanmean(found)) if np.isfinite(found).any() else 0.0
-
     def statistics(self) -> dict[str, float]:
+        strengths = self.strengths()
         return {
             "transfer/prediction_error": self.error(),
-            "transfer/prior_strength": self.mean_strength(),
+            "transfer/prior_strength": float(np.nanmean(strengths)) if np.isfinite(strengths).any() else 0.0,
             "transfer/values_bounded": float(self.value_bound() is not None),
             "transfer/bound_exceeded": self.excess,
             "transfer/prior_copies": 0 if self.choice is None else int((self.choice.copies >= 0).sum(axis=1).max(initial=0)),
