@@ -107,7 +107,7 @@ class Candidates:
         for mappings in self.sets:
             state = [(*index, *sign) for index, sign in zip(mappings.state_mappings, mappings.state_signs, strict=True)]
             number = {key: k for k, key in enumerate(state)}
-            each = [mappings[k] for k in range(len(mappings))]
+            each = list(mappings)
             index = [number[(*mapping.state_index, *mapping.state_sign)] for mapping in each]
             found.append((np.array(index), np.array([mapping.action for mapping in each])))
         return found

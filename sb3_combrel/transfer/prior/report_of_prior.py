@@ -42,11 +42,9 @@ class _Sample:
 
 def compliance_of_prior(prior: SourcePrior) -> np.ndarray:
     """Mean compliance of what each target action is taken for, shape (n_target_actions,); NaN where nothing is chosen."""
-    sample = _Sample(prior)
-    chosen = [
-        prior.choice if prior.choice is not None and prior.choice.moves(a) else None for a in range(prior.task.n_actions)
-    ]
-    return np.array([np.nan if choice is None else sample.judge(choice, a)[0] for a, choice in enumerate(chosen)])
+    choice, sample = prior.choice, _Sample(prior)
+    actions = range(prior.task.n_actions)
+    return np.array([sample.judge(choice, a)[0] if choice is not None and choice.moves(a) else np.nan for a in actions])
 
 
 def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, float]) -> TransferReport:
