@@ -52,8 +52,8 @@ class Copies:
         self.breadth = float(breadth)
         self.sources = sources
         self.source = source
-        self.state = state
-        self.sign = sign
+        self.state = np.ascontiguousarray(state, dtype=np.int64)
+        self.sign = np.ascontiguousarray(sign, dtype=np.float64)
         # Copies with the same variables of the same source have its actions in common.
         parts = [(s, tuple(np.unique(row[row >= 0]).tolist())) for s, row in zip(source.tolist(), state, strict=True)]
         different = list(dict.fromkeys(parts))
@@ -62,8 +62,8 @@ class Copies:
         n_variables = self.model.n_variables
         count = (state[:, :, None] == np.arange(n_variables)).sum(axis=1)
         self.table = CopyTable(
-            variable=np.ascontiguousarray(state, dtype=np.int64),
-            sign=np.ascontiguousarray(sign, dtype=np.float64),
+            variable=self.state,
+            sign=self.sign,
             share=1.0 / np.maximum(count, 1),
             first=np.array([first[part] for part in parts], dtype=np.int64),
             n_actions=np.array([sources[s].n_actions for s in source], dtype=np.int64),
@@ -132,7 +132,7 @@ class Copies:
         effects, outcomes, n = [np.empty((0, self.model.n_variables))], [np.empty((0, 2))], 0
         for use, (copy, action) in enumerate(zip(uses.copy.tolist(), uses.action.tolist(), strict=True)):
             asked = np.flatnonzero((uses.of_action == use).any(axis=1)[actions])
-            variables = np.flatnonzero(self.table.variable[copy] >= 0)
+            variables = np.flatnonzero(self.state[copy] >= 0)
             chosen, inverse = distinct_rows(states[np.ix_(asked, variables)])
             at = self.as_copy(copy, states[asked[chosen]])
             found = self.model.predict(at, np.full(len(at), action, dtype=np.int64))
@@ -145,9 +145,9 @@ class Copies:
     def as_copy(self, copy: int, states: np.ndarray) -> np.ndarray:
         """Return target states as a copy has them, shape (n, most source variables); 0 for variables that it does not have."""
         at = np.zeros((len(states), self.model.n_variables))
-        for v in np.flatnonzero(self.table.variable[copy] >= 0):
-            k = self.table.variable[copy, v]
-            side = 1.0 - states[:, v] if self.table.sign[copy, v] < 0.0 else states[:, v]
+        for v in np.flatnonzero(self.state[copy] >= 0):
+            k = self.state[copy, v]
+            side = 1.0 - states[:, v] if self.sign[copy, v] < 0.0 else states[:, v]
             at[:, k] += self.table.share[copy, k] * side
         return at
 
