@@ -21,7 +21,7 @@ def translated(states, own, mappings, source, task, breadth, transfer_terminals=
     """What the translator gives each state from a pool of all ``mappings``, for target action 0; and what it is drawn from."""
     candidates = Candidates(source, mappings, task)
     arguments = dict(by_relevance=relevance is not None, times_weight=times_weight)
-    translator = Translator(candidates, task, breadth=breadth, transfer_terminals=transfer_terminals, **arguments)
+    translator = Translator(candidates, breadth=breadth, transfer_terminals=transfer_terminals, **arguments)
     if relevance is not None:
         translator.relevance[:] = relevance[: len(candidates), : translator.relevance.shape[1]]
     found = translator(states, own, (np.zeros(len(states), dtype=np.int64), np.full(len(states), len(candidates))))

@@ -234,12 +234,11 @@ class ComplianceTable:
         bandwidths: Bandwidths,
         starts: np.ndarray | float,
         min_evidence: float = DEFAULT_MIN_EVIDENCE,
-        periodic: Sequence[bool] | None = None,
     ):
         table, instances = candidates.table, candidates.instances
         #: Compliance of the last transition, shape (n_state_mappings, n_source_actions).
         self.values = np.empty((len(table.variable), len(instances.size)))
-        scratch = ComplianceScratch.for_mappings(table, instances, starts, min_evidence, periodic)
+        scratch = ComplianceScratch.for_mappings(table, instances, starts, min_evidence, candidates.task.periodic)
         # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
         self._given = tuple(instances), tuple(table), tuple(bandwidths), tuple(scratch), self.values
         self._bandwidths = bandwidths

@@ -54,8 +54,7 @@ class ComplianceSelector(Selector):
         self.limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
         self.first_episode = True
         self.n_switches = 0
-        of_compliance = options.bandwidths, options.starts, options.min_evidence
-        self._table = ComplianceTable(self.candidates, *of_compliance, self.task.periodic)
+        self._table = ComplianceTable(self.candidates, options.bandwidths, options.starts, options.min_evidence)
         self._limits = float(self.task.exploration_threshold), self.limit
         self._allocate()
 

@@ -14,7 +14,6 @@ def renew_relevance(
     transitions: RecordedTransitions,
     n_used: int,
     bandwidths: CandidateBandwidths,
-    periodic: np.ndarray,
     values: np.ndarray,
     mu: float | None,
 ) -> None:
@@ -25,6 +24,7 @@ def renew_relevance(
     :param mu: fraction of the weight of Eq. 4; None: the relevance that does not favour distant instances
     """
     weight, evidence = np.empty(n_used), np.empty(values.shape[1])
+    periodic = np.array(candidates.task.periodic)
     of_actions = {}
     for a in range(len(candidates.arrays.first) - 1):
         rows = np.flatnonzero(transitions.actions[:n_used] == a)

@@ -7,7 +7,6 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
@@ -18,7 +17,6 @@ class SelectorParts(NamedTuple):
     """What every selector is made from: candidates of every target action, and the recorded target transitions."""
 
     candidates: Candidates
-    task: TargetTask
     transitions: RecordedTransitions
     rng: np.random.Generator
 
@@ -42,7 +40,8 @@ class Selector(ABC):
     selects_one: ClassVar[bool] = True
 
     def __init__(self, parts: SelectorParts):
-        self.candidates, self.task, self.transitions, self.rng = parts
+        self.candidates, self.transitions, self.rng = parts
+        self.task = self.candidates.task
         self.first = self.candidates.arrays.first
 
     @abstractmethod

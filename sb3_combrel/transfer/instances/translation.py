@@ -11,7 +11,6 @@ from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.selectors import Ranges
 
@@ -249,14 +248,13 @@ class Translator:
     def __init__(
         self,
         candidates: Candidates,
-        task: TargetTask,
         *,
         breadth: float,
         transfer_terminals: bool,
         by_relevance: bool,
         times_weight: bool = False,
     ):
-        largest = int(candidates.instances.size.max())
+        task, largest = candidates.task, int(candidates.instances.size.max())
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
         self._n_blocks = max(1, (largest + BLOCK - 1) // BLOCK)
         self._n_variables = task.n_variables

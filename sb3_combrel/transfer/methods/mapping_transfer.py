@@ -151,22 +151,21 @@ class MappingTransfer(Transfer):
     def _make_instances(self, task: TargetTask) -> InstanceTransfer:
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         bandwidths = candidate_bandwidths(self.candidates, self.bandwidths)
-        parts = SelectorParts(self.candidates, task, RecordedTransitions(task.n_variables), self.rng)
+        parts = SelectorParts(self.candidates, RecordedTransitions(task.n_variables), self.rng)
         selector = self._make_selector(parts, bandwidths)
-        translator = self._make_translator(self.candidates, task, float(self.breadth))
+        translator = self._make_translator(self.candidates, self.breadth)
         mu = None if self.relevance == NEAR else float(self.relevance_fraction)
-        seen = self.candidates, parts.transitions
-        measure = partial(renew_relevance, *seen, bandwidths=bandwidths, periodic=self._periodic, mu=mu)
+        measure = partial(renew_relevance, self.candidates, parts.transitions, bandwidths=bandwidths, mu=mu)
         return InstanceTransfer(selector, translator, breadth_decay=self.breadth_decay, measure_relevance=measure)
 
     def _whole_mappings(self) -> bool:
         """Return whether whole mappings are the candidates."""
         return False
 
-    def _make_translator(self, candidates: Candidates, task: TargetTask, breadth: float) -> Translator:
+    def _make_translator(self, candidates: Candidates, breadth: float) -> Translator:
         ranked = bool(self.relevance) and self.ranks_by_relevance
         order = {"by_relevance": ranked, "times_weight": ranked and self.relevance == NEAR}
-        return Translator(candidates, task, breadth=breadth, transfer_terminals=self.transfer_terminals, **order)
+        return Translator(candidates, breadth=breadth, transfer_terminals=self.transfer_terminals, **order)
 
     @abstractmethod
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:

@@ -167,7 +167,7 @@ class LeastErrorSelector(FixedSelector):
     needs_transitions = True
 
     def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
-        task = parts.task
+        task = parts.candidates.task
         super().__init__(parts, fixed=np.full(task.n_actions, -1, dtype=np.int64))
         self.copies, self.n_transitions = copies, n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)

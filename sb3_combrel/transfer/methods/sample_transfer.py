@@ -127,7 +127,7 @@ class SampleTransfer(MappingTransfer):
         self.drawn = drawn
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
         instances = self._instances
-        instances.translator = self._make_translator(candidates, self._bound_task, instances.translator.rules.breadth)
+        instances.translator = self._make_translator(candidates, instances.translator.rules.breadth)
 
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
         """Return the compliance, 0 to 1, of a mapping's virtual source task with the transitions so far, Lambda_X of Eq. 6.
@@ -173,7 +173,7 @@ class TaskComplianceSelector(PooledSelector):
     def __init__(self, parts: SelectorParts, bandwidths: Bandwidths, starts: np.ndarray, max_transitions: int):
         super().__init__(parts)
         self.max_transitions = max_transitions
-        self._table = ComplianceTable(self.candidates, bandwidths, starts, periodic=self.task.periodic)
+        self._table = ComplianceTable(self.candidates, bandwidths, starts)
         n_rows, n_source_actions = self._table.values.shape
         #: Compliances of transitions added up, by state mapping, target action and source action, of all sources.
         self.sums = np.zeros((n_rows, self.task.n_actions, n_source_actions))

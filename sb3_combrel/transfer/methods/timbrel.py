@@ -78,7 +78,7 @@ class TIMBREL(MappingTransfer):
             return PooledSelector(parts) if self.mapping == "pool" else RandomSelector(parts)
         check_one_source(parts.candidates.sources)
         n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
-        n_actions = parts.task.n_actions
+        n_actions = self._bound_task.n_actions
         if n_given not in (1, n_actions):
             raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {n_given}")
         given = [parts.candidates.sets[0][a if n_given > 1 else 0] for a in range(n_actions)]
