@@ -16,6 +16,7 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import difference, flag_array
 from sb3_combrel.transfer.candidates import Candidates, MappingTable
 from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 # Where the sum of start kernels is less, no instance is near enough to be evidence: normalized, a far one would look as good.
@@ -222,27 +223,17 @@ _transition_compliance = EntryPoint(transition_compliance)
 
 
 class ComplianceTable:
-    """Computes compliance with all candidates of a set, one transition after the other.
+    """Computes compliance with all candidates of a set, one transition after the other."""
 
-    :param bandwidths: of Eq. 2, but for those of starts
-    :param starts: start bandwidth of each state mapping, shape (n_state_mappings,)
-    """
-
-    def __init__(
-        self,
-        candidates: Candidates,
-        bandwidths: Bandwidths,
-        starts: np.ndarray | float,
-        min_evidence: float = DEFAULT_MIN_EVIDENCE,
-    ):
+    def __init__(self, candidates: Candidates, bandwidths: CandidateBandwidths, min_evidence: float = DEFAULT_MIN_EVIDENCE):
         table, instances = candidates.table, candidates.instances
         #: Compliance of the last transition, shape (n_state_mappings, n_source_actions).
         self.values = np.empty((len(table.variable), len(instances.size)))
-        scratch = ComplianceScratch.for_mappings(table, instances, starts, min_evidence, candidates.task.periodic)
+        scratch = ComplianceScratch.for_mappings(table, instances, bandwidths.starts, min_evidence, candidates.task.periodic)
         # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
-        self._given = tuple(instances), tuple(table), tuple(bandwidths), tuple(scratch), self.values
-        self._bandwidths = bandwidths
-        rewards = np.concatenate([instances.reward[action, :n] for action, n in enumerate(instances.size)])
+        self._given = tuple(instances), tuple(table), tuple(bandwidths.of_all), tuple(scratch), self.values
+        self._bandwidths = bandwidths.of_all
+        rewards = np.concatenate([source.rewards for source in candidates.sources])
         # The different rewards of source instances, and which fraction of all has each of them.
         self._rewards, count = np.unique(rewards, return_counts=True)
         self._fraction = count / count.sum()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
-from sb3_combrel.transfer.equations import Bandwidths
+from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose, select
 from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, SelectorParts
@@ -26,8 +26,7 @@ _add_to_sample, _choose, _select = EntryPoint(add_to_sample), EntryPoint(choose)
 class SelectionOptions:
     """How candidates are selected by compliance; most are arguments of COMBREL."""
 
-    bandwidths: Bandwidths
-    starts: np.ndarray  # start bandwidth of each state mapping, shape (n_state_mappings,)
+    bandwidths: CandidateBandwidths
     n_neighbors: int
     all_actions: bool  # transitions of all actions are neighbours, not those with the same action; for whole mappings
     neighbor_radius: float | None
@@ -54,7 +53,7 @@ class ComplianceSelector(Selector):
         self.limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
         self.first_episode = True
         self.n_switches = 0
-        self._table = ComplianceTable(self.candidates, options.bandwidths, options.starts, options.min_evidence)
+        self._table = ComplianceTable(self.candidates, options.bandwidths, options.min_evidence)
         self._limits = float(self.task.exploration_threshold), self.limit
         self._allocate()
 

@@ -141,7 +141,7 @@ class COMBREL(MappingTransfer):
         names = ("n_neighbors", "neighbor_radius", "max_transitions", "min_evidence", "min_compliance")
         given = {name: getattr(self, name) for name in names}
         given |= {"all_actions": self._whole_mappings(), "drawn": self.choice == "drawn", "online": self.measured == "online"}
-        options = SelectionOptions(bandwidths.of_all, bandwidths.starts, **given)
+        options = SelectionOptions(bandwidths, **given)
         self._compliance_selector = ComplianceSelector(parts, options)
         return self._compliance_selector
 

@@ -13,7 +13,6 @@ from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike
-from sb3_combrel.transfer.equations import Bandwidths
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
@@ -97,7 +96,7 @@ class SampleTransfer(MappingTransfer):
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> TaskComplianceSelector:
         check_action_mappings(parts.candidates.sets)
-        self._tasks = TaskComplianceSelector(parts, *bandwidths, self.max_transitions)
+        self._tasks = TaskComplianceSelector(parts, bandwidths, self.max_transitions)
         return self._tasks
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
@@ -170,10 +169,10 @@ class TaskComplianceSelector(PooledSelector):
 
     needs_transitions = True
 
-    def __init__(self, parts: SelectorParts, bandwidths: Bandwidths, starts: np.ndarray, max_transitions: int):
+    def __init__(self, parts: SelectorParts, bandwidths: CandidateBandwidths, max_transitions: int):
         super().__init__(parts)
         self.max_transitions = max_transitions
-        self._table = ComplianceTable(self.candidates, bandwidths, starts)
+        self._table = ComplianceTable(self.candidates, bandwidths)
         n_rows, n_source_actions = self._table.values.shape
         #: Compliances of transitions added up, by state mapping, target action and source action, of all sources.
         self.sums = np.zeros((n_rows, self.task.n_actions, n_source_actions))
