@@ -10,7 +10,7 @@ from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose, select
-from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, SelectorParts
+from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, SelectorParts, ranges_of
 
 # Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: to plan again
 # with every transition would cost more than all the rest.
@@ -135,9 +135,7 @@ class ComplianceSelector(Selector):
         return first[:n], last[:n]
 
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        chosen = self._choice[actions * self._near.shape[1] + points]
-        first = np.maximum(chosen, 0)
-        return first, first + (chosen >= 0)
+        return ranges_of(self._choice[actions * self._near.shape[1] + points])
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         if self.transitions.n < self._renewal_due:

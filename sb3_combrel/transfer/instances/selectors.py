@@ -13,6 +13,11 @@ from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 Ranges = tuple[np.ndarray, np.ndarray]
 
 
+def ranges_of(chosen: np.ndarray) -> Ranges:
+    """Return the ranges that hold one candidate each; empty ones for -1."""
+    return np.maximum(chosen, 0), chosen + 1
+
+
 class SelectorParts(NamedTuple):
     """What every selector is made from: candidates of every target action, and the recorded target transitions."""
 
@@ -95,7 +100,7 @@ class Selector(ABC):
 
 
 class FixedSelector(Selector):
-    """Selects one candidate for each target action, ``fixed``, the same in every state."""
+    """Selects one candidate for each target action, ``fixed``, the same in every state; -1 for none."""
 
     makes_choices = True
 
@@ -104,7 +109,7 @@ class FixedSelector(Selector):
         self.fixed = fixed
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        return self.fixed[actions], self.fixed[actions] + 1
+        return ranges_of(self.fixed[actions])
 
     def choices(self) -> np.ndarray:
         return np.repeat(self.fixed, len(self.task.sample_states))
@@ -124,7 +129,7 @@ class RandomSelector(Selector):
         return self.rng.integers(self.first[actions], self.first[actions + 1])
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        return self._drawn[actions], self._drawn[actions] + 1
+        return ranges_of(self._drawn[actions])
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {"drawn": self._drawn.astype(np.float64)}
@@ -133,8 +138,7 @@ class RandomSelector(Selector):
         self._drawn = np.clip(state["drawn"].astype(np.int64), self.first[:-1], self.first[1:] - 1)
 
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        chosen = self._draw(actions)
-        return chosen, chosen + 1
+        return ranges_of(self._draw(actions))
 
 
 class PooledSelector(Selector):

@@ -16,7 +16,7 @@ from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
-from sb3_combrel.transfer.instances.selectors import FixedSelector, Ranges, SelectorParts
+from sb3_combrel.transfer.instances.selectors import FixedSelector, SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
@@ -192,10 +192,6 @@ class LeastErrorSelector(FixedSelector):
         # Actions are numbered on from source to source.
         number = source_action + sum(source.n_actions for source in self.candidates.sources[: self.copies.source[row]])
         return self.candidates.find(action, table.variable[row], table.sign[row], number)
-
-    def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        chosen = self.fixed[actions]
-        return np.maximum(chosen, 0), chosen + 1
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         just_chosen, self._just_chosen = self._just_chosen, False
