@@ -97,7 +97,7 @@ class ComplianceSelector(Selector):
         return self.transitions.n < self.options.max_transitions and (self.first_episode or self.options.online)
 
     def add_transition(self, i: int) -> None:
-        if self.options.online or not self.first_episode:
+        if self.options.online:
             self._use(i)
 
     def n_used(self) -> int:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
-from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
 from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector
 from sb3_combrel.transfer.instances.translation import Translator
@@ -37,7 +36,7 @@ class InstanceTransfer:
         self, selector: Selector, translator: Translator, *, breadth_decay: float, measure_relevance: Callable[..., None]
     ):
         self.task = task = selector.task
-        self.candidates: Candidates = selector.candidates
+        self.candidates = selector.candidates
         self.sources = selector.candidates.sources
         #: Number of the environment that transitions come from, which makes no difference.
         self.environment = 0

@@ -38,7 +38,6 @@ class InstancesCheck:
         self.evidence = OutcomeEvidence(np.concatenate([source.rewards for source in sources]), threshold)
         self.n_compared = 0
         self._sources = sources
-        self._threshold = threshold
         # Squared errors, and squared effects.
         self._sums = np.zeros(2)
         # Transitions compared and ends contradicted, as far as they have narrowed the kernel.
@@ -60,11 +59,11 @@ class InstancesCheck:
     ) -> np.ndarray | None:
         """Compare a transition with what was transferred to its state and action; the predicted effect, None if nothing."""
         given = self._pending.pop(state.tobytes(), None)
-        n = 0 if given is None else int(given.length[action])
-        if given is None or n == 0:
+        if given is None or given.length[action] == 0:
             # A visit to where an end was predicted may be over.
             self.evidence.note(0.0, 0.0, 0.0, reward, terminated)
             return None
+        n = given.length[action]
         weight = given.weight[action, :n] / given.weight[action, :n].sum()
         predicted: np.ndarray = weight @ given.effect[action, :n]
         error = effect - predicted
@@ -72,7 +71,7 @@ class InstancesCheck:
         self._sums += error @ error, effect @ effect
         self.n_compared += 1
         end, predicted_reward = float(weight @ given.terminated[action, :n]), float(weight @ given.reward[action, :n])
-        self.evidence.note(self._threshold, end, predicted_reward, reward, terminated)
+        self.evidence.note(self.evidence.threshold, end, predicted_reward, reward, terminated)
         return predicted
 
     def end_episode(self, truncated: bool) -> bool:

@@ -40,7 +40,7 @@ class TranslationRules(NamedTuple):
     min_fraction: float
     transfer_terminals: bool  # whether an instance that ended a source episode ends the target's
     by_relevance: bool  # whether instances come in the order of their relevance, not of their distance
-    times_weight: bool = False  # of their relevance times their weight
+    times_weight: bool  # of their relevance times their weight
 
 
 class TranslationScratch(NamedTuple):
@@ -51,7 +51,6 @@ class TranslationScratch(NamedTuple):
     variable: np.ndarray  # int64, shape (n_variables,): source variables that a candidate compares with
     at: np.ndarray  # float64, same shape: where the state lies along each
     periodic: np.ndarray  # bool, same shape: whether it wraps there
-    gap: np.ndarray  # float64, shape (n_blocks,): squared distances of the blocks' boxes
     full: np.ndarray  # bool, shape (1,): an instance that was needed did not fit
     enters: np.ndarray  # float64, shape (1,): an instance of no higher rank than this is not needed
 
@@ -136,8 +135,7 @@ def add_near_instances(state, own, candidate, arrays, kept):
             scratch.at[n_mapped] = 1.0 - state[v] if mirrored else state[v]
             n_mapped += 1
     size = source.size[action]
-    low, high = source.block_low[action], source.block_high[action]
-    nearest_block = measure_mapped_gaps(low, high, size, n_mapped, scratch)
+    nearest_block = measure_mapped_gaps(source, action, n_mapped, scratch)
     nearest = far
     # The instances in the nearest block exclude most other blocks. By relevance alone they do not: there, of equally relevant
     # ones the first comes first.
@@ -145,7 +143,7 @@ def add_near_instances(state, own, candidate, arrays, kept):
     first_turn = 0 if by_relevance_alone else -1
     for turn in range(first_turn, (size + BLOCK - 1) // BLOCK):
         block = nearest_block if turn < 0 else turn
-        if scratch.gap[block] > nearest or (turn == nearest_block and first_turn < 0):
+        if source.gap[block] > nearest or (turn == nearest_block and first_turn < 0):
             continue
         for j in range(block * BLOCK, min(size, (block + 1) * BLOCK)):
             if rules.by_relevance and arrays.relevance[candidate, j] <= scratch.enters[0]:
@@ -169,11 +167,12 @@ def add_near_instances(state, own, candidate, arrays, kept):
 
 
 @inlined
-def measure_mapped_gaps(low, high, size, n_mapped, scratch):
-    """Write to ``scratch.gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
-    variable, at, gap = scratch.variable, scratch.at, scratch.gap
+def measure_mapped_gaps(source, action, n_mapped, scratch):
+    """Write to ``source.gap`` the squared distance of each block's box, in the mapped variables; return the nearest block."""
+    low, high, gap = source.block_low[action], source.block_high[action], source.gap
+    variable, at = scratch.variable, scratch.at
     nearest_block = 0
-    for block in range((size + BLOCK - 1) // BLOCK):
+    for block in range((source.size[action] + BLOCK - 1) // BLOCK):
         total = 0.0
         for m in range(n_mapped):
             k = variable[m]
@@ -252,11 +251,10 @@ class Translator:
         breadth: float,
         transfer_terminals: bool,
         by_relevance: bool,
-        times_weight: bool = False,
+        times_weight: bool,
     ):
         task, largest = candidates.task, int(candidates.instances.size.max())
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
-        self._n_blocks = max(1, (largest + BLOCK - 1) // BLOCK)
         self._n_variables = task.n_variables
         self._set_arrays(
             TranslationArrays(
@@ -291,13 +289,11 @@ class Translator:
             variable=np.empty(self._n_variables, dtype=np.int64),
             at=np.empty(self._n_variables),
             periodic=np.zeros(self._n_variables, dtype=np.bool_),
-            gap=np.empty(self._n_blocks),
             full=np.zeros(1, dtype=np.bool_),
             enters=np.zeros(1),
         )
 
     def _make_room(self, n: int) -> None:
-        self._room = n
         self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
         self._plain_transferred = tuple(self._transferred)
 
@@ -307,13 +303,13 @@ class Translator:
 
     def __call__(self, states: np.ndarray, own_weight: np.ndarray, ranges: Ranges) -> TransferredInstances:
         """Translate instances for states and actions, see :func:`translate`, in arrays that the next call uses again."""
-        if len(own_weight) > self._room:
+        if len(own_weight) > len(self._transferred.length):
             self._make_room(2 * len(own_weight))
         _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
         # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
         while self.rules.by_relevance and self._arrays.scratch.full[0]:
             self._max_instances *= 2
             self._set_arrays(self._arrays._replace(scratch=self._make_scratch()))
-            self._make_room(self._room)
+            self._make_room(len(self._transferred.length))
             _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
         return self._transferred

@@ -102,7 +102,7 @@ class SampleTransfer(MappingTransfer):
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         super().observe(state, action, reward, next_state, terminated)
         n = self._tasks.transitions.n
-        if n > self._n_of_draw and n >= max(self.min_transitions, RELEVANCE_GROWTH * self._n_of_draw):
+        if n >= max(self.min_transitions, RELEVANCE_GROWTH * self._n_of_draw):
             self._draw(n)
 
     def _draw(self, n: int) -> None:
