@@ -40,14 +40,13 @@ def default_bandwidths(source: Instances) -> Bandwidths:
     from scipy.spatial import cKDTree
 
     distances, effects, rewards = [], [], []
+    periodic = source.periodic
     for action, n in enumerate(source.size):
         if n > 1:
-            states = source.state[action, :n]
+            # The tree wants periodic coordinates below the period.
+            states = np.where(periodic, source.state[action, :n] % 1.0, source.state[action, :n])
             nth = min(N_SHARING, n - 1) + 1
-            if source.periodic.any():
-                # The tree wants them below the period.
-                states = np.where(source.periodic, states % 1.0, states)
-            tree = cKDTree(states, boxsize=np.where(source.periodic, 1.0, 0.0) if source.periodic.any() else None)
+            tree = cKDTree(states, boxsize=np.where(periodic, 1.0, 0.0) if periodic.any() else None)
             distances.append(tree.query(states, k=[nth])[0].ravel())
         effects.append((source.effect[action, :n] ** 2).sum(axis=1))
         rewards.append(source.reward[action, :n])

@@ -181,10 +181,10 @@ class ComplianceSelector(Selector):
         """Return the mean compliance of the chosen candidate of pairs of the sample (line 19); NaN where nothing is chosen."""
         near = self._near_of_pair[pairs]
         self._measure(near)
-        counted = (near >= 0) & (self._choice[pairs] >= 0)[:, None]
-        chosen = np.maximum(self._choice[pairs], 0)[:, None]
-        first = self.first[pairs // self._near.shape[1]][:, None]
-        compliance = self._cache.compliance[np.maximum(near, 0), np.maximum(chosen - first, 0)]
+        chosen = self._choice[pairs]
+        counted = (near >= 0) & (chosen >= 0)[:, None]
+        column = np.maximum(chosen - self.first[pairs // self._near.shape[1]], 0)
+        compliance = self._cache.compliance[np.maximum(near, 0), column[:, None]]
         n_counted = counted.sum(axis=1)
         total = np.where(counted, compliance, 0.0).sum(axis=1)
         return np.where(n_counted > 0, total / np.maximum(n_counted, 1), np.nan)

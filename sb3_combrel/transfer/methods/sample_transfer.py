@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
@@ -89,7 +90,6 @@ class SampleTransfer(MappingTransfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
-        self.drawn: np.ndarray  #: candidate and number of its instance of those drawn, one a row, int64, shape (n, 2)
         self._show_drawn(np.empty((0, 2), dtype=np.int64))
         self._seed = 0
         self._n_of_draw = self._n_of_first = self._n_draws = 0
@@ -123,7 +123,7 @@ class SampleTransfer(MappingTransfer):
         self._instances.all_changed = True
 
     def _show_drawn(self, drawn: np.ndarray) -> None:
-        self.drawn = drawn
+        self.drawn = drawn  #: candidate and number of its instance of those drawn, one a row, int64, shape (n, 2)
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
         instances = self._instances
         instances.translator = self._make_translator(candidates, instances.translator.rules.breadth)
@@ -131,15 +131,23 @@ class SampleTransfer(MappingTransfer):
     def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
         """Return the compliance, 0 to 1, of a mapping's virtual source task with the transitions so far, Lambda_X of Eq. 6.
 
+        :return: 0 before the first transition
         :raises ValueError: if the set has no such state mapping
         """
-        return self._tasks.task_compliance(source, mapping)
+        sets, sources = self.candidates.sets, self.candidates.sources
+        mappings = sets[source]
+        same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
+        rows = np.flatnonzero(same.all(axis=1))
+        if len(rows) == 0:
+            raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
+        row = int(rows[0]) + sum(each.n_state_mappings for each in sets[:source])
+        actions = np.array(mapping.action) + sum(each.n_actions for each in sources[:source])
+        sums = self._tasks.sums[row, np.arange(len(actions)), actions]
+        return float(sums.sum() / max(self._tasks.transitions.n, 1))
 
     def drawn_counts(self) -> list[tuple[str, int]]:
         """Return how many of the instances in use were drawn through each candidate, the most first, by name."""
-        numbers, counts = np.unique(self.drawn[:, 0], return_counts=True)
-        order = np.argsort(-counts, kind="stable")
-        return [(self.describe(int(numbers[k])), int(counts[k])) for k in order]
+        return [(self.describe(candidate), n) for candidate, n in Counter(self.drawn[:, 0].tolist()).most_common()]
 
     def mapping_steps(self) -> int:
         """Return after how many transitions of the target instances were first drawn; all so far if none have been."""
@@ -184,18 +192,6 @@ class TaskComplianceSelector(PooledSelector):
         self._table.measure(self.transitions, i)
         self.sums[:, int(self.transitions.actions[i])] += self._table.values
 
-    def task_compliance(self, source: int, mapping: InterTaskMapping) -> float:
-        """See :meth:`SampleTransfer.task_compliance`; 0 before the first transition."""
-        sets, sources = self.candidates.sets, self.candidates.sources
-        mappings = sets[source]
-        same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
-        rows = np.flatnonzero(same.all(axis=1))
-        if len(rows) == 0:
-            raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
-        row = int(rows[0]) + sum(each.n_state_mappings for each in sets[:source])
-        actions = np.array(mapping.action) + sum(each.n_actions for each in sources[:source])
-        return float(self.sums[row, np.arange(len(actions)), actions].sum() / max(self.transitions.n, 1))
-
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         for i in range(self.transitions.n):
             self.add_transition(i)
@@ -218,20 +214,19 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
 
 def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
     """Return for each candidate the compliance of all tasks that have it, added up; ``sums``: of all sources, numbered on."""
-    origins = np.array(candidates.origins, dtype=np.int64)
-    found, row, action = np.zeros(len(origins)), 0, 0
-    for number, (source, mappings) in enumerate(zip(candidates.sources, candidates.sets, strict=True)):
+    found, row, action = np.zeros_like(sums), 0, 0
+    for source, mappings in zip(candidates.sources, candidates.sets, strict=True):
         rows, actions = slice(row, row + mappings.n_state_mappings), slice(action, action + source.n_actions)
         each = mean_compliances(mappings, sums[rows, :, actions], n_transitions) / len(candidates.sources)
         # Of equal state mappings one is a candidate, which stands for all.
         same = np.unique(np.hstack([mappings.state_mappings, mappings.state_signs]), axis=0, return_inverse=True)[1].ravel()
         of_equal = np.zeros_like(each)
         np.add.at(of_equal, same, each)
-        own = origins[:, 0] == number
-        _, target_action, state_index, source_action = origins[own].T
-        found[own] = of_equal[same[state_index], target_action, source_action]
+        found[rows, :, actions] = of_equal[same]
         row, action = rows.stop, actions.stop
-    return found
+    target_actions = [origin.target_action for origin in candidates.origins]
+    of_candidates: np.ndarray = found[candidates.arrays.row, target_actions, candidates.arrays.action]
+    return of_candidates
 
 
 def draw_instances(

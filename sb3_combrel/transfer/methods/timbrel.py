@@ -77,12 +77,13 @@ class TIMBREL(MappingTransfer):
         if isinstance(self.mapping, str):
             return PooledSelector(parts) if self.mapping == "pool" else RandomSelector(parts)
         check_one_source(parts.candidates.sources)
-        n_given = 1 if isinstance(self.mapping, InterTaskMapping | FactoredMapping | dict) else len(self.mapping)
-        n_actions = self._bound_task.n_actions
-        if n_given not in (1, n_actions):
-            raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {n_given}")
-        given = [parts.candidates.sets[0][a if n_given > 1 else 0] for a in range(n_actions)]
-        fixed = [parts.candidates.find(a, x.state_index, x.state_sign, x.action[a]) for a, x in enumerate(given)]
+        given, n_actions = parts.candidates.sets[0], self._bound_task.n_actions
+        if len(given) not in (1, n_actions):
+            raise ValueError(
+                f"mapping must be one mapping or one for each of the {n_actions} target actions, got {len(given)}"
+            )
+        each = [given[a if len(given) > 1 else 0] for a in range(n_actions)]
+        fixed = [parts.candidates.find(a, x.state_index, x.state_sign, x.action[a]) for a, x in enumerate(each)]
         return FixedSelector(parts, fixed=np.array(fixed, dtype=np.int64))
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
