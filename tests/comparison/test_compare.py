@@ -237,7 +237,7 @@ def test_a_control_that_cannot_be_made_is_warned_of(monkeypatch):
         if self.mapping == "random":
             raise ValueError("too many variables")
 
-    monkeypatch.setattr(TIMBREL, "_replace_names", refuse)
+    monkeypatch.setattr(TIMBREL, "bind", refuse)
     monkeypatch.setattr(
         module,
         "run_missing",

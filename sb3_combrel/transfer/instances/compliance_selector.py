@@ -49,17 +49,14 @@ class ComplianceSelector(Selector):
     def __init__(self, parts: SelectorParts, options: SelectionOptions):
         super().__init__(parts)
         self.options = options
+        candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
+        n_neighbors = options.n_neighbors
         # An empty place counts as a neighbour at the limit: what is farther away does not enter.
-        self.limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
+        limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
+        self._limits = float(self.task.exploration_threshold), limit
         self.first_episode = True
         self.n_switches = 0
-        self._table = ComplianceTable(self.candidates, options.bandwidths, options.min_evidence)
-        self._limits = float(self.task.exploration_threshold), self.limit
-        self._allocate()
-
-    def _allocate(self) -> None:
-        candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
-        n_neighbors = self.options.n_neighbors
+        self._table = ComplianceTable(candidates, options.bandwidths, options.min_evidence)
         # Where in the table the candidates of each action stand.
         columns = candidates.arrays.row * len(candidates.instances.size) + candidates.arrays.action
         self._columns = np.split(columns, self.first[1:-1])
@@ -71,13 +68,13 @@ class ComplianceSelector(Selector):
         self._sample = np.ascontiguousarray(self.task.sample_states.T), self._periodic
         self._apart = np.empty(n_points)
         self._near = np.full((n_actions, n_points, n_neighbors), -1, dtype=np.int64)
-        self._distance = np.full((n_actions, n_points, n_neighbors), self.limit)
+        self._distance = np.full((n_actions, n_points, n_neighbors), limit)
         self._near_of_pair = self._near.reshape(-1, n_neighbors)
         self._choice = np.full(n_actions * n_points, -1, dtype=np.int64)
         self._due = np.zeros((n_actions, n_points), dtype=np.bool_)
         self._renewal_due = 0.0
         # Nothing is asked before the first transition. To draw here would change what a loaded model draws.
-        self._draws_at = np.zeros(n_actions) if self.options.drawn else NO_DRAWS
+        self._draws_at = np.zeros(n_actions) if options.drawn else NO_DRAWS
         self._make_room_at(n_actions)
 
     def _set_cache(self, cache: ComplianceCache) -> None:

@@ -139,14 +139,11 @@ class MappingTransfer(Transfer):
         sources = load_sources(self.source)
         # Once read, the instances themselves: the file of a saved model must not depend on other files.
         self.source = sources if len(sources) > 1 else sources[0]
-        self._replace_names(sources, task)
-        self._periodic = np.array(task.periodic)
-        self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
-
-    def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
         states, actions = tuple(task.state_names), tuple(task.action_names)
         names = [MappingNames(each.state_names, states, each.action_names, actions) for each in sources]
         self.mappings = with_numbers(self.mappings, names)
+        self._periodic = np.array(task.periodic)
+        self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
     def _make_instances(self, task: TargetTask) -> InstanceTransfer:
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())

@@ -10,7 +10,6 @@ import numpy as np
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
-from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
@@ -68,9 +67,10 @@ class TIMBREL(MappingTransfer):
         # The set has no meaning for a mapping that is given.
         return given if isinstance(self.mapping, str) else {name: each for name, each in given.items() if name != "mappings"}
 
-    def _replace_names(self, sources: Sequence[SourceInstances], task: TargetTask) -> None:
-        super()._replace_names(sources, task)
+    def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        super().bind(task, rng)
         if not isinstance(self.mapping, str):
+            # With numbers in place of names.
             self.mapping = self.mappings  # type: ignore[assignment]
 
     def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
