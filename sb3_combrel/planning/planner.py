@@ -39,25 +39,7 @@ def sweep(values, mdp, upper, worth, lowest, searching, downwards):
     return largest
 
 
-@compiled
-def cautious_sweep(values, mdp, upper, lowest, downwards):
-    """As :func:`sweep`, over the pairs that have a model alone: what nobody has seen is worth the least there is."""
-    to, weight, length, reward, modelled, _ = mdp
-    n_points = len(values)
-    largest = 0.0
-    for step in range(n_points):
-        point = n_points - 1 - step if downwards else step
-        best = lowest
-        for action in range(reward.shape[1]):
-            if modelled[action * n_points + point]:
-                best = max(best, value_of_row(values, to, weight, length, reward, point, action))
-        best = min(best, upper[point])
-        largest = max(largest, abs(best - values[point]))
-        values[point] = best
-    return largest
-
-
-_sweep, _cautious_sweep = EntryPoint(sweep), EntryPoint(cautious_sweep)
+_sweep = EntryPoint(sweep)
 
 
 class Planner:
@@ -83,19 +65,20 @@ class Planner:
 
     def sweep(self, max_sweeps: int) -> int:
         """Back up all points, up and down the grid in turn, until little changes; the sweeps that this took."""
-        arrays, searching = (self.values, self.mdp.plain, self.upper, self.worth), self.worth is not self.upper
-        for n in range(max_sweeps):
-            if _sweep.call(*arrays, self.bounds[0], searching, n % 2 == 1) <= self.tolerance:
-                return n + 1
-        return max_sweeps
+        return self._back_up(self.values, self.worth, self.worth is not self.upper, max_sweeps)
 
     def cautious_values(self, max_sweeps: int) -> np.ndarray:
         """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are."""
         values = np.full(len(self.values), self.bounds[0])
-        for n in range(max_sweeps):
-            if _cautious_sweep.call(values, self.mdp.plain, self.upper, self.bounds[0], n % 2 == 1) <= self.tolerance:
-                break
+        # What nobody has seen is worth the least there is.
+        self._back_up(values, values.copy(), False, max_sweeps)
         return values
+
+    def _back_up(self, values: np.ndarray, worth: np.ndarray, searching: bool, max_sweeps: int) -> int:
+        for n in range(max_sweeps):
+            if _sweep.call(values, self.mdp.plain, self.upper, worth, self.bounds[0], searching, n % 2 == 1) <= self.tolerance:
+                return n + 1
+        return max_sweeps
 
     def set_worth(self, worth: np.ndarray | None) -> None:
         """Give points a worth of their own, which the agent may go there for.
