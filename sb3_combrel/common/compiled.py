@@ -1,6 +1,6 @@
 """How the inner loops are compiled: on first use, cached on disk, with a message while it lasts.
 
-Compiled functions take arrays and NamedTuples of arrays. Those that Python calls are wrapped in :class:`EntryPoint`. Numba
+Compiled functions take arrays and NamedTuples of arrays. Those that Python calls are each an :class:`EntryPoint`. Numba
 finds the types of arrays and plain tuples in C, of each NamedTuple in Python: functions that are called at every environment
 step take plain tuples, and make NamedTuples of them.
 
@@ -73,7 +73,7 @@ inner_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 
 class EntryPoint:
-    """A compiled function for callers from Python: ``EntryPoint(function)(...)``, or ``.call(...)``, a little quicker.
+    """A compiled function for callers from Python, as a decorator: ``function(...)``; ``function.call(...)`` is quicker.
 
     Its first call may have to compile; it then prints a message, and garbage collection waits.
     """

@@ -30,6 +30,7 @@ def with_own_arrays(env: Any) -> Any:
     return gym.wrappers.TransformObservation(env, np.array, env.observation_space)
 
 
+@EntryPoint
 @compiled
 def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, units):
     """``StateScaling.to_unit``; what is outside fixed bounds is moved to the boundary, and periodic variables are wrapped.
@@ -58,9 +59,6 @@ def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, un
                 outside = True
                 n_outside[k] += noted and abs(unit - inside) > ROUNDING
     return outside
-
-
-_scale_into_box = EntryPoint(scale_into_box)
 
 
 class ObservationScaler:
@@ -96,7 +94,7 @@ class ObservationScaler:
         inside = np.empty_like(raw)
         flat = (-1, self.scaling.n_variables)
         scales, noted = (self._low, self._range, self._periodic, self._fixed), self._unnoted if observed is None else observed
-        if _scale_into_box.call(raw.reshape(flat), *scales, noted, self.n_outside, inside.reshape(flat)):
+        if scale_into_box.call(raw.reshape(flat), *scales, noted, self.n_outside, inside.reshape(flat)):
             excess = self.scaling.to_unit(raw) - np.clip(inside, 0.0, 1.0)
             with np.errstate(invalid="ignore"):
                 # Whole periods are no excess; what is not finite stays so.

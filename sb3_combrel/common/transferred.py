@@ -73,7 +73,7 @@ def check_transferred(
     """
     name = type(method).__name__
     _check_arrays(given, name, len(own_weight), n_variables)
-    problem, row = _first_problem.call(given, own_weight, threshold)
+    problem, row = first_problem.call(given, own_weight, threshold)
     if problem == _NO_PROBLEM:
         return
     length, weights = int(given.length[row]), given.weight[row, : max(0, given.length[row])]
@@ -113,6 +113,7 @@ def _check_arrays(given: TransferredInstances, name: str, n: int, n_variables: i
 _NO_PROBLEM, _LENGTH, _WEIGHT, _VALUE, _THRESHOLD = range(5)
 
 
+@EntryPoint
 @compiled
 def first_problem(given, own_weight, threshold):
     """What is wrong with the first row that breaks the contract, and its number."""
@@ -134,6 +135,3 @@ def first_problem(given, own_weight, threshold):
         if n > 0 and total < threshold * (1.0 - ROUNDING):
             return _THRESHOLD, row
     return _NO_PROBLEM, 0
-
-
-_first_problem = EntryPoint(first_problem)

@@ -24,11 +24,6 @@ from sb3_combrel.models.grid_points import CAME, ENDED, WENT, PairArrays, PointS
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
 from sb3_combrel.planning.q_values import Prediction
 
-_note_instance, _put_transition, _put_arrivals = (
-    EntryPoint(note_instance),
-    EntryPoint(put_transition),
-    EntryPoint(put_arrivals),
-)
 NO_EFFECT = np.empty(0)
 
 
@@ -51,6 +46,7 @@ def add_to_row(reward, n_touched, transferred, row, total, scratch, grid):
     return reward, n_touched
 
 
+@EntryPoint
 @compiled
 def join_transferred(transferred, threshold, prediction):
     """Let transferred instances join the prediction of actions of less weight than ``threshold``; plain tuples."""
@@ -72,9 +68,6 @@ def join_transferred(transferred, threshold, prediction):
                     prediction.effect[action, n, v] = transferred.effect[action, j, v]
                 n += 1
         prediction.reward[action], prediction.length[action], prediction.modelled[action] = reward, n, True
-
-
-_join_transferred = EntryPoint(join_transferred)
 
 
 class GridModel(Model):
@@ -150,7 +143,7 @@ class GridModel(Model):
         arrivals = Instances.empty(self.n_actions, self.grid.n_variables, instances.capacity)
         shared = {name: getattr(instances, name) for name in ("reward", "terminated", "size", "periodic")}
         self.arrivals = arrivals._replace(**shared)
-        _put_arrivals.call(instances, self.arrivals)
+        put_arrivals.call(instances, self.arrivals)
         self._renew_ends()
 
     def _renew_ends(self) -> None:
@@ -165,7 +158,7 @@ class GridModel(Model):
     def _put(self, transition: tuple[Any, ...], effect: np.ndarray = NO_EFFECT) -> np.ndarray:
         """Write an instance to its slot; the pairs that are due. ``effect``: in place of next state minus state."""
         action, slot, state, _, _, terminated = transition
-        _put_transition.call(*self._plain_experience[:2], transition, effect)
+        put_transition.call(*self._plain_experience[:2], transition, effect)
         self.n_added += 1
         self._number[action, slot] = self.n_added
         numbers = self._numbers_of(action, slot)
@@ -204,7 +197,7 @@ class GridModel(Model):
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""
         first = action * self.grid.n_points
-        n = _note_instance.call(instance, first, self._plain_pairs, widest, why, self.grid.plain, self._rules, self._points)
+        n = note_instance.call(instance, first, self._plain_pairs, widest, why, self.grid.plain, self._rules, self._points)
         due: np.ndarray = self._points[2][:n]
         return due
 
@@ -273,7 +266,7 @@ class GridModel(Model):
         if room > self._prediction.probability.shape[1]:
             self._make_prediction(room)
             self._predict_own(state)
-        _join_transferred.call(tuple(given), self.exploration_threshold, self._plain_prediction)
+        join_transferred.call(tuple(given), self.exploration_threshold, self._plain_prediction)
         return self._prediction, given
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:

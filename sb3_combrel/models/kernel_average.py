@@ -49,6 +49,7 @@ def weight_ever(instances, action, state, kernel, threshold, total):
     return threshold if everything >= threshold else total
 
 
+@EntryPoint
 @compiled
 def predict_own(instances, state, kernel, threshold, near, prediction):
     """Predict every action at ``state`` from the instances that the kernel keeps there; the least weight that one has.
@@ -77,6 +78,7 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
     return least
 
 
+@EntryPoint
 @compiled
 def weigh(instances, pairs, grid, kernel, threshold, which, near, found):
     """Write the weight of the instances of some pairs, ``which``, to ``found``; plain tuples."""
@@ -107,6 +109,7 @@ def entry_distance(near, length, total, kernel, threshold):
     return -np.log(least) * breadth * breadth * (1 + 1e-12)
 
 
+@EntryPoint
 @compiled
 def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, near):
     """Write rows of pairs from the instances that the kernel keeps, and from transferred ones; how many are done.
@@ -151,9 +154,6 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
     return done
 
 
-_predict_own, _update_rows, _weigh = EntryPoint(predict_own), EntryPoint(update_rows), EntryPoint(weigh)
-
-
 class KernelAverage(GridModel):
     """The model of Jong & Stone (2007), one for each action.
 
@@ -175,14 +175,14 @@ class KernelAverage(GridModel):
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
         model = self._plain_experience[0], self._plain_pairs, mdp.plain, self.grid.plain, self._weights
-        return int(_update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
+        return int(update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
 
     def _weigh(self, pairs: np.ndarray) -> np.ndarray:
         found, threshold = np.empty(len(pairs)), self.exploration_threshold
         model = self._plain_experience[0], self._plain_pairs, self.grid.plain, self._weights
-        _weigh.call(*model, threshold, pairs, self._near, found)
+        weigh.call(*model, threshold, pairs, self._near, found)
         return found
 
     def _predict_own(self, state: np.ndarray) -> float:
         given = state, self._weights, self.exploration_threshold, self._near, self._plain_prediction
-        return float(_predict_own.call(self._plain_experience[0], *given))
+        return float(predict_own.call(self._plain_experience[0], *given))

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, nearest_instances, squared_distance
@@ -69,6 +69,7 @@ def outcome_of(to, moved, around, experience, kernel, end):
         end_at(to, (moved + near) ** 2, kernel.outcome_breadth, arrivals, ends, end)
 
 
+@EntryPoint
 @compiled
 def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratch, prediction):
     """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
@@ -114,6 +115,7 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
     return least
 
 
+@EntryPoint
 @compiled
 def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     """Write to ``effect`` what the instances alone predict of an action, without a prior; plain tuples.
@@ -131,6 +133,7 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     return leverage_of(fit, length, kernel)
 
 
+@EntryPoint
 @compiled
 def weigh(instances, pairs, grid, kernel, which, fit, at, found):
     """Write the weight of the instances of some pairs, ``which``, to ``found``; ``at``: work space; plain tuples."""
@@ -234,6 +237,7 @@ def recall_own_fit(pair, at, action, instances, pairs, fit):
     fit.distance[0] = squared_distance(at, instances.state[action, fit.item[0]], instances.periodic, wraps)
 
 
+@EntryPoint
 @compiled
 def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, fit, scratch):
     """Fit pairs anew, and write their rows, with transferred instances for what is not known; how many are done.
@@ -302,6 +306,7 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
     return done
 
 
+@EntryPoint
 @compiled
 def interpolate_prior(prior, grid, states, actions, corners, found):
     """Write what a prior says of states and actions, multilinear between the grid points, to ``found``.

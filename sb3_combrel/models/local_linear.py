@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.regression import LocalFit
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel
@@ -20,9 +19,6 @@ from sb3_combrel.models.linear_rows import (
     weigh,
 )
 from sb3_combrel.planning.mdp import FiniteMDP
-
-_update_rows, _predict_own = EntryPoint(update_rows), EntryPoint(predict_own)
-_interpolate_prior, _weigh, _predict_alone = EntryPoint(interpolate_prior), EntryPoint(weigh), EntryPoint(predict_alone)
 
 
 class LocalLinear(GridModel):
@@ -80,7 +76,7 @@ class LocalLinear(GridModel):
         Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through it.
         """
         found = np.empty((len(actions), 2 * self.grid.n_variables))
-        _interpolate_prior.call(self.linear.prior, self.grid.plain, states, actions, self._corners, found)
+        interpolate_prior.call(self.linear.prior, self.grid.plain, states, actions, self._corners, found)
         return found
 
     def renew_prior(self) -> np.ndarray:
@@ -101,20 +97,20 @@ class LocalLinear(GridModel):
         planned = mdp.gamma, self._rules[1], self._has_prior, self.n_added
         model = self._plain_experience, self._plain_linear, self._plain_pairs, mdp.plain, self.grid.plain, self._plain_kernel
         scratch = mdp.plain_scratch, self._fit, self._scratch
-        return int(_update_rows.call(*model, planned, pairs, transferred, *scratch))
+        return int(update_rows.call(*model, planned, pairs, transferred, *scratch))
 
     def _weigh(self, pairs: np.ndarray) -> np.ndarray:
         found, at = np.empty(len(pairs)), np.empty(self.grid.n_variables)
         model = self._plain_experience[0], self._plain_pairs, self.grid.plain, self._plain_kernel
-        _weigh.call(*model, pairs, self._fit, at, found)
+        weigh.call(*model, pairs, self._fit, at, found)
         return found
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         found = np.zeros(self.grid.n_variables)
         given = self._plain_experience[0], self._plain_kernel, state, action
-        return found, float(_predict_alone.call(*given, self._fit, self._scratch, found))
+        return found, float(predict_alone.call(*given, self._fit, self._scratch, found))
 
     def _predict_own(self, state: np.ndarray) -> float:
         model, prior = (self._plain_experience, self._plain_linear), self._prior_at(state)
         given = state, self._plain_kernel, self.exploration_threshold, self._fit, self._scratch, self._plain_prediction
-        return float(_predict_own.call(*model, prior, *given))
+        return float(predict_own.call(*model, prior, *given))

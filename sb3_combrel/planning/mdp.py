@@ -94,7 +94,7 @@ class FiniteMDP:
         """
         done = 0
         while done < len(pairs):
-            done = _write_rows.call(
+            done = write_rows.call(
                 self.arrays, self.grid.arrays, self.gamma, (pairs, modelled, probability, effect, reward), done, self.scratch
             )
             if done < len(pairs):
@@ -171,6 +171,7 @@ def set_modelled(mdp, pair, modelled):
         mdp.n_optimistic[point] += -1 if modelled else 1
 
 
+@EntryPoint
 @compiled
 def write_rows(mdp, grid, gamma, predictions, done, scratch):
     """Write rows from predictions, from number ``done`` on; how many are done, fewer than all if there is no room."""
@@ -190,6 +191,3 @@ def write_rows(mdp, grid, gamma, predictions, done, scratch):
         set_modelled(mdp, pair, modelled[done])
         done += 1
     return done
-
-
-_write_rows = EntryPoint(write_rows)

@@ -15,6 +15,7 @@ def value_of_row(values, to, weight, length, reward, point, action):
     return q
 
 
+@EntryPoint
 @compiled
 def sweep(values, mdp, upper, worth, lowest, searching, downwards):
     """V(point) = max over a of Q(point, a), Fitted R-Max's backup, at all grid points; the largest change.
@@ -37,9 +38,6 @@ def sweep(values, mdp, upper, worth, lowest, searching, downwards):
         largest = max(largest, abs(best - values[point]))
         values[point] = best
     return largest
-
-
-_sweep = EntryPoint(sweep)
 
 
 class Planner:
@@ -76,7 +74,7 @@ class Planner:
 
     def _back_up(self, values: np.ndarray, worth: np.ndarray, searching: bool, max_sweeps: int) -> int:
         for n in range(max_sweeps):
-            if _sweep.call(values, self.mdp.plain, self.upper, worth, self.bounds[0], searching, n % 2 == 1) <= self.tolerance:
+            if sweep.call(values, self.mdp.plain, self.upper, worth, self.bounds[0], searching, n % 2 == 1) <= self.tolerance:
                 return n + 1
         return max_sweeps
 

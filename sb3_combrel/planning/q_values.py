@@ -70,6 +70,7 @@ def optimistic_value(state, function, grid, scratch):
     return value
 
 
+@EntryPoint
 @compiled
 def evaluate_actions(prediction, state, function, q, scratch):
     """Q of every action at ``state``, into ``q``, shape (n_actions,); the best action, -1 if several are; plain tuples.
@@ -103,9 +104,6 @@ def evaluate_actions(prediction, state, function, q, scratch):
     return -1 if ties > 0 else best
 
 
-_evaluate_actions = EntryPoint(evaluate_actions)
-
-
 class QValues:
     """Action values at exact states, with work space of their own."""
 
@@ -119,5 +117,5 @@ class QValues:
         :param state: unit coordinates, shape (n_variables,)
         :return: the best action, -1 if several are
         """
-        best: int = _evaluate_actions.call(tuple(prediction), state, tuple(function), self.q, self._scratch)
+        best: int = evaluate_actions.call(tuple(prediction), state, tuple(function), self.q, self._scratch)
         return best

@@ -133,7 +133,7 @@ def test_compiled_code_older_than_any_source_file_beside_some_is_removed_when_as
 
 def test_compiled_code_in_numba_cache_dir_is_found(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
-    folder = njit(cache=True)(scale_into_box.py_func).stats.cache_path
+    folder = njit(cache=True)(scale_into_box.function.py_func).stats.cache_path
     index = touch(tmp_path / folder / "observations.f-1.nbi", 2_000_000_000)
     remove_outdated(compiled.PACKAGE / "common", str(tmp_path))
     assert index.is_relative_to(tmp_path) and not index.exists()
