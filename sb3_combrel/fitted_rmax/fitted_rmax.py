@@ -67,7 +67,7 @@ class FittedRMax(PastData):
       every step spread over the grid.
     - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``).
     - With ``degree=1``, until an episode has ended or rewards have differed, each visit to a place makes it, and an action not
-      tried there, worth less by a step (:func:`~sb3_combrel.fitted_rmax.search.worth_after_visits`).
+      tried there, worth less by a step (:func:`~sb3_combrel.fitted_rmax.optimism.worth_after_visits`).
     - A time limit is not a terminal state.
     - Where an agent stays although its values promise otherwise it holds an action drawn at random
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).

@@ -72,7 +72,7 @@ class Model(ABC):
 
     #: Whether what a transfer method predicts may join the fits to the target's own instances (``use="prior"``).
     takes_prior: ClassVar[bool] = False
-    #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.search``).
+    #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.optimism``).
     searches: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):

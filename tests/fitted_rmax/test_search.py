@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.fitted_rmax import agent as agents
-from sb3_combrel.fitted_rmax.search import worth_after_visits
+from sb3_combrel.fitted_rmax.optimism import worth_after_visits
 from tests.helpers.own_method import Mine
 
 LIMIT, NEEDLE, RADIUS = 60, np.array([0.5, 0.55]), 0.03
