@@ -70,10 +70,7 @@ class Instances(NamedTuple):
         if flags.any():
             state = np.where(flags, state - np.floor(state), state)
         counts = np.bincount(action, minlength=n_actions)
-        capacity = 8 * BLOCK
-        while capacity < counts.max():
-            capacity *= 2
-        made = cls.empty(n_actions, state.shape[1], capacity, flags)
+        made = cls.empty(n_actions, state.shape[1], periodic=flags).enlarged(int(counts.max()))
         made.size[:] = counts
         for a, n in enumerate(counts):
             rows, first = np.flatnonzero(action == a), np.arange(0, n, BLOCK)

@@ -163,12 +163,6 @@ def fit_around(at, action, length, instances, kernel, fit):
 
 
 @inlined
-def weight_of_nearest(fit, length, kernel):
-    """The weight of a fit's nearest instance, in parts of which those of all are."""
-    return np.exp(fit.distance[0] * kernel_scale(fit, length, kernel))
-
-
-@inlined
 def leverage_of(fit, length, kernel):
     """The fit's leverage: 1 over as how many instances at the very state it counts.
 
@@ -176,7 +170,9 @@ def leverage_of(fit, length, kernel):
     a wall, the slope across it is not determined: the fit would count for nothing close beside them.
     """
     last = fit.solution.shape[1] - 1
-    return min(fit.solution[0, last] / weight_of_nearest(fit, length, kernel), np.exp(-fit.distance[0] * kernel.scale))
+    # The weights of all are in parts of that of the nearest.
+    nearest = np.exp(fit.distance[0] * kernel_scale(fit, length, kernel))
+    return min(fit.solution[0, last] / nearest, np.exp(-fit.distance[0] * kernel.scale))
 
 
 @inner

@@ -70,7 +70,7 @@ class StateScaling:
         # A variable that never changes has no scale.
         around = np.where(most > least, 0.0, 0.5)
         found_low, found_high = around_zero(least - around, most + around)
-        unbounded = ~((np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND) & (np.asarray(low) < high))
+        unbounded = without_bounds(low, high)
         return cls(np.where(unbounded, found_low, low), np.where(unbounded, found_high, high))
 
     @staticmethod
@@ -105,6 +105,11 @@ class StateScaling:
 
     def __repr__(self) -> str:
         return f"StateScaling(low={self.low.tolist()}, high={self.high.tolist()})"
+
+
+def without_bounds(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which variables have no bounds to scale them by: infinite ones, or, where one never changes, without a width."""
+    return ~((np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND) & (np.asarray(low) < high))
 
 
 def around_zero(low: NDArray[np.float64], high: NDArray[np.float64]) -> Limits:

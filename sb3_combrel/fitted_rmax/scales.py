@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from sb3_combrel.common.constants import BEYOND, TOO_WIDE
 from sb3_combrel.common.periodic import check_periods
-from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling, around_zero
+from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling, around_zero, without_bounds
 
 
 class FoundScales:
@@ -32,8 +32,7 @@ class FoundScales:
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
         self._found = ~periodic & (bounds is None)
-        # A space may hold a variable that never changes between bounds without a width.
-        unbounded = ~((np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND) & (low < high))
+        unbounded = without_bounds(low, high)
         check_periods(periodic & unbounded)
         #: What the space allows, raw units.
         self.low = np.where((low > -LARGEST_BOUND) & (low < high), low, -np.inf)

@@ -120,12 +120,10 @@ class Model(ABC):
 
     def transitions(self) -> list[tuple[np.ndarray, int, float, np.ndarray, bool]]:
         """State, action, reward, next state and terminated of all instances, in the order in which they came."""
-        found, d = [], self.grid.n_variables
-        for number, row in zip(self._numbers(), self.instances.rows(), strict=True):
-            state = row[1 : 1 + d]
-            transition = state, int(row[0]), float(row[-2]), state + row[1 + d : 1 + 2 * d], bool(row[-1] > 0.5)
-            found.append((float(number), transition))
-        return [transition for _, transition in sorted(found, key=lambda each: each[0])]
+        rows, d = self.instances.rows()[np.argsort(self._numbers(), kind="stable")], self.grid.n_variables
+        states, next_states = rows[:, 1 : 1 + d], rows[:, 1 : 1 + d] + rows[:, 1 + d : 1 + 2 * d]
+        actions, rewards, terminated = rows[:, 0].astype(np.int64).tolist(), rows[:, -2].tolist(), (rows[:, -1] > 0.5).tolist()
+        return list(zip(states, actions, rewards, next_states, terminated, strict=True))
 
     def _numbers(self) -> np.ndarray:
         """When each instance came, by action as in ``Instances.rows``."""
@@ -183,9 +181,7 @@ class Model(ABC):
         by_action = np.split(self.instances.rows(), np.cumsum(self.instances.size)[:-1])
         # The oldest first, so that they are replaced first after loading as well.
         rows = np.vstack([np.roll(some, -oldest, axis=0) for some, oldest in zip(by_action, self._oldest, strict=True)])
-        return {
-            "instances": np.column_stack([rows, np.ones(len(rows))]),
-        }
+        return {"instances": np.column_stack([rows, np.ones(len(rows))])}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`get_state` returned, and update all rows of the finite MDP; for a new model."""
@@ -193,11 +189,14 @@ class Model(ABC):
         self._oldest[:] = 0
         self.update_all_rows()
 
-    def update_all_rows(self) -> None:
-        """Bring all rows of the finite MDP up to date."""
-        pairs = np.arange(len(self.known))
+    def update_all(self, pairs: np.ndarray) -> None:
+        """:meth:`update_rows` of any number of pairs."""
         for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
             self.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
+
+    def update_all_rows(self) -> None:
+        """Bring all rows of the finite MDP up to date."""
+        self.update_all(np.arange(len(self.known)))
 
     def _check(self, given: TransferredInstances, own_weight: np.ndarray) -> None:
         threshold = self.settings.exploration_threshold

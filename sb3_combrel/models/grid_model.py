@@ -7,7 +7,7 @@ depends on the transitions alone: so a model is saved as its transitions and one
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.regression import Kernel
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
 from sb3_combrel.models.ends import Ends, put_arrivals, put_transition
 from sb3_combrel.models.grid_points import CAME, ENDED, WENT, PairArrays, PointScratch, note_instance
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
@@ -221,9 +221,7 @@ class GridModel(Model):
     def _make_room(self, capacity: int) -> None:
         """Make room for so many instances of each action."""
         self.instances = self.instances.enlarged(capacity)
-        number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
-        number[:, : self._number.shape[1]] = self._number
-        self._number = number
+        self._number = np.pad(self._number, ((0, 0), (0, self.instances.capacity - self._number.shape[1])))
         self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
@@ -291,25 +289,24 @@ class GridModel(Model):
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
         self._replays = True
-        self._update_all(self.renew_prior())
+        self.update_all(self.renew_prior())
         rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
         self._make_room(int(np.bincount(actions, minlength=self.n_actions).max()))
         n_added, self._informed_at = (int(number) for number in state["n_added"])
-        fitted_at = state["fitted_at"].astype(np.int64)
-        for_fitting = _Due(fitted_at)
+        due = when_fitted(state["fitted_at"].astype(np.int64))
         for action, row in zip(actions.tolist(), rows, strict=True):
-            self._fit_until(for_fitting, int(row[-1]))
+            self._fit_until(due, int(row[-1]))
             self.n_added = int(row[-1]) - 1
             at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
-        self._fit_until(for_fitting, n_added + 1)
+        self._fit_until(due, n_added + 1)
         self.n_added, self._replays = n_added, False
         self._put_in_order(state["instances"])
         if self._giver is not None:
             # What is transferred now may be something else than when they were fitted, which stays as it was.
             before = [array.copy() for array in self.pairs]
-            self._update_all(np.flatnonzero(~self.known))
+            self.update_all(np.flatnonzero(~self.known))
             for array, copied in zip(self.pairs, before, strict=True):
                 array[:] = copied
 
@@ -325,31 +322,17 @@ class GridModel(Model):
             self._number[action, : len(own)] = own
         self._renew_arrivals()
 
-    def _fit_until(self, due: _Due, number: int) -> None:
+    def _fit_until(self, due: deque[tuple[int, np.ndarray]], number: int) -> None:
         """Fit the pairs that were last fitted before transition ``number`` came."""
-        for fitted_at, pairs in due.before(number):
-            self.n_added = fitted_at
-            if 0 < self._informed_at <= fitted_at:
+        while due and due[0][0] < number:
+            self.n_added, pairs = due.popleft()
+            if 0 < self._informed_at <= self.n_added:
                 self._set_informed()
-            self._update_all(pairs)
-
-    def _update_all(self, pairs: np.ndarray) -> None:
-        for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
-            self.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
+            self.update_all(pairs)
 
 
-class _Due:
-    """Pairs in the order in which they were last fitted; those that never were are left out."""
-
-    def __init__(self, fitted_at: np.ndarray):
-        self._pairs = np.argsort(fitted_at, kind="stable")
-        self._times = fitted_at[self._pairs]
-        self._done = int(np.searchsorted(self._times, 1))
-
-    def before(self, number: int) -> Iterator[tuple[int, np.ndarray]]:
-        """Each time before ``number`` that has not been asked for, and its pairs, ascending."""
-        end = int(np.searchsorted(self._times, number))
-        while self._done < end:
-            first, time = self._done, int(self._times[self._done])
-            self._done = int(np.searchsorted(self._times, time, side="right"))
-            yield time, np.sort(self._pairs[first : self._done])
+def when_fitted(fitted_at: np.ndarray) -> deque[tuple[int, np.ndarray]]:
+    """The transitions at which pairs were last fitted, and these pairs, ascending; those that never were are left out."""
+    pairs = np.argsort(fitted_at, kind="stable")
+    times, first = np.unique(fitted_at[pairs], return_index=True)
+    return deque((time, some) for time, some in zip(times.tolist(), np.split(pairs, first[1:]), strict=True) if time > 0)

@@ -64,6 +64,14 @@ class PointScratch(NamedTuple):
         return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64), np.empty(d + 1))
 
 
+@inlined
+def note_fit(pair, length, weight, threshold, transitions, pairs):
+    """Note that a pair is fitted to its instances; whether these suffice."""
+    pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
+    pairs.weight[pair], pairs.known[pair], pairs.surprise[pair] = weight, weight >= threshold, 0.0
+    return pairs.known[pair]
+
+
 # Why the pairs around a state are looked at: an instance has come, has gone, or an episode has ended there.
 CAME, WENT, ENDED = range(3)
 

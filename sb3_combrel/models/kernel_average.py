@@ -12,7 +12,7 @@ from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, 
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel, add_to_row, total_weight
-from sb3_combrel.models.grid_points import PairArrays
+from sb3_combrel.models.grid_points import PairArrays, note_fit
 from sb3_combrel.planning.grid import GridArrays, unit_coordinates_of
 from sb3_combrel.planning.mdp import FiniteMDP, MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
 from sb3_combrel.planning.q_values import Prediction
@@ -129,10 +129,8 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         action = pair // n_points
         length, total = near_pair(pair, instances, pairs, grid, kernel, near)
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
-        known = weight >= threshold
-        pairs.weight[pair], pairs.known[pair] = weight, known
+        known = note_fit(pair, length, weight, threshold, transitions, pairs)
         pairs.reach[pair] = entry_distance(near, length, total, kernel, threshold)
-        pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
         joined = not known and transferred.length[done] > 0
         if known or joined:
             coordinates_of(point, grid, row_scratch.at)

@@ -12,7 +12,7 @@ from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, join_pri
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
-from sb3_combrel.models.grid_points import PairArrays
+from sb3_combrel.models.grid_points import PairArrays, note_fit
 from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, unit_coordinates_of
 from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
 from sb3_combrel.planning.q_values import Prediction
@@ -201,14 +201,6 @@ def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
         if inside == 0.0 or taken < 1.0 or left or end > 0.5:
             break
     return total, goes_on, discount
-
-
-@inlined
-def note_fit(pair, length, weight, threshold, transitions, pairs):
-    """Note that a pair is fitted to its instances; whether these suffice."""
-    pairs.n_new[pair], pairs.length[pair], pairs.fitted_at[pair] = 0, length, transitions
-    pairs.weight[pair], pairs.known[pair], pairs.surprise[pair] = weight, weight >= threshold, 0.0
-    return pairs.known[pair]
 
 
 @inlined
