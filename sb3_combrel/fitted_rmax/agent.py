@@ -1,4 +1,9 @@
-"""The agent of Fitted R-Max: model, planner and transfer method together, on arrays, without Stable-Baselines3."""
+"""The agent of Fitted R-Max: model, planner and transfer method together, on arrays, without Stable-Baselines3.
+
+A step of learning, as Jong & Stone (2007) have it: :meth:`FittedRMaxAgent.act` predicts every action at the exact state,
+values what it leads to by the planner's values, and takes the best one; :meth:`FittedRMaxAgent.update` gives the transition to
+the model, which says what pairs of the grid it changes, fits these anew, and sweeps over the grid.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +20,13 @@ from sb3_combrel.common.constants import LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
-from sb3_combrel.fitted_rmax.correspondence import Correspondence
+from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.fitted_rmax.correspondence import Correspondence, NoTransfer
 from sb3_combrel.fitted_rmax.optimism import RewardRange, worth_after_visits
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
-from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, Model
+from sb3_combrel.models.base import NO_PAIRS, Model
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.planner import Planner
@@ -29,6 +35,8 @@ from sb3_combrel.transfer.base import TargetTask, Transfer
 
 # State, action, reward, next state, terminated.
 Transition = tuple[np.ndarray, int, float, np.ndarray, bool]
+# By what the names of arrays of a transfer method begin in the agent's state.
+OF_TRANSFER = "transfer_"
 
 
 class FittedRMaxAgent:
@@ -54,7 +62,11 @@ class FittedRMaxAgent:
         rng: np.random.Generator | None = None,
         model_class: type[Model] | None = None,
     ):
-        self.settings, self.task, self.transfer = settings, task, transfer
+        self.settings, self.task = settings, task
+        #: The transfer method, None for none.
+        self.transfer = transfer
+        # The same, or one that transfers nothing.
+        self._method = NoTransfer() if transfer is None else transfer
         self.model_class = MODELS[settings.degree] if model_class is None else model_class
         self.rng = np.random.default_rng() if rng is None else rng
         self._prediction_rng = self.rng.spawn(1)[0]
@@ -65,8 +77,7 @@ class FittedRMaxAgent:
         breadth, min_weight = self.model_settings.model_breadth, self.model_settings.min_weight
         check_resolution(settings.resolution, d)
         self.grid = fitting_grid(d, task.n_actions, settings.resolution, breadth, min_weight, self.periodic)
-        transfers = transfer is not None and transfer.informs_model
-        self.workload = workload(self.grid, task.n_actions, self.model_settings, transfers)
+        self.workload = workload(self.grid, task.n_actions, self.model_settings, self._method.informs_model)
         warn_if_long(self.workload, self.grid)
         self.rewards = RewardRange(settings.gamma, settings.max_value)
         self.n_sweeps = 0
@@ -82,60 +93,49 @@ class FittedRMaxAgent:
         self._lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
         # Most methods leave all actions to the agent: they are not asked at every step.
-        self._transfer_decides = transfer is not None and type(transfer).action is not Transfer.action
-        if transfer is not None:
-            transfer.check_degree(1 if self.model_class.takes_prior else 0)
+        self._transfer_decides = type(self._method).action is not Transfer.action
+        self._method.check_degree(1 if self.model_class.takes_prior else 0)
         self._bind()
         self._build()
 
     def _bind(self) -> None:
-        self.correspondence = Correspondence(self.task.scaling, self.task.shared_scaling)
-        if self.transfer is not None:
-            self.target = self._target_task()
-            self.transfer.bind(self.target, self.rng)
-
-    def _target_task(self) -> TargetTask:
-        return TargetTask(
-            scaling=self.task.shared_scaling,
-            n_actions=self.task.n_actions,
+        """Tell the transfer method of the task, in the unit coordinates in which tasks correspond."""
+        task, kernel = self.task, self.model_settings
+        self.correspondence = Correspondence(task.scaling, task.shared_scaling)
+        target = TargetTask(
+            scaling=task.shared_scaling,
+            n_actions=task.n_actions,
             sample_states=self.correspondence.states(self.grid.points()),
-            exploration_threshold=self.model_settings.exploration_threshold,
-            min_weight=self.model_settings.min_weight,
-            min_fraction=self.model_settings.min_fraction,
-            state_names=tuple(self.task.state_names),
-            action_names=tuple(self.task.action_names),
+            exploration_threshold=kernel.exploration_threshold,
+            min_weight=kernel.min_weight,
+            min_fraction=kernel.min_fraction,
+            state_names=tuple(task.state_names),
+            action_names=tuple(task.action_names),
             periodic=self.periodic,
             takes_prior=self.model_class.takes_prior,
             gamma=self.rewards.gamma,
             max_value=self.rewards.max_value,
         )
+        self._method.bind(target, self.rng)
 
     def _build(self, width: int | None = None) -> None:
         """Make model and planner, without any instances; ``width``: room for successors that rows have had before."""
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma, width)
-        self._model_transfer = self.transfer if self.transfer is not None and self.transfer.informs_model else None
-        self._asked = None if self._model_transfer is None else self.correspondence.of_learner(self._model_transfer)
+        self._asked = self.correspondence.of_learner(self._method) if self._method.informs_model else None
         self.model = self.model_class(self.mdp, self.model_settings, self._asked)
         self.planner = Planner(self.mdp, max_value=max_value, min_value=min(0.0, max_value) - 1.0, tolerance=tolerance)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
-        if self.transfer is not None:
-            self._widen(self.transfer.lowest_reward())
+        self._widen(self._method.lowest_reward())
 
-    def reseed(self, rng: np.random.Generator) -> None:
-        """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
-        # The generator itself stays the same, as the transfer method has it too.
-        self.rng.bit_generator.state = rng.bit_generator.state
-        self._prediction_rng = rng.spawn(1)[0]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_lock"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _lock=threading.RLock())
+    def prepare(self) -> None:
+        """Model what is transferred before the first step, and plan until the values have converged."""
+        with self._lock:
+            if self.transfer is not None and self.model.n_instances == 0:
+                self._plan(SWEEPS_AT_EPISODE_END)
 
     def act(self, state: np.ndarray, explore: bool = True, environment: int = 0) -> int:
         """Choose an action.
@@ -157,22 +157,22 @@ class FittedRMaxAgent:
 
     def _decided_by_transfer(self, state: np.ndarray, environment: int) -> int | None:
         """The action that the transfer method decides on; None if it leaves it to the agent."""
-        assert self.transfer is not None
-        self.transfer.environment = environment
-        action = self.transfer.action(self.correspondence.states(state))
-        is_number = isinstance(action, int | np.integer) and not isinstance(action, bool)
-        if action is None or (is_number and 0 <= action < self.task.n_actions):
-            return None if action is None else int(action)
+        self._method.environment = environment
+        action = self._method.action(self.correspondence.states(state))
+        if action is None:
+            return None
+        if isinstance(action, int | np.integer) and not isinstance(action, bool) and 0 <= action < self.task.n_actions:
+            return int(action)
         raise ValueError(
-            f"{type(self.transfer).__name__}.action must return None or a whole number from 0 to {self.task.n_actions - 1}, "
+            f"{type(self._method).__name__}.action must return None or a whole number from 0 to {self.task.n_actions - 1}, "
             f"got {action!r}"
         )
 
     def _explore(self, state: np.ndarray, environment: int) -> int:
-        prediction, given = self.model.predict_at(state)
+        """The action of the largest value, or the one that is held where values do not keep their promise."""
+        prediction, given, best = self._evaluate(state)
         if given is not None and self._asked is not None:
             self._asked.note_use(given)
-        best = self._q.compute(prediction, state, self._value_function(self.planner.values))
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())
             best = int(ties[self.rng.integers(len(ties))])
@@ -181,13 +181,131 @@ class FittedRMaxAgent:
             self.n_optimistic_actions += 1
         return chosen
 
+    def _evaluate(
+        self, state: np.ndarray, values: np.ndarray | None = None
+    ) -> tuple[Prediction, TransferredInstances | None, int]:
+        """Compute the action values at a state; what is predicted and transferred there, and the best action, -1 for ties."""
+        prediction, given = self.model.predict_at(state)
+        values = self.planner.values if values is None else values
+        function = ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.worth)
+        return prediction, given, self._q.compute(prediction, state, function)
+
+    def update(
+        self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
+    ) -> None:
+        """Learn from one transition, and plan.
+
+        :param state: unit coordinates; ``next_state``: the same
+        :param action: from 0 on
+        :param terminated: whether ``next_state`` is a terminal state; a time limit is none
+        :param environment: see :meth:`act`
+        """
+        with self._lock:
+            self.has_acted = True
+            self._note_reward(reward, terminated)
+            self._method.environment = environment
+            self.promises.pay(environment, reward, self.mdp.gamma)
+            self._take_in(state, action, reward, next_state, terminated)
+            self._plan(SWEEPS_A_STEP)
+
+    def end_episode(self, truncated: bool, environment: int = 0) -> None:
+        """Plan on while no action is due.
+
+        :param truncated: whether the episode ended by its time limit
+        :param environment: see :meth:`act`
+        """
+        with self._lock:
+            self.rewards.n_truncated += bool(truncated)
+            self.promises.end_episode(environment)
+            self._method.environment = environment
+            self._method.end_episode(truncated)
+            self._outdated.append(self.model.end_episode())
+            self._plan(SWEEPS_AT_EPISODE_END)
+
+    def _take_in(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        """Give a transition to the model and to the transfer method."""
+        if self._method.use == "prior":
+            effect, leverage = self.model.predict_alone(state, action)
+            self._method.note_prediction(self.correspondence.effects(effect), leverage)
+        self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
+        before, after = self.correspondence.states(state), self.correspondence.states(next_state)
+        self._method.observe(before, action, reward, after, terminated)
+
+    def _note_reward(self, reward: float, terminated: bool) -> None:
+        """Take in what a step has paid: how optimistic to be, and how low values may get."""
+        self.rewards.note(reward, terminated)
+        self._widen(reward)
+
+    def _widen(self, reward: float) -> None:
+        """Keep the lower bound of the values below what the worst reward seen could add up to."""
+        low, high = self.planner.bounds
+        self.planner.bounds = (min(low, min(0.0, high) + LONGEST_PLAN * min(0.0, reward)), high)
+
+    def _plan(self, max_sweeps: int) -> None:
+        """Update the rows of the pairs that changed, and sweep over the grid."""
+        began = perf_counter() if self.timed else None
+        self._follow_rewards()
+        if self._method.informs_model:
+            self._outdated.append(self._changed_by_transfer())
+        pairs = self._outdated[0] if len(self._outdated) == 1 else np.unique(np.concatenate([NO_PAIRS, *self._outdated]))
+        self.model.update_all(pairs)
+        self._outdated.clear()
+        self._search()
+        self.n_sweeps += self.planner.sweep(max_sweeps)
+        self._cautious = None
+        if began is not None:
+            self.planning_seconds += perf_counter() - began
+
+    def _follow_rewards(self) -> None:
+        """Plan with other optimism, or another discount, if what rewards have shown asks for it."""
+        gamma, max_value = self.rewards.gamma, self.rewards.max_value
+        if gamma == self.mdp.gamma and max_value == self.planner.bounds[1]:
+            return
+        if gamma != self.mdp.gamma:
+            self.mdp.gamma = gamma
+            self._outdated.append(np.flatnonzero(self.mdp.arrays.modelled))
+        self.planner.set_max_value(max_value)
+        self._method.change_optimism(gamma, max_value)
+        self._bound_values()
+
+    def _changed_by_transfer(self) -> np.ndarray:
+        """The pairs for which transfer has changed: all for a new prior, or those, not known, that may have new instances."""
+        if self._method.use == "prior":
+            if self._method.prior_version() != self._prior_version:
+                self._prior_version = self._method.prior_version()
+                self._bound_values()
+            return self.model.renew_prior()
+        changed = self._method.changed(self.model.known.reshape(self.task.n_actions, -1))
+        if isinstance(changed, np.ndarray):
+            return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
+        return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
+
+    def _bound_values(self) -> None:
+        """Take over what a prior bounds values by."""
+        if self._method.use == "prior":
+            self.planner.set_upper(self._method.value_bound())
+
+    def _search(self) -> None:
+        """Let places be worth what they are after the visits to them, as long as nothing has been found."""
+        # Transferred instances tell what is where; a prior does so by its bound on values.
+        if not self.model.searches or self.rewards.differ or self.transfers or self.model.n_instances == 0:
+            self.planner.set_worth(None)
+            return
+        visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)
+        self.planner.set_worth(worth_after_visits(self.planner.upper, visits, self.rewards.lowest, self.mdp.gamma))
+
+    @property
+    def transfers(self) -> bool:
+        """Whether there are pairs that transferred instances model."""
+        return bool((self.mdp.arrays.modelled & ~self.model.known).any())
+
     def _exploit(self, state: np.ndarray) -> int:
         """The best of what is known: nobody has seen what the others do.
 
         By the learner's own values; of an agent that has only been given others' transitions by values without optimism, as it
         has not tried what it hopes for.
         """
-        prediction = self._evaluate(state, None if self.has_acted else self._values_without_optimism())
+        prediction, _, _ = self._evaluate(state, None if self.has_acted else self._values_without_optimism())
         eligible = prediction.weight >= self.model.exploration_threshold
         if not eligible.any():
             eligible = prediction.modelled
@@ -220,34 +338,6 @@ class FittedRMaxAgent:
             self._evaluate(np.ascontiguousarray(state, dtype=np.float64), values)
             return self._q.q.copy()
 
-    def _evaluate(self, state: np.ndarray, values: np.ndarray | None = None) -> Prediction:
-        prediction, _ = self.model.predict_at(state)
-        self._q.compute(prediction, state, self._value_function(self.planner.values if values is None else values))
-        return prediction
-
-    def _value_function(self, values: np.ndarray) -> ValueFunction:
-        return ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.worth)
-
-    def update(
-        self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
-    ) -> None:
-        """Learn from one transition, and plan.
-
-        :param state: unit coordinates; ``next_state``: the same
-        :param action: from 0 on
-        :param terminated: whether ``next_state`` is a terminal state; a time limit is none
-        :param environment: see :meth:`act`
-        """
-        with self._lock:
-            self.has_acted = True
-            self.rewards.note(reward, terminated)
-            self._widen(reward)
-            if self.transfer is not None:
-                self.transfer.environment = environment
-            self.promises.pay(environment, reward, self.mdp.gamma)
-            self._take_in(state, action, reward, next_state, terminated)
-            self._plan(SWEEPS_A_STEP)
-
     def take_in(self, transitions: Sequence[Transition]) -> None:
         """Learn from past transitions of the task, in their order, and plan until little changes.
 
@@ -255,8 +345,7 @@ class FittedRMaxAgent:
         """
         with self._lock:
             for _, _, reward, _, terminated in transitions:
-                self.rewards.note(reward, terminated)
-                self._widen(reward)
+                self._note_reward(reward, terminated)
             self._follow_rewards()
             self._take_in_all(transitions)
             self._plan(SWEEPS_AT_EPISODE_END)
@@ -271,34 +360,9 @@ class FittedRMaxAgent:
                 self.model.add(state, action, reward, next_state, terminated)
                 continue
             self._take_in(state, action, reward, next_state, terminated)
-            if terminated and self.transfer is not None:
-                self.transfer.end_episode(truncated=False)
+            if terminated:
+                self._method.end_episode(truncated=False)
         self._outdated = [self.model.outdated()]
-
-    def _take_in(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
-        """Give a transition to the model and to the transfer method."""
-        if self.transfer is not None and self.transfer.use == "prior":
-            effect, leverage = self.model.predict_alone(state, action)
-            self.transfer.note_prediction(self.correspondence.effects(effect), leverage)
-        self._outdated.append(self.model.add(state, action, reward, next_state, terminated))
-        if self.transfer is not None:
-            before, after = self.correspondence.states(state), self.correspondence.states(next_state)
-            self.transfer.observe(before, action, reward, after, terminated)
-
-    def end_episode(self, truncated: bool, environment: int = 0) -> None:
-        """Plan on while no action is due.
-
-        :param truncated: whether the episode ended by its time limit
-        :param environment: see :meth:`act`
-        """
-        with self._lock:
-            self.rewards.n_truncated += bool(truncated)
-            self.promises.end_episode(environment)
-            if self.transfer is not None:
-                self.transfer.environment = environment
-                self.transfer.end_episode(truncated)
-            self._outdated.append(self.model.end_episode())
-            self._plan(SWEEPS_AT_EPISODE_END)
 
     def rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
         """Compute all anew in other unit coordinates; an interrupt, or an error, leaves all as it was.
@@ -306,49 +370,32 @@ class FittedRMaxAgent:
         :param scaling: raw <-> unit coordinates from now on; ``bounds``: as of :class:`~sb3_combrel.common.task.Task`
         """
         with self._lock:
-            attributes, generator = dict(vars(self)), self.rng.bit_generator.state
-            of_transfer = {} if self.transfer is None else self.transfer.get_state()
+            attributes, generator, of_transfer = dict(vars(self)), self.rng.bit_generator.state, self._method.get_state()
             try:
                 self._rescale(scaling, bounds)
             except BaseException:
                 vars(self).update(attributes)
-                if self.transfer is not None:
-                    self._bind()
-                    self.transfer.set_state(of_transfer)
+                self._bind()
+                self._method.set_state(of_transfer)
                 self.rng.bit_generator.state = generator
                 raise
 
     def _rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
         before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
         # What a transfer method has learned is about the bounds.
-        same = self.transfer is not None and bounds == self.task.shared_scaling
-        learned = self.transfer.get_state() if self.transfer is not None and same else {}
+        learned = self._method.get_state() if bounds == self.task.shared_scaling else {}
         self.task = replace(self.task, scaling=scaling, bounds=bounds)
         self._bind()
         self._build(self.mdp.width)
-        if self.transfer is not None and learned:
-            self.transfer.set_state(learned)
+        if learned:
+            self._method.set_state(learned)
         self._widen(min(0.0, lowest) / LONGEST_PLAN)
-        self._take_in_all(
-            [
-                (
-                    scaling.to_unit(before.to_raw(state)),
-                    action,
-                    reward,
-                    scaling.to_unit(before.to_raw(next_state)),
-                    terminated,
-                )
-                for state, action, reward, next_state, terminated in transitions
-            ],
-            observed=bool(learned),
-        )
-        self._plan(SWEEPS_AT_EPISODE_END)
 
-    def prepare(self) -> None:
-        """Model what is transferred before the first step, and plan until the values have converged."""
-        with self._lock:
-            if self.transfer is not None and self.model.n_instances == 0:
-                self._plan(SWEEPS_AT_EPISODE_END)
+        def moved(state: np.ndarray) -> np.ndarray:
+            return scaling.to_unit(before.to_raw(state))
+
+        self._take_in_all([(moved(s), a, r, moved(n), t) for s, a, r, n, t in transitions], observed=bool(learned))
+        self._plan(SWEEPS_AT_EPISODE_END)
 
     def plan_anew(self) -> None:
         """Plan from the upper bounds on: what values were before does not count."""
@@ -356,73 +403,17 @@ class FittedRMaxAgent:
             self.planner.restore(self.planner.upper)
             self._plan(SWEEPS_AT_EPISODE_END)
 
-    def _plan(self, max_sweeps: int) -> None:
-        """Update the rows of the pairs that changed, and sweep over the grid."""
-        began = perf_counter() if self.timed else None
-        self._follow_rewards()
-        if self._model_transfer is not None:
-            self._outdated.append(self._changed_by(self._model_transfer))
-        pairs = self._outdated[0] if len(self._outdated) == 1 else np.unique(np.concatenate([NO_PAIRS, *self._outdated]))
-        for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
-            self.model.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
-        self._outdated.clear()
-        self._search()
-        self.n_sweeps += self.planner.sweep(max_sweeps)
-        self._cautious = None
-        if began is not None:
-            self.planning_seconds += perf_counter() - began
-
-    def _search(self) -> None:
-        """Let places be worth what they are after the visits to them, as long as nothing has been found."""
-        # Transferred instances tell what is where; a prior does so by its bound on values.
-        if not self.model.searches or self.rewards.differ or self.transfers or self.model.n_instances == 0:
-            self.planner.set_worth(None)
-            return
-        visits = self.model.own_weight.reshape(self.task.n_actions, -1).sum(axis=0)
-        self.planner.set_worth(worth_after_visits(self.planner.upper, visits, self.rewards.lowest, self.mdp.gamma))
-
-    @property
-    def transfers(self) -> bool:
-        """Whether there are pairs that transferred instances model."""
-        return bool((self.mdp.arrays.modelled & ~self.model.known).any())
-
-    def _follow_rewards(self) -> None:
-        """Plan with other optimism, or another discount, if what rewards have shown asks for it."""
-        gamma, max_value = self.rewards.gamma, self.rewards.max_value
-        if gamma == self.mdp.gamma and max_value == self.planner.bounds[1]:
-            return
-        if gamma != self.mdp.gamma:
-            self.mdp.gamma = gamma
-            self._outdated.append(np.flatnonzero(self.mdp.arrays.modelled))
-        self.planner.set_max_value(max_value)
-        if self.transfer is not None:
-            self.transfer.change_optimism(gamma, max_value)
-            if self.transfer.use == "prior":
-                self.planner.set_upper(self.transfer.value_bound())
-
-    def _changed_by(self, transfer: Transfer) -> np.ndarray:
-        """The pairs for which transfer has changed: all for a new prior, or those, not known, that may have new instances."""
-        if transfer.use == "prior":
-            if transfer.prior_version() != self._prior_version:
-                self._prior_version = transfer.prior_version()
-                self.planner.set_upper(transfer.value_bound())
-            return self.model.renew_prior()
-        changed = transfer.changed(self.model.known.reshape(self.task.n_actions, -1))
-        if isinstance(changed, np.ndarray):
-            return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
-        return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
-
-    def _widen(self, reward: float) -> None:
-        """Keep the lower bound of the values below what the worst reward seen could add up to."""
-        low, high = self.planner.bounds
-        self.planner.bounds = (min(low, min(0.0, high) + LONGEST_PLAN * min(0.0, reward)), high)
+    def reseed(self, rng: np.random.Generator) -> None:
+        """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
+        # The generator itself stays the same, as the transfer method has it too.
+        self.rng.bit_generator.state = rng.bit_generator.state
+        self._prediction_rng = rng.spawn(1)[0]
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What has been learned, float64 arrays by name; only the number of rows of arrays with several axes ever changes."""
         with self._lock:
-            of_transfer = {} if self.transfer is None else self.transfer.get_state()
             return {
-                **{f"transfer_{name}": array for name, array in of_transfer.items()},
+                **{f"{OF_TRANSFER}{name}": array for name, array in self._method.get_state().items()},
                 **self.model.get_state(),
                 "values": self.planner.values.copy(),
                 "lowest_value": np.array([self.planner.bounds[0]]),
@@ -440,28 +431,32 @@ class FittedRMaxAgent:
             self.rewards.set_state(state["rewards"])
             self._bind()
             self._build()
-            if self.transfer is not None:
-                prefix = "transfer_"
-                self.transfer.set_state({name.removeprefix(prefix): state[name] for name in state if name.startswith(prefix)})
+            of_transfer = [name for name in state if name.startswith(OF_TRANSFER)]
+            self._method.set_state({name.removeprefix(OF_TRANSFER): state[name] for name in of_transfer})
             self.model.set_state(state)
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
-            if self.transfer is not None and self.transfer.use == "prior":
-                self.planner.set_upper(self.transfer.value_bound())
+            self._bound_values()
             self.planner.restore(state["values"])
             self._search()
             self.promises.restore(state["promises"])
             self.has_acted, self._cautious = bool(state["has_acted"][0] > 0.5), None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=threading.RLock())
+
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""
         with self._lock:
             modelled, known = float(self.mdp.arrays.modelled.mean()), float(self.model.known.mean())
-            figures = {
+            return {
                 "model/instances": self.model.n_instances,
                 "model/known": known,
                 "model/transferred": modelled - known,
                 "model/optimistic": 1.0 - modelled,
                 "planner/max_value": self.planner.bounds[1],
                 "planner/gamma": self.mdp.gamma,
+                **self._method.statistics(),
             }
-            return figures if self.transfer is None else {**figures, **self.transfer.statistics()}

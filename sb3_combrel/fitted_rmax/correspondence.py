@@ -69,3 +69,15 @@ class OfLearner:
 
     def note_use(self, given: TransferredInstances) -> None:
         self._transfer.note_use(given._replace(effect=self._correspondence.effects(given.effect)))
+
+
+class NoTransfer(Transfer):
+    """What an agent without a transfer method speaks to: it hears everything, and knows nothing."""
+
+    use = "actions"
+
+    def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
+        pass
+
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
+        return TransferredInstances.empty(len(actions), states.shape[1])
