@@ -78,7 +78,7 @@ class StateScaling:
         """As :meth:`from_space`, but the limits themselves, some of which may be infinite: (low, high)."""
         n_variables = _count_variables(space)
         if bounds is not None:
-            return _check_bounds(bounds, n_variables)
+            return check_bounds(bounds, n_variables)
         low, high = (np.asarray(limit, dtype=np.float64) for limit in (space.low, space.high))  # type: ignore[attr-defined]
         return low, high
 
@@ -166,8 +166,8 @@ def _count_variables(space: spaces.Space[Any]) -> int:
     return int(space.shape[0])
 
 
-def _check_bounds(bounds: Bounds, n_variables: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(low, high)`` of the ``bounds`` argument, each broadcast to one number a variable."""
+def check_bounds(bounds: Bounds, n_variables: int) -> Limits:
+    """``(low, high)`` of the ``bounds`` argument, each broadcast to one number a variable; a ValueError if they are wrong."""
     wrong = f"bounds must be (low, high), each a finite number or a sequence of {n_variables} finite numbers, got {{}}"
     try:
         low, high = (np.array(bound, dtype=np.float64) for bound in bounds)

@@ -212,24 +212,26 @@ class SourceInstances:
         action_names: Sequence[str] = (),
         n_actions: int | None = None,
         bounds: Bounds | None = None,
+        periodic: Sequence[bool] | None = None,
     ) -> SourceInstances:
         """Take the transitions of a table with a row for each step, such as a controller's log.
 
         Columns: each state variable, by its name; ``action``, numbers from 0 on, or names; ``reward``; ``terminated``, whether
         the step reached a terminal state (or ``done``, with ``truncated`` for time limits; without either no step did); and
         where the step led, ``next_`` and the name of each variable. Without these columns a step leads to the state of the
-        next row: of the same ``episode``, if there is such a column, and otherwise up to an end. A last state of an episode
-        is a row with an empty ``action``.
+        next row, up to an end, and of the same ``episode`` if there is such a column. A last state of an episode is a row with
+        an empty ``action``. Where the whole numbers of the table's index say that rows were left out, no step leads across.
 
         :param table: path of a CSV file, or a pandas DataFrame
         :param state_names: columns that are state variables, in their order; None: all that are not one of those above
         :param action_names: names of the actions, in the order of their numbers
         :param n_actions: number of actions; None: one for each name, or up to the largest number
         :param bounds: ``(low, high)`` of the states, raw units; None: their range
+        :param periodic: which state variables are angles or the like, one bool for each; ``bounds`` are one period apart then
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if a column is missing, or holds something else
         """
-        return cls(*tables.read_table(table, state_names, action_names, n_actions, bounds))
+        return cls(*tables.read_table(table, state_names, action_names, n_actions, bounds, periodic))
 
     def to_table(self) -> pd.DataFrame:
         """The instances as a pandas DataFrame that :meth:`from_table` reads; ``.to_csv(path, index=False)`` writes it."""

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sb3_combrel.common.scaling import Bounds
+from sb3_combrel.common.periodic import check_periods, periodic_flags
+from sb3_combrel.common.scaling import Bounds, check_bounds
 from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.sources.transitions import Floats, Transitions
 
@@ -23,7 +25,8 @@ Table: TypeAlias = "str | os.PathLike[str] | pd.DataFrame"
 ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE = "action", "reward", "terminated", "done", "truncated", "episode"
 NEXT, INDEX = "next_", "Unnamed: "
 _NO_STATES = {ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE}
-_TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0", "nan", "", "none")
+_TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0", "nan", "", "none", "<na>")
+_LIKE_ENDS = {"terminal", "terminated", "done", "last", "timeout", "time_out", "truncated", "end", "episode_end", "episode"}
 
 
 def read_table(
@@ -32,11 +35,15 @@ def read_table(
     action_names: Sequence[str],
     n_actions: int | None,
     bounds: Bounds | None,
+    periodic: Sequence[bool] | None,
 ) -> Transitions:
     """Read the transitions of a table; for the parameters see :meth:`SourceInstances.from_table`."""
     frame = _read(table)
     if len(frame) == 0:
         raise ValueError(f"the table has no rows, its columns are {[str(name) for name in frame.columns]}")
+    if EPISODE in frame.index.names:
+        frame = frame.reset_index(level=EPISODE)
+    _check_columns(frame, state_names or ())
     for name in (ACTION, REWARD, *(state_names or ())):
         _require(frame, name)
     names = _state_names(frame) if state_names is None else tuple(state_names)
@@ -45,16 +52,17 @@ def read_table(
         raise ValueError(
             f"the table has no column of a state variable, its columns are {[str(name) for name in frame.columns]}"
         )
-    frame = frame.reset_index(drop=True)
+    flags = periodic_flags(periodic, len(names))
+    check_periods(np.array(flags) & (bounds is None))
     steps, next_states = _with_next_states(frame, names)
     states = _numbers(steps, names)
     actions = _actions(steps, action_names)
     if n_actions is None:
         n_actions = len(action_names) or int(actions.max(initial=0)) + 1
-    low, high = (-np.inf, np.inf) if bounds is None else bounds
-    limits = np.full(len(names), low, dtype=np.float64), np.full(len(names), high, dtype=np.float64)
+    unknown = np.full(len(names), np.inf)
+    limits = (-unknown, unknown) if bounds is None else check_bounds(bounds, len(names))
     columns = states, actions, _numbers(steps, [REWARD])[:, 0], next_states, _terminated(steps)
-    given = {"state_names": names, "action_names": tuple(action_names)}
+    given = {"state_names": names, "action_names": tuple(action_names), "periodic": flags}
     origin = {"env": None, "recorder": os.path.basename(table) if isinstance(table, str | os.PathLike) else "table"}
     return Transitions.within(limits, columns, n_actions, given, origin)
 
@@ -77,6 +85,20 @@ def _read(table: Table) -> pd.DataFrame:
                 f"pandas.read_csv(path, sep={separator!r}), and pass that table (where numbers have a comma, with decimal=',')"
             )
     return frame
+
+
+def _check_columns(frame: pd.DataFrame, state_names: Sequence[str]) -> None:
+    """:raises ValueError: if columns are not told apart by text, or one seems to say where episodes end, by another name"""
+    columns = frame.columns.tolist()
+    if len(set(columns)) < len(columns) or not all(isinstance(name, str) for name in columns):
+        raise ValueError(f"the columns of the table must have different names, all of them text, got {columns}")
+    if not {TERMINATED, DONE, TRUNCATED, EPISODE}.intersection(columns):
+        for name in columns:
+            if name not in state_names and name.strip().lower().removeprefix("is_").removesuffix("s") in _LIKE_ENDS:
+                raise ValueError(
+                    f"the table has a column {name!r}, and none of {TERMINATED!r}, {DONE!r}, {TRUNCATED!r} and {EPISODE!r}: "
+                    f"if it says where episodes end, call it {TERMINATED!r}, or {TRUNCATED!r}, and otherwise leave it out"
+                )
 
 
 def _state_names(frame: pd.DataFrame) -> tuple[str, ...]:
@@ -119,23 +141,41 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
         return frame, _numbers(frame, following)
     ends = _flags(frame, TERMINATED) | _flags(frame, DONE) | _flags(frame, TRUNCATED)
     acts = frame[ACTION].notna().to_numpy()
+    # The row after an end is its last state only if nothing was done there.
+    follows = _follow(frame) & (~ends[:-1] | ~acts[1:])
     if EPISODE in frame.columns:
-        episode = frame[EPISODE].to_numpy()
-        goes_on = np.append(episode[1:] == episode[:-1], False)
-    else:
-        # Without numbers of episodes the row after an end is its last state only if nothing was done there.
-        goes_on = np.append(~ends[:-1] | ~acts[1:], False) & acts
+        episode = frame[EPISODE]
+        if episode.isna().any():
+            raise ValueError(f"column {EPISODE!r} must say of every row which episode it is of, got none in some")
+        follows &= episode.to_numpy()[1:] == episode.to_numpy()[:-1]
+    goes_on = np.append(follows, False)
     # The last step before a time limit may be left out; where an end was reached must be known.
     lost = np.flatnonzero(_terminated(frame) & acts & ~goes_on)
     if len(lost):
         raise ValueError(
-            f"the table does not say in which state the episode that terminates in row {lost[0]} arrived: add columns "
-            f"{following}, or, after that row, one with this state and an empty action"
+            f"the table does not say in which state the episode that terminates in row {frame.index[lost[0]]} arrived: add "
+            f"columns {following}, or, after that row, one with this state and an empty action"
         )
     chosen = np.flatnonzero(acts & goes_on)
     if len(chosen) == 0:
         raise ValueError(f"the table has no transition: it needs columns {following}, or two rows of one episode")
     return frame.iloc[chosen], _numbers(frame.iloc[chosen + 1], names)
+
+
+def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:
+    """Whether each row but the first was made right after the one above it: some may have been left out, by their index."""
+    import pandas as pd
+
+    if frame.index.nlevels > 1 or not pd.api.types.is_integer_dtype(frame.index.dtype):
+        return np.ones(len(frame) - 1, dtype=np.bool_)
+    apart = np.diff(frame.index.to_numpy())
+    found, times = np.unique(apart, return_counts=True)
+    if len(apart) > 0 and (found[times.argmax()] < 1 or 2 * times.max() < len(apart)):
+        raise ValueError(
+            "the table's index must rise evenly where rows follow each other, as it does not: sort the rows, or, if they are "
+            "in order, number them: table.reset_index(drop=True)"
+        )
+    return apart == (found[times.argmax()] if len(apart) else 1)
 
 
 def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> Floats:

@@ -155,3 +155,78 @@ def test_a_file_that_is_not_there_is_named_with_its_folder(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileNotFoundError, match=re.escape(f"no file lgo.csv, looked for in {tmp_path}")):
         SourceInstances.from_table("lgo.csv")
+
+
+def log(**columns):
+    """Seven rows of a log without columns of next states."""
+    return pd.DataFrame({"x": 0.1 * np.arange(7), "action": 0, "reward": -1.0, **columns})
+
+
+def effects(table, **arguments):
+    """The effects of the transitions of a table, rounded."""
+    source = SourceInstances.from_table(table, **arguments)
+    return np.round(source.next_states - source.states, 6)[:, 0].tolist()
+
+
+def test_no_transition_leads_across_rows_that_were_left_out():
+    table = log()
+    assert effects(table) == [0.1] * 6
+    assert effects(table.drop(index=[3, 4])) == [0.1] * 3
+    assert effects(pd.concat([table, table + {"x": 5.0, "action": 0, "reward": 0.0}])) == [0.1] * 12
+    with pytest.raises(ValueError, match="sort the rows"):
+        SourceInstances.from_table(table.sample(frac=1.0, random_state=0))
+    # Every second row of a recording, and times of them: nothing says that some are missing.
+    assert effects(table.iloc[::2]) == [0.2] * 3
+    assert effects(table.set_index(pd.Index(20 * np.arange(7)))) == [0.1] * 6
+
+
+def test_an_end_is_one_whatever_the_numbers_of_episodes_say():
+    ends = [False] * 3 + [True] + [False] * 3
+    assert effects(log(episode=0, truncated=ends)) == [0.1] * 5
+    with pytest.raises(ValueError, match="terminates in row 3 arrived"):
+        SourceInstances.from_table(log(episode=0, terminated=ends))
+    arrived = log(episode=0, terminated=ends)
+    arrived["action"] = arrived["action"].astype(float).mask(arrived.index == 4)
+    assert effects(arrived) == [0.1] * 5
+
+
+def test_episodes_may_be_an_index_and_every_row_needs_one():
+    table = log(episode=[0] * 4 + [1] * 3, step=[0, 1, 2, 3, 0, 1, 2]).set_index(["episode", "step"])
+    assert effects(table) == [0.1] * 5
+    with pytest.raises(ValueError, match="'episode' must say of every row"):
+        SourceInstances.from_table(log(episode=[0] + [None] * 6))
+
+
+@pytest.mark.parametrize("name", ["terminal", "Done", "is_last", "timeouts"])
+def test_a_column_that_seems_to_say_where_episodes_end_is_not_left_out_without_a_word(name):
+    with pytest.raises(ValueError, match=f"has a column '{name}', and none of 'terminated'"):
+        SourceInstances.from_table(log(**{name: 0.0}), state_names=["x"])
+    assert SourceInstances.from_table(log(**{name: 0.0}), state_names=["x", name]).n_variables == 2
+
+
+@pytest.mark.parametrize("columns", [["x", "action", "reward", 3], ["x", "action", "reward", "x"]])
+def test_columns_are_told_apart_by_text(columns):
+    with pytest.raises(ValueError, match="must have different names, all of them text"):
+        SourceInstances.from_table(pd.DataFrame(np.zeros((3, 4)), columns=columns))
+
+
+def test_an_angle_of_a_table_is_one_with_its_period():
+    table = log(x=[3.0, 3.1, -3.1, -3.0, 2.9, 3.0, 3.1])
+    around = (-np.pi, np.pi)
+    source = SourceInstances.from_table(table, bounds=around, periodic=[True])
+    assert source.periodic == (True,) and source.low[0] == -np.pi
+    with pytest.raises(ValueError, match="periodic variables must have finite bounds"):
+        SourceInstances.from_table(table, periodic=[True])
+    with pytest.raises(ValueError, match="periodic must be None or 1 booleans"):
+        SourceInstances.from_table(table, bounds=around, periodic=[True, False])
+
+
+@pytest.mark.parametrize("bounds", [(100.0, -100.0), (np.nan, 1e40), (0.0, [1.0, 2.0])])
+def test_bounds_of_a_table_are_checked(bounds):
+    with pytest.raises(ValueError, match="bounds"):
+        SourceInstances.from_table(log(), bounds=bounds)
+
+
+def test_flags_may_be_missing_in_columns_that_allow_it():
+    table = log(terminated=pd.array([False] * 6 + [pd.NA], dtype="boolean"))
+    assert len(SourceInstances.from_table(table)) == 6
