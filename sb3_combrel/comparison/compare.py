@@ -113,12 +113,14 @@ def compare(
         Results do not depend on it.
     :param progress_bar: show which runs are complete; None: in a terminal or notebook
     :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from
-        there. Where the source of the environment's class or function, or that of a method's class, has changed, it is refused
+        there. Where the source of the environment's class or function, or that of a method's class, has changed, it is
+        refused, as where that of a class which these inherit from has. What a function calls is not noticed, such as the
+        class of the environment that it makes: take another folder then
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
     :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument
     :raises ValueError: if an argument is wrong or a method does not fit the task, before any run; or if a run was too short
-        for a single episode; or if the folder has runs of other settings
+        for a single episode; or if the folder has runs of other settings, or a method does not say what its arguments are
     :raises FileNotFoundError: if a source does not exist
     :raises OSError: if the folder cannot be written to
     :raises ~sb3_combrel.runs.runner.JobError: if a run failed
@@ -148,7 +150,8 @@ def compare(
             in_use[CONTROL], first[CONTROL] = _try_out(run), run
         except ValueError as error:
             warnings.warn(f"there is no control ({error}): controls=False leaves it out without a warning", stacklevel=2)
-    first = {method: replace(run, in_use=settings_of(in_use[method])) for method, run in first.items()}
+    if folder is not None:
+        first = {method: replace(run, in_use=_kept_settings(method, in_use[method])) for method, run in first.items()}
     runs = [replace(run, seed=seed, is_shown=seed == numbers[0]) for run in first.values() for seed in numbers]
     console = Console(stderr=True)
     shown = console.is_terminal or console.is_jupyter if progress_bar is None else progress_bar
@@ -180,6 +183,14 @@ def _try_out(run: ComparedRun) -> Transfer | None:
         # Subclasses may ask for more than a message.
         kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
         raise kind(f"{run.method}: {error}") from error
+
+
+def _kept_settings(method: str, transfer: Transfer | None) -> Any:
+    """The settings of a method, by which its runs in a folder are told from others; ValueError if it does not say them."""
+    try:
+        return settings_of(transfer)
+    except ValueError as error:
+        raise ValueError(f"{method}: {error}") from error
 
 
 def settings_of(transfer: Transfer | None) -> Any:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+import json
 import re
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -196,8 +198,11 @@ def chosen_on_purpose() -> Iterator[None]:
 def described(value: Any) -> Any:
     """Return as JSON: functions by name and arguments, transfers by arguments, arrays by digest, others by repr.
 
-    Functions and classes that are not this package's have a digest of their source behind their name. Of a lambda the names
-    and constants count, as it has no name that tells it from others.
+    Functions and classes that are not this package's have a digest of their source behind their name, or of their code where
+    there is no source, as in a notebook. Of a lambda the names and constants count, as it has no name that tells it from
+    others.
+
+    :raises ValueError: if a transfer method does not say what its arguments are
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value
@@ -211,8 +216,10 @@ def described(value: Any) -> Any:
     if isinstance(value, Transfer):
         try:
             return {_name_of(type(value)): described(value.arguments())}
-        except AttributeError:  # a third party's, that does not keep them
-            return _name_of(type(value))
+        except AttributeError as error:
+            name = type(value).__name__
+            told = f"runs of {name} with other arguments cannot be told apart ({error})"
+            raise ValueError(f"{told}: give it the method arguments(), or attributes of these names") from error
     if isinstance(value, SourceInstances):
         arrays = (value.states, value.actions, value.rewards, value.next_states, value.terminated)
         return f"{len(value)} instances {_digest(*arrays)}"
@@ -226,7 +233,11 @@ def described(value: Any) -> Any:
         return _name_of(value)
     if type(value).__repr__ is object.__repr__:
         return _name_of(type(value))
-    # Another process has the same objects elsewhere.
+    return _plain_repr(value)
+
+
+def _plain_repr(value: Any) -> str:
+    """The repr of an object without its address: another process has the same objects elsewhere."""
     return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
 
 
@@ -246,15 +257,48 @@ def _content_of(function: FunctionType) -> list[Any]:
 
 
 def _name_of(defined: Any) -> str:
-    """Module and name; and a digest of the source, if there is any, where this package's version says nothing of it."""
+    """Module and name; and a digest of the source, or of the code, where this package's version says nothing of it.
+
+    Of a class those that it inherits from count as well, but for the standard library's.
+    """
     name = f"{defined.__module__}.{defined.__qualname__}"
     if name.partition(".")[0] in OURS:
         return name
+    parts = [each for each in getattr(defined, "__mro__", (defined,)) if not _has_version(each)]
+    sources = [source for each in parts if (source := _source_of(each))]
+    return f"{name} {hashlib.sha256(''.join(sources).encode()).hexdigest()[:8]}" if sources else name
+
+
+def _has_version(defined: Any) -> bool:
+    """Whether something changes only with a version of this package, of those that it rests on, or of Python."""
+    return str(defined.__module__).partition(".")[0] in (*OURS, *sys.stdlib_module_names)
+
+
+def _source_of(defined: Any) -> str:
+    """The source of a function or class; or else its code, as of what is typed in; or "" for compiled ones."""
     try:
-        source = inspect.getsource(defined)
+        return inspect.getsource(defined)
     except (OSError, TypeError):
-        return name
-    return f"{name} {hashlib.sha256(source.encode()).hexdigest()[:8]}"
+        code = _code_of(defined)
+        return json.dumps(code) if isinstance(code, dict | list) else ""
+
+
+def _code_of(value: Any) -> Any:
+    """What a function or class is made of, as JSON: instructions, names and constants; of a class its functions and values."""
+    value = getattr(value, "__func__", value)
+    if isinstance(value, type):
+        own = {name: each for name, each in vars(value).items() if isinstance(each, FunctionType) or name[:2] != "__"}
+        return {name: _code_of(each) for name, each in own.items()}
+    if isinstance(value, property):
+        return [_code_of(each) for each in (value.fget, value.fset, value.fdel)]
+    if isinstance(value, FunctionType):
+        return [_code_of(each) for each in (value.__code__, value.__defaults__, value.__kwdefaults__)]
+    if isinstance(value, CodeType):
+        return [value.co_code.hex(), value.co_names, [_code_of(each) for each in value.co_consts]]
+    if isinstance(value, np.ndarray):
+        return _digest(value)
+    # Another process has sets in another order.
+    return sorted(map(_plain_repr, value)) if isinstance(value, set | frozenset) else _plain_repr(value)
 
 
 def _digest(*arrays: np.ndarray) -> str:

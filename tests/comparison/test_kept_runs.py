@@ -4,7 +4,9 @@ import importlib
 import json
 import linecache
 import os
+import subprocess
 import sys
+import types
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from helpers.dashboard import NamedWalk
+from helpers.own_method import Mine
 from helpers.walk import Walk, walk_source
 
 from sb3_combrel import COMBREL, MappingSet, SourceInstances
@@ -183,6 +186,79 @@ def test_an_edited_environment_is_another(tmp_path, monkeypatch):
     one, again, other = settings_of(1), settings_of(1), settings_of(22)
     assert one == again and one[0] == one[1] and one[0] != other[0] and one[1] != other[1]
     assert described(ComparedRun) == "sb3_combrel.comparison.compare.ComparedRun", "the version tells"
+
+
+def test_an_edited_base_class_makes_another_environment(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_base.py").write_text("class Base:\n    step_size = 1\n")
+    (tmp_path / "own_walk.py").write_text("from own_base import Base\n\nclass Mine(Base):\n    pass\n")
+    one = importlib.import_module("own_walk").Mine
+    before = described(one)
+    assert described(one) == before
+    (tmp_path / "own_base.py").write_text("class Base:\n    step_size = 22\n")
+    linecache.clearcache()
+    assert described(one) != before
+
+
+TYPED_IN = """
+import abc
+
+class Mine(abc.ABC):
+    step_size = {step}
+
+    def reset(self):
+        return self.step_size in {{"one", "two", "three"}}
+
+    @staticmethod
+    def step(action):
+        return [each {sign} action for each in (1, 2)]
+
+    @property
+    def far(self):
+        return {far}
+
+def make(limit={limit}):
+    return Mine()
+"""
+
+
+def typed_in(step=1, sign="+", far=5, limit=9):
+    """A class and a function without a source, as in a notebook."""
+    module = types.ModuleType("notebook")
+    exec(TYPED_IN.format(step=step, sign=sign, far=far, limit=limit), module.__dict__)
+    return module.Mine, module.make
+
+
+def test_what_is_typed_in_is_known_by_its_code(monkeypatch):
+    described_as = [described(each) for each in typed_in()]
+    assert described_as == [described(each) for each in typed_in()]
+    for change in (dict(step=2), dict(sign="-"), dict(far=6)):
+        assert described(typed_in(**change)[0]) != described_as[0], change
+    assert described(typed_in(limit=8)[1]) != described_as[1]
+    assert described(np.add.reduce).endswith(".reduce") and described(len) == "builtins.len", "compiled code has none to digest"
+    code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import *; print(*map(described, typed_in()), sep='|')"
+    for seed in ("1", "2"):
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        call = [sys.executable, "-c", code]
+        made = subprocess.run(call, env=environment, capture_output=True, text=True, check=True)
+        assert made.stdout.strip().split("|") == described_as
+
+
+class Unsaid(Mine):
+    """Keeps its argument under another name."""
+
+    def __init__(self, worth):
+        super().__init__(worth)
+
+
+def test_a_method_that_does_not_say_its_arguments_is_not_kept(carried_out, tmp_path):
+    call = dict(methods={"none": None, "mine": Unsaid(-2.0)}, controls=False)
+    quietly(**call)
+    carried_out.clear()
+    message = r"^mine: runs of Unsaid with other arguments cannot be told apart \(.*worth.*\): give it the method arguments\(\)"
+    with pytest.raises(ValueError, match=message):
+        quietly(**call, output=tmp_path)
+    assert not carried_out
 
 
 @pytest.mark.parametrize("kind", ["file", "below a file", "number", "others"])
