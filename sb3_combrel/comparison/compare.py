@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_combrel.common.checks import as_count, check_boolean, check_count, check_finite
 from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.common.suggestions import did_you_mean
-from sb3_combrel.comparison.controls import CONTROL, name_of_control, random_control
+from sb3_combrel.comparison.controls import CONTROL, is_control, name_of_control, random_control
 from sb3_combrel.comparison.result import CompareResult, evaluate
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
@@ -143,6 +143,9 @@ def compare(
 
     first = {method: first_run(method, transfer) for method, transfer in methods.items()}
     in_use = {method: _try_out(run) for method, run in first.items()}
+    if CONTROL in in_use and not is_control(in_use[CONTROL]):
+        wanted = f"methods must call none but a mapping drawn at random {CONTROL!r}, which is the control's name"
+        raise ValueError(f'{wanted}, got {in_use[CONTROL]!r}: give it another one, or take TIMBREL(source, "random")')
     control = random_control(in_use) if controls else None
     if control is not None:
         run = first_run(CONTROL, control)

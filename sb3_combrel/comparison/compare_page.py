@@ -21,8 +21,9 @@ def compare_page(result: CompareResult, variables: Sequence[VariablePair] | None
     :raises ValueError: if they do not fit the task
     """
     n_runs = len(next(iter(result.curves.values())).returns)
+    role = "compared with" if result.baseline in result.reports else "without"
     facts = [
-        f"{n_runs} runs of each method, {result.n_steps:,} environment steps that all of them have; without: {result.baseline}"
+        f"{n_runs} runs of each method, {result.n_steps:,} environment steps that all of them have; {role}: {result.baseline}"
     ]
     sections = [_curves(result), _measures(result)]
     if result.reports:

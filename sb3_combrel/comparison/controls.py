@@ -18,7 +18,12 @@ _SAME = ("use", "source_breadth", "transfer_terminals", "breadth", "breadth_deca
 
 def name_of_control(in_use: Mapping[str, Transfer | None]) -> str:
     """Return the name of the method that is a mapping drawn at random, whoever has added it; or :data:`CONTROL`."""
-    return next((name for name, each in in_use.items() if isinstance(each, TIMBREL) and each.mapping == "random"), CONTROL)
+    return next((name for name, each in in_use.items() if is_control(each)), CONTROL)
+
+
+def is_control(method: Transfer | None) -> bool:
+    """Whether a method is a mapping drawn at random."""
+    return isinstance(method, TIMBREL) and method.mapping == "random"
 
 
 def random_control(in_use: Mapping[str, Transfer | None]) -> TIMBREL | None:

@@ -77,7 +77,7 @@ class CompareResult:
 
     @property
     def sentence(self) -> str:
-        """Whether transfer helped, in one plain sentence for each method."""
+        """Whether transfer helped, in one plain sentence for each method; or which is better, if the baseline transfers."""
         return " ".join(self.sentences.values())
 
     @property
@@ -152,11 +152,15 @@ class CompareResult:
             return f"{method}: too few runs to tell ({figures}), {advice}"
         number = f"{len(self.measures)} comparison{'s' if len(self.measures) > 1 else ''}"
         tested = f"{figures} (p = {p_value_text(p_value)}, by Holm's correction for {number})"
+        helps = measure.effect > 0.0
+        if self.baseline in self.reports:  # it transfers, too
+            unclear = f"it is not shown to be better or worse than {self.baseline}"
+            clear = f"it is {'better' if helps else 'worse'} than {self.baseline}"
+        else:
+            unclear, clear = "it is not shown that transfer helps or harms", f"transfer {'helped' if helps else 'harmed'}"
         if p_value >= ALPHA:
-            return f"{method}: it is not shown that transfer helps or harms: {tested}."
-        if measure.effect <= 0.0:
-            return f"{method}: transfer harmed: {tested}."
-        return f"{method}: transfer helped: {tested}.{self._of_control(method, with_it)}"
+            return f"{method}: {unclear}: {tested}."
+        return f"{method}: {clear}: {tested}.{self._of_control(method, with_it) if helps else ''}"
 
     def _of_control(self, method: str, with_it: float) -> str:
         """Say if it is not shown that it does better than a mapping drawn at random."""

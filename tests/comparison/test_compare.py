@@ -14,7 +14,7 @@ import sb3_combrel
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import compare
-from sb3_combrel.comparison.controls import name_of_control, random_control
+from sb3_combrel.comparison.controls import CONTROL, name_of_control, random_control
 from sb3_combrel.comparison.curves import LearningCurves, returns_over_steps
 from sb3_combrel.comparison.measures import compare_learning
 from sb3_combrel.runs.episodes import EpisodeRecorder
@@ -102,7 +102,8 @@ def made_up(monkeypatch, returns, **arguments):
     # The learner itself is not asked.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return compare(Walk, dict.fromkeys(returns), **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
+        methods = {name: TIMBREL(walk_source(), "random") if name == CONTROL else None for name in returns}
+        return compare(Walk, methods, **{"seeds": n, "steps": 120, "baseline": "none", **arguments})
 
 
 def around(mean, n_runs, spread=1.0):
@@ -119,6 +120,15 @@ def test_the_sentence_says_whether_transfer_helped(monkeypatch, mean, says):
     assert found.sentence.startswith("COMBREL: ") and says in found.sentence
     assert f"its mean return over 120 steps is {returns.mean():.4g}, that of none" in found.sentence
     assert (found.p_values["COMBREL"] < 0.05) == ("helped" in says or "harmed" in says)
+
+
+@pytest.mark.parametrize(("mean", "says"), [(-50.0, "is better than"), (-70.0, "is worse than"), (-60.2, "not shown to be")])
+def test_of_a_baseline_that_transfers_it_is_said_which_is_better(monkeypatch, mean, says):
+    reports = {"COMBREL": (TransferReport("COMBREL()", "prior"),)}
+    runs = {"COMBREL": around(-60.0, 6), "none": around(mean, 6)}
+    found = replace(made_up(monkeypatch, runs, baseline="COMBREL"), reports=reports)
+    assert found.sentence.startswith("none: it is ") and says in found.sentence and "COMBREL: its mean" in found.sentence
+    assert "helped" not in found.sentence and "harm" not in found.sentence
 
 
 @pytest.mark.parametrize("n_runs", [1, 2, 3])
@@ -209,7 +219,6 @@ def test_a_random_mapping_of_the_same_set_is_the_control():
     [
         {"none": None, "mine": Mine()},
         {"none": None, "COMBREL": COMBREL(walk_source()), "any": TIMBREL(walk_source(), "random")},
-        {"random mapping": TIMBREL(walk_source(), InterTaskMapping((0, 1), (0, 1))), "COMBREL": COMBREL(walk_source())},
     ],
 )
 def test_there_is_no_control_where_nothing_is_mapped_or_there_is_one(methods):
@@ -277,6 +286,11 @@ GOOD = dict(env=Walk, methods=METHODS, seeds=2, steps=50, **LEARNER)
         (dict(controls="no"), "controls must be"),
         (dict(progress_bar="yes"), "progress_bar must be"),
         (dict(model_breadth=-1), "none: model_breadth must be"),
+        (dict(methods={**METHODS, "random mapping": METHODS["TIMBREL"]}), "methods must call none but .*, got TIMBREL"),
+        (
+            dict(methods={"TIMBREL": METHODS["TIMBREL"], "random mapping": None}, controls=False),
+            "the control's name, got None",
+        ),
     ],
 )
 def test_bad_input_is_refused_before_any_run(change, message, monkeypatch):

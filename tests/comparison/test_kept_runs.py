@@ -235,7 +235,9 @@ def test_what_is_typed_in_is_known_by_its_code(monkeypatch):
     for change in (dict(step=2), dict(sign="-"), dict(far=6)):
         assert described(typed_in(**change)[0]) != described_as[0], change
     assert described(typed_in(limit=8)[1]) != described_as[1]
-    assert described(np.add.reduce).endswith(".reduce") and described(len) == "builtins.len", "compiled code has none to digest"
+    assert (
+        described(np.add.reduce).endswith(".reduce") and described(len) == "builtins.len"
+    ), "compiled code has none to digest"
     code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import *; print(*map(described, typed_in()), sep='|')"
     for seed in ("1", "2"):
         environment = {**os.environ, "PYTHONHASHSEED": seed}
@@ -255,7 +257,9 @@ def test_a_method_that_does_not_say_its_arguments_is_not_kept(carried_out, tmp_p
     call = dict(methods={"none": None, "mine": Unsaid(-2.0)}, controls=False)
     quietly(**call)
     carried_out.clear()
-    message = r"^mine: runs of Unsaid with other arguments cannot be told apart \(.*worth.*\): give it the method arguments\(\)"
+    message = (
+        r"^mine: runs of Unsaid with other arguments cannot be told apart \(.*worth.*\): give it the method arguments\(\)"
+    )
     with pytest.raises(ValueError, match=message):
         quietly(**call, output=tmp_path)
     assert not carried_out
