@@ -28,6 +28,10 @@ FOR_THE_ALGORITHM = frozenset(
 )
 
 
+#: How a model may use the source, see :attr:`Transfer.use`.
+USES = ("instances", "prior", "actions")
+
+
 @dataclass(frozen=True)
 class TargetTask:
     """The target task, as a transfer method sees it."""
@@ -83,6 +87,8 @@ class Transfer(ABC):
         :param rng: generator of all random numbers that the method draws; predictions must draw none
         :raises ValueError: if the method does not fit the task
         """
+        if self.use not in USES:
+            raise ValueError(f"{type(self).__name__}.use must be one of {', '.join(USES)}, got {self.use!r}")
         self.task = task
         self.rng = rng
 
@@ -106,7 +112,11 @@ class Transfer(ABC):
 
     @property
     def _bound_task(self) -> TargetTask:
-        assert self.task is not None
+        if self.task is None:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} is bound to no task: a method bind(task, rng) of its own must call super().bind(task, rng)"
+            )
         return self.task
 
     @property

@@ -239,6 +239,31 @@ def too_light(self, states, actions, own_weight):
     return found
 
 
+class Forgetful(Mine):
+    """Prepares itself, and forgets the rest."""
+
+    def bind(self, task, rng):
+        self.effects = np.zeros((task.n_actions, task.n_variables))
+
+
+class Misspelt(Mine):
+    """Means a prior."""
+
+    use = "priors"
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (Forgetful, r"Forgetful is bound to no task: a method bind\(task, rng\) of its own must call super\(\)\.bind"),
+        (Misspelt, "Misspelt.use must be one of instances, prior, actions, got 'priors'"),
+    ],
+)
+def test_a_method_of_ones_own_that_is_not_what_it_should_be_is_named(method, message):
+    with pytest.raises(ValueError, match=message):
+        small(transfer=method()).learn(10)
+
+
 class Silent(Transfer):
     """Transfers nothing, and decides nothing."""
 
