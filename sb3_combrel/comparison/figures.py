@@ -55,7 +55,7 @@ def readable_ticks(axis: Any) -> None:
 def save(figure: Figure, path: Path) -> list[Path]:
     """Save as PNG and SVG, without the date and random names, which would make every file differ; ``path`` has no suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    png, svg = path.with_suffix(".png"), path.with_suffix(".svg")
+    png, svg = (path.with_name(f"{path.name}.{kind}") for kind in ("png", "svg"))
     figure.savefig(png, dpi=110)
     with rc_context({"svg.hashsalt": f"sb3_combrel {path.name}"}):
         figure.savefig(svg, metadata={"Date": None})

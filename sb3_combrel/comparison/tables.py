@@ -43,7 +43,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], n_names
 
 def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[Path]:
     """Show tables, and write them to ``path`` as Markdown, into one file, and as CSV, one file each; the files."""
-    made = [path.with_suffix(".md")]
+    made = [path.with_name(f"{path.name}.md")]
     write_whole(made[0], "\n".join(table.as_markdown() for table in tables).encode())
     for number, table in enumerate(tables, 1):
         console.print(table.for_terminal())

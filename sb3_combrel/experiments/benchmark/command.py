@@ -18,13 +18,15 @@ from sb3_combrel.common.version import __version__
 from sb3_combrel.experiments.benchmark.methods import METHODS, Method, method_of
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.pairs import PAIRS
-from sb3_combrel.experiments.benchmark.report import few_runs, write_report
+from sb3_combrel.experiments.benchmark.report import OVERVIEW, PAGE, few_runs, write_report
 from sb3_combrel.experiments.benchmark.runs import jobs_of
-from sb3_combrel.experiments.benchmark.scores import FEWEST_RUNS
+from sb3_combrel.experiments.benchmark.scores import n_compared
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.experiments.suite.tasks import Source
+from sb3_combrel.fitted_rmax.arguments import MAX_SEED
 from sb3_combrel.runs.job import described, file_name
-from sb3_combrel.runs.runner import LOCAL, Backend, prepare_folder, run_missing
+from sb3_combrel.runs.runner import FOLDER as RUNS
+from sb3_combrel.runs.runner import LOCAL, Backend, JobError, prepare_folder, run_missing
 from sb3_combrel.runs.source_files import FOLDER, load_or_learn
 
 ALL = "all"
@@ -32,6 +34,8 @@ OUTPUT = Path("benchmark")
 #: No setting was chosen with this seed or those after it.
 FIRST_SEED = 7000
 N_SEEDS = 10
+# Names of files and folders besides those of pairs.
+_FILES = (OVERVIEW, f"{OVERVIEW}_1", f"{OVERVIEW}_2", PAGE, RUNS, FOLDER)
 
 
 def benchmark(
@@ -54,27 +58,39 @@ def benchmark(
     :param backend: where the runs are carried out
     :param console: where to write; None for the standard output
     :return: the files made
-    :raises ValueError: if an argument is unknown or out of range, or the folder has results of other settings
+    :raises ValueError: if an argument is unknown or out of range, the folder has results of other settings, or a pair's known
+        mapping does not fit its tasks
     :raises ConnectionError: if no cluster answers at the backend's address
+    :raises JobError: if runs failed, once the report is written
     """
-    check_count("seeds", seeds)
-    check_count("first_seed", first_seed, min=0)
+    check_count("seeds", seeds, max=MAX_SEED)
+    check_count("first_seed", first_seed, min=0, max=MAX_SEED + 1 - seeds)
     chosen_pairs, chosen_methods = pairs_of(pairs), methods_of(methods)
     _check_names("pairs", chosen_pairs)
     _check_names("methods", chosen_methods)
+    for pair in chosen_pairs:
+        if pair.name.lower() in _FILES:
+            raise ValueError(f"pairs must not have the name of another file of the report, got {pair.name}")
     backend.check()
     console = console or Console()
     prepare_folder(output)
-    if seeds < FEWEST_RUNS:
-        console.print(few_runs(seeds), markup=False, soft_wrap=True)
+    if few := few_runs(seeds, n_compared(chosen_pairs, chosen_methods)):
+        console.print(few, markup=False, soft_wrap=True)
     all_seeds = range(first_seed, first_seed + seeds)
     sources, failed = prepare_sources(chosen_pairs, all_seeds, output, console)
+    for pair in chosen_pairs:
+        pair.check_known(next((given for seed in all_seeds if (given := sources[pair.name, seed])), ()))
     jobs = jobs_of(chosen_pairs, chosen_methods, all_seeds, sources)
-    results = run_missing([job for job in jobs if job.group not in failed], output, backend, console)
-    results += [job.result(error=failed[job.group]) for job in jobs if job.group in failed]
+    results = run_missing([job for job in jobs if (job.group, job.seed) not in failed], output, backend, console)
+    results += [job.result(error=failed[job.group, job.seed]) for job in jobs if (job.group, job.seed) in failed]
     command = ["sb3-combrel", "benchmark", "--pairs", *pairs, "--methods", *methods, "--seeds", str(seeds)]
     command += ["--first-seed", str(first_seed)]
-    return write_report(chosen_pairs, chosen_methods, all_seeds, results, output, command, console)
+    made = write_report(chosen_pairs, chosen_methods, all_seeds, results, output, command, console)
+    n_failed = sum(bool(each.error) for each in results)
+    if n_failed:
+        where = f"the notes in {made[-1]} say why, and the same command tries them again"
+        raise JobError(f"{n_failed} of {len(results)} runs failed: {where}")
+    return made
 
 
 def pairs_of(names: Sequence[str]) -> list[Pair]:
@@ -104,23 +120,22 @@ def methods_of(names: Sequence[str]) -> list[Method]:
 
 def prepare_sources(
     pairs: Sequence[Pair], seeds: Sequence[int], output: Path, console: Console
-) -> tuple[dict[tuple[str, int], tuple[SourceInstances, ...]], dict[str, str]]:
+) -> tuple[dict[tuple[str, int], tuple[SourceInstances, ...]], dict[tuple[str, int], str]]:
     """Learn or load the sources of pairs, one of each for each seed.
 
-    :return: instances, by the pair's name and the seed, () where they could not be learned; and why not, by the pair's name
+    :return: by the pair's name and the seed, instances, () where they could not be learned; and why not
     """
     found: dict[tuple[str, int], tuple[SourceInstances, ...]] = {}
-    failed: dict[str, str] = {}
+    failed: dict[tuple[str, int], str] = {}
     for pair, seed in product(pairs, seeds):
         found[pair.name, seed] = ()
-        if pair.name in failed:
-            continue
         try:
             rows = [(output / FOLDER / file_of(source, pair, seed), source.learn) for source in pair.sources]
             found[pair.name, seed] = tuple(load_or_learn(file, learn, seed, console) for file, learn in rows)
         except Exception as error:  # a third party's environment raises what it likes
-            failed[pair.name] = f"its source could not be learned: {type(error).__name__}: {' '.join(str(error).split())}"
-            console.print(f"{pair.name}: {failed[pair.name]}", markup=False, soft_wrap=True)
+            why = f"its source could not be learned: {type(error).__name__}: {' '.join(str(error).split())}"
+            failed[pair.name, seed] = why
+            console.print(f"{pair.name}, seed {seed}: {why}", markup=False, soft_wrap=True)
     return found, failed
 
 

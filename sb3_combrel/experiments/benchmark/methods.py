@@ -219,9 +219,11 @@ def method_of(text: str) -> Method:
     if ":" not in text:
         raise ValueError(f"methods must be of {', '.join(METHODS)}, or all; {_HOW_TO_NAME}; got {text!r}")
     found, digest = load_attribute("methods", text)
+    name = found.name if isinstance(found, Method) else text.rpartition(":")[2]
+    if name in METHODS:
+        raise ValueError(f"methods: {text} must have a name that no method of the package has, got {name}")
     if isinstance(found, Method):
         return replace(found, digest=digest)
-    name = text.rpartition(":")[2]
     if inspect.isabstract(found):
         raise ValueError(f"methods: {text} lacks {', '.join(sorted(found.__abstractmethods__))}, which a transfer method has")
     description = (inspect.getdoc(found) or "").partition("\n")[0]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.checks import check_count, check_finite
@@ -98,8 +99,21 @@ class Pair:
         check_budget(self.name, self.n_steps, self.n_episodes)
         if self.threshold is not None:
             check_finite("threshold", self.threshold)
-        are_sources = bool(self.sources) and all(isinstance(source, Source) for source in self.sources)
-        self._check(are_sources, f"sources must be a tuple of at least one Source, see recorded(), got {self.sources!r}")
+        are_sources = _are_all(Source, self.sources) and len(self.sources) > 0
+        comma = "; a tuple of one has a comma, (recorded(...),)" if isinstance(self.sources, Source) else ""
+        right = "sources must be a tuple of at least one Source, see recorded()"
+        self._check(are_sources, f"{right}, got {self.sources!r}{comma}")
+        is_task = isinstance(self.target, str | EnvSpec) or callable(self.target)
+        right = "target must be the id of an environment or a function that makes one, as each run has its own"
+        self._check(is_task, f"{right}, got {self.target!r}")
+        right = "known must be a factored mapping, a sequence of mappings for actions or of factored mappings, or None"
+        is_known = self.known is None or isinstance(self.known, FactoredMapping)
+        is_known = is_known or _are_all(FactoredMapping, self.known) or _are_all(InterTaskMapping, self.known)
+        self._check(is_known, f"{right}, got {self.known!r}")
+        by_action = self.known_by_action
+        right = "known_by_action must be an InterTaskMapping, a sequence of one for each target action, or None"
+        is_known = by_action is None or isinstance(by_action, InterTaskMapping) or _are_all(InterTaskMapping, by_action)
+        self._check(is_known, f"{right}, got {by_action!r}")
         n, numbers = len(self.sources), self.sources_by_action
         if isinstance(self.known, Sequence) and all(isinstance(each, FactoredMapping) for each in self.known):
             right = f"known must have one factored mapping for each of the {n} sources"
@@ -123,6 +137,37 @@ class Pair:
         """Make the environment of the target task."""
         return make_env(self.target)
 
+    def check_known(self, sources: Sequence[SourceInstances]) -> None:
+        """Check that ``known_by_action`` has the variables and actions of both tasks.
+
+        :param sources: instances of each source; none: nothing is checked
+        :raises ValueError: if it has not
+        """
+        if self.known_by_action is None or not sources:
+            return
+        try:
+            with closing(self.make_target()) as env:
+                n_variables, n_actions = env.observation_space.shape[0], int(env.action_space.n)  # type: ignore
+        except Exception:  # a third party's environment raises what it likes: that of the runs is reported
+            return
+        one = isinstance(self.known_by_action, InterTaskMapping)
+        by_action: Sequence[InterTaskMapping] = [self.known_by_action] * n_actions if one else self.known_by_action  # type: ignore
+        right = f"known_by_action must have one mapping for each of the {n_actions} target actions"
+        self._check(len(by_action) == n_actions, f"{right}, got {len(by_action)}")
+        right = f"sources_by_action must have one number for each of the {n_actions} target actions, or none"
+        self._check(len(self.sources_by_action) in (0, n_actions), f"{right}, got {len(self.sources_by_action)}")
+        for action, mapping in enumerate(by_action):
+            source = sources[self.sources_by_action[action] if self.sources_by_action else 0]
+            try:
+                mapping.check(
+                    n_source_variables=source.n_variables,
+                    n_target_variables=n_variables,
+                    n_source_actions=source.n_actions,
+                    n_target_actions=n_actions,
+                )
+            except ValueError as error:
+                raise ValueError(f"{self.name}: known_by_action: {error}") from error
+
     def agrees(self, mapped: MappedVariables) -> bool:
         """Whether what a method makes of a target action is what the known mapping makes of the variables that it moves."""
         assert self.known_by_action is not None
@@ -142,6 +187,11 @@ class Pair:
         values = {name: value for name, value in vars(self).items() if name not in ("description", "sources", "threshold")}
         sources = {source.name: described(source.learn) for source in self.sources}
         return {**{name: described(value) for name, value in values.items()}, "sources": sources}
+
+
+def _are_all(kind: type, values: object) -> bool:
+    """Whether these are a sequence of objects of a class."""
+    return isinstance(values, Sequence) and all(isinstance(each, kind) for each in values)
 
 
 def check_name(name: object) -> None:

@@ -12,10 +12,10 @@ from rich.console import Console
 
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.comparison.measures import Comparison
-from sb3_combrel.comparison.statistics import ALPHA, Estimate
+from sb3_combrel.comparison.statistics import ALPHA, Estimate, fewest_runs, smallest_p_value
 from sb3_combrel.comparison.tables import Table, p_text, without_minus_zero, write_csv, write_tables
 from sb3_combrel.experiments.benchmark.figures import draw_pair
-from sb3_combrel.experiments.benchmark.methods import NONE, Method
+from sb3_combrel.experiments.benchmark.methods import Method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.scores import (
     FEWEST_RUNS,
@@ -26,6 +26,7 @@ from sb3_combrel.experiments.benchmark.scores import (
     compare,
     mean_ranks,
     measure_name,
+    n_compared,
     performance_of,
     ranks,
 )
@@ -63,7 +64,8 @@ def write_report(
     made += write_tables(overview, output / OVERVIEW, console)
     made.append(_write_runs(outcomes, output / RUNS))
     page = output / f"{PAGE}.md"
-    write_whole(page, _page(methods, seeds, overview, sections, command).encode())
+    few = few_runs(len(seeds), n_compared(pairs, methods))
+    write_whole(page, _page(methods, seeds, few, overview, sections, command).encode())
     return [*made, page]
 
 
@@ -135,10 +137,11 @@ def rank_table(methods: Sequence[Method], cells: Cells, compared: Scores) -> Tab
     rows = []
     for name in sorted(found, key=lambda each: found[each].rank):
         rank = found[name]
-        tested = [of_pair[name] for of_pair in compared.values() if name in of_pair and of_pair[name].p_value < ALPHA]
-        better = sum(each.better for each in tested)
+        tested = [of_pair[name] for of_pair in compared.values() if name in of_pair and not np.isnan(of_pair[name].p_value)]
+        differs = [each for each in tested if each.p_value < ALPHA]
+        better = sum(each.better for each in differs)
         interval = _EMPTY if np.isnan(rank.low) else f"{rank.low:.1f} to {rank.high:.1f}"
-        against = (_EMPTY, _EMPTY) if name == NONE else (str(better), str(len(tested) - better))
+        against = (str(better), str(len(differs) - better)) if tested else (_EMPTY, _EMPTY)
         rows.append((name, f"{rank.rank:.2f}", interval, str(rank.n_pairs), *against))
     rows += [(method.name, "", "", "0", "", "") for method in methods if method.name not in found]
     header = ("method", "mean rank", "95% interval", "pairs", "better than none", "worse than none")
@@ -171,13 +174,18 @@ def _section(pair: Pair, table: Table) -> str:
 
 
 def _page(
-    methods: Sequence[Method], seeds: Sequence[int], overview: Sequence[Table], sections: Sequence[str], command: Sequence[str]
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    few: str,
+    overview: Sequence[Table],
+    sections: Sequence[str],
+    command: Sequence[str],
 ) -> str:
     """The results as Markdown, with the command."""
     parts = [
         "# The benchmark, pair by pair",
         f"Made by `{shlex.join(command)}`, seeds {seeds[0]} to {seeds[-1]}.",
-        *([f"**{few_runs(len(seeds))}**"] if len(seeds) < FEWEST_RUNS else []),
+        *([f"**{few}**"] if few else []),
         *(table.as_markdown() for table in overview),
         Table("The methods", ("method", "what it is"), [(each.name, each.description) for each in methods]).as_markdown(),
         *sections,
@@ -185,10 +193,18 @@ def _page(
     return "\n\n".join(part.strip("\n") for part in parts) + "\n"
 
 
-def few_runs(n_seeds: int) -> str:
-    """What is said where there are too few seeds for an interval."""
-    needed = f"which need at least {FEWEST_RUNS} runs of each method"
-    return f"seeds={n_seeds} is too few for intervals and tests, {needed}: tables have means alone"
+def few_runs(n_seeds: int, n_methods: int) -> str:
+    """What is said where there are too few seeds for an interval, or for any of so many methods to differ from none; or ""."""
+    smallest = smallest_p_value(n_seeds, n_seeds, n_methods)
+    advice = f"take at least {max(FEWEST_RUNS, fewest_runs(n_methods))}, better 10"
+    if n_seeds < FEWEST_RUNS:
+        needed = f"which need at least {FEWEST_RUNS} runs of each method"
+        return f"seeds={n_seeds} is too few for intervals and tests, {needed}: tables have means alone; {advice}"
+    if smallest < ALPHA:
+        return ""
+    compared = f"of {n_methods} method{'s' if n_methods > 1 else ''} compared with none"
+    corrected = f"{compared} the smallest possible is {p_text(smallest)}, by Holm's method"
+    return f"seeds={n_seeds} is too few for p < {ALPHA:g}: {corrected}; {advice}"
 
 
 def _write_runs(results: Sequence[Result], path: Path) -> Path:

@@ -72,6 +72,13 @@ def cells_of(pair: Pair, methods: Sequence[Method], outcomes: Sequence[Result], 
     return cells
 
 
+def n_compared(pairs: Sequence[Pair], methods: Sequence[Method]) -> int:
+    """Count the methods that are compared with no transfer in a pair, if all fit it: in that with the fewest."""
+    if NONE not in [method.name for method in methods]:
+        return 0
+    return min(len({run_as(method, methods, pair) for method in methods} - {NONE}) for pair in pairs)
+
+
 def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
     """Compute each run's mean return of an episode, or over environment steps, as many as the pair's shortest run has."""
     curves = {name: curves_of(cell.outcomes) for name, cell in cells.items() if cell.outcomes}

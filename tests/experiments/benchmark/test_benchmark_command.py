@@ -7,15 +7,21 @@ import shutil
 
 import cloudpickle
 import pytest
-from helpers.benchmark_files import command, fail, succeed, write_files
+from helpers.benchmark_files import call, command, fail, succeed, write_files
 from helpers.clusters import dask_cluster
+from helpers.walk import walk_source
 from imageio.v3 import imread
+from rich.console import Console
 
+from sb3_combrel.experiments.benchmark.command import prepare_sources
+from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
+from sb3_combrel.experiments.suite.tasks import Source
 from sb3_combrel.runs.runner import FOLDER
 
 FAILING = '''
 from sb3_combrel import COMBREL
+from sb3_combrel.experiments.benchmark.methods import Method
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -40,7 +46,13 @@ class NoMethod(Transfer):
     """Has not what a method needs."""
 
 
+def none(source, pair):
+    """Named like no transfer."""
+    return COMBREL(source)
+
+
 NUMBER = 3
+OWN = Method("oracle", "", none)
 '''
 DYING = '''
 import os
@@ -65,6 +77,7 @@ def files(tmp_path_factory):
     assert write_files(folder) == ["my_method.py", "two_walks.py"]
     (folder / "failing.py").write_text(FAILING)
     (folder / "dying.py").write_text(DYING)
+    (folder / "overview.py").write_text((folder / "two_walks.py").read_text().replace("two-walks", "Overview_2"))
     (folder / "raising.py").write_text("open('table.csv')\n")
     return folder
 
@@ -171,7 +184,11 @@ def failed(files, tmp_path_factory):
     folder = tmp_path_factory.mktemp("failed")
     own = [f"{files / 'failing.py'}:{name}" for name in ("Sulking", "picky")]
     args = ("--pairs", files / "two_walks.py", "--methods", "none", *own, "TIMBREL", *TINY, "--output", folder)
-    return folder, succeed(*args), args
+    status, printed, errors = call(*args)
+    assert status == 1
+    where = f"the notes in {folder / 'benchmark.md'} say why, and the same command tries them again"
+    assert errors == f"sb3-combrel: 1 of 4 runs failed: {where}\n", "what does not fit has not failed"
+    return folder, printed, args
 
 
 class TestFailures:
@@ -193,7 +210,7 @@ class TestFailures:
 
     def test_it_is_tried_again(self, failed):
         _, _, args = failed
-        printed = succeed(*args)
+        _, printed, _ = call(*args)
         assert "3 of 4 runs were complete already" in printed
         assert re.findall(r"two-walks, (\S+), seed 7000:", printed) == ["Sulking"]
 
@@ -207,7 +224,7 @@ class TestFailures:
     @pytest.mark.long
     def test_a_worker_that_dies(self, files, tmp_path):
         args = ("--pairs", files / "two_walks.py", "--methods", f"{files / 'dying.py'}:Dying", "none", *TINY)
-        succeed(*args, "--jobs", 2, "--output", tmp_path / "out")
+        assert call(*args, "--jobs", 2, "--output", tmp_path / "out")[0] == 1
         rows = {row["method"]: row for row in rows_of(tmp_path / "out" / "two-walks.csv")}
         assert rows["none"]["runs"] == "1" and re.match(r"failed \(seed 7000\): .*died", rows["Dying"]["note"])
 
@@ -216,9 +233,21 @@ class TestFailures:
         broken = text.replace('recorded("walk", make_walk,', 'recorded("walk", lambda: 1 / 0,').replace("two-walks", "broken")
         (tmp_path / "broken.py").write_text(broken)
         args = ("--pairs", tmp_path / "broken.py", "--methods", "none", "oracle", *TINY, "--output", tmp_path / "out")
-        assert "broken: its source could not be learned: ZeroDivisionError" in succeed(*args)
+        status, printed, _ = call(*args)
+        assert status == 1 and "broken, seed 7000: its source could not be learned: ZeroDivisionError" in printed
         for row in rows_of(tmp_path / "out" / "broken.csv"):
             assert row["note"].startswith("failed (seed 7000): its source could not be learned: ZeroDivisionError")
+
+    def test_a_source_that_one_seed_cannot_learn_costs_the_runs_of_that_seed(self, tmp_path):
+        def learn(seed):
+            if seed == 1:
+                raise RuntimeError("no luck")
+            return walk_source()
+
+        pair = Pair("lucky", "", (Source("walk", learn),), "CartPole-v1", n_episodes=1)
+        found, failed = prepare_sources([pair], range(3), tmp_path, Console(quiet=True))
+        assert failed == {("lucky", 1): "its source could not be learned: RuntimeError: no luck"}
+        assert [len(found["lucky", seed]) for seed in range(3)] == [1, 0, 1]
 
 
 class TestBadInput:
@@ -236,6 +265,10 @@ class TestBadInput:
             (("--pairs", "failing.py"), "pairs: failing.py defines no PAIR"),
             (("--pairs", "raising.py"), "pairs: raising.py cannot be imported: FileNotFoundError: .*table.csv"),
             (("--methods", "none", "none"), "methods must be .* different names, got none, none"),
+            (("--methods", "failing.py:none"), "methods: failing.py:none must have a name that no .* has, got none"),
+            (("--methods", "failing.py:OWN"), "methods: failing.py:OWN must have a name that no .* has, got oracle"),
+            (("--pairs", "overview.py"), "pairs must not have the name of another file of the report, got Overview_2"),
+            (("--first-seed", 2**32 - 3), "first_seed must be a whole number from 0 to 4,294,967,286, got 4,294,967,293"),
             (("--seeds", "0"), "seeds must be .* got 0"),
             (("--first-seed", "-1"), "first_seed must be .* got -1"),
             (("--jobs", "0"), "jobs must be .* got 0"),
@@ -246,6 +279,13 @@ class TestBadInput:
     def test_nothing_is_learned_or_written(self, options, words, files, tmp_path, monkeypatch):
         monkeypatch.chdir(files)
         assert re.search(words, fail(*options, "--output", tmp_path / "out")) and not (tmp_path / "out").exists()
+
+    def test_a_known_mapping_of_other_tasks_is_refused_before_the_runs(self, files, tmp_path):
+        text = (files / "two_walks.py").read_text()
+        (tmp_path / "wide.py").write_text(text.replace("known_by_action=MIRRORED", "known_by_action=(MIRRORED,) * 3"))
+        message = fail("--pairs", tmp_path / "wide.py", "--methods", "none", *TINY, "--output", tmp_path / "out")
+        assert "two-walks: known_by_action must have one mapping for each of the 2 target actions, got 3" in message
+        assert not list((tmp_path / "out" / FOLDER).iterdir())
 
     def test_a_pair_that_has_changed_since(self, copied, files, tmp_path):
         changed = tmp_path / "two_walks.py"

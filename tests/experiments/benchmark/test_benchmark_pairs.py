@@ -60,6 +60,10 @@ class TestEveryPair:
             limit = env.get_wrapper_attr("_max_episode_steps")
             assert limit <= (PAIRS[name].n_steps or limit)
 
+    def test_known_mappings_have_the_variables_and_actions_of_their_tasks(self, sources):
+        for name, pair in PAIRS.items():
+            pair.check_known(sources[name])
+
     @pytest.mark.parametrize("name", ["mountain-car", "mirrored-car"])
     def test_combrel_is_run_once_where_its_default_is_what_it_is_told(self, name, sources):
         def bound(method):
@@ -265,7 +269,7 @@ class TestMappedVariables:
             assert (found.variable[~has] == -1).all() and (found.sign[~has] == 0).all() and (found.action[~has] == -1).all()
 
 
-SAME = InterTaskMapping((0, 1), (0, 1))
+SAME, FOUR = InterTaskMapping((0, 1), (0, 1)), InterTaskMapping((0, 1, 2, 3), (0, 1))
 
 
 class TestPairArguments:
@@ -278,6 +282,11 @@ class TestPairArguments:
             ({"n_episodes": 0}, "n_episodes must be .* got 0"),
             ({"threshold": np.nan}, "threshold must be .* got nan"),
             ({"sources": ()}, "sources must be a tuple of at least one Source"),
+            ({"sources": recorded("s", "CartPole-v1")}, r"sources must be .* a tuple of one has a comma, \(recorded"),
+            ({"target": gym.Env()}, "p: target must be the id of an environment or a function that makes one, .* got <"),
+            ({"known": ((0, 1), (0, 1))}, "p: known must be a factored mapping, a sequence .* got"),
+            ({"known": (SAME, FactoredMapping((SAME,)))}, "p: known must be a factored mapping, a sequence .* got"),
+            ({"known_by_action": {"state": [0], "action": [0]}}, "p: known_by_action must be an InterTaskMapping, .* got"),
             ({"known": (FactoredMapping((disguise(ORDER, SIGNS, ACTIONS),)),) * 2}, "each of the 1 sources, got 2"),
             ({"known_by_action": (SAME,) * 2, "sources_by_action": (0,)}, "sources_by_action must .* 2 mappings .* got 1"),
             ({"known_by_action": SAME, "sources_by_action": (0, 1)}, r"numbers of the 1 sources, .*, got \(0, 1\)"),
@@ -287,6 +296,30 @@ class TestPairArguments:
         given = {"name": "p", "description": "", "sources": (recorded("s", "CartPole-v1"),), "target": "CartPole-v1"}
         with pytest.raises(ValueError, match=words):
             Pair(**{**given, "n_episodes": 1, **options})
+
+    @pytest.mark.parametrize(
+        ("by_action", "numbers", "words"),
+        [
+            (FOUR, (), None),
+            ((FOUR,) * 2, (0, 0), None),
+            (FOUR, (0,), "sources_by_action must have one number for each of the 2 target actions, or none, got 1"),
+            ((FOUR,), (), "known_by_action must have one mapping for each of the 2 target actions, got 1"),
+            (SAME, (), "known_by_action: state must have 4 entries"),
+            (InterTaskMapping((0,) * 4, (0, 2)), (), "known_by_action: action must hold indices from 0 to 1"),
+            (InterTaskMapping({"x": "x"}, {"left": "left"}), (), "known_by_action: .* has names"),
+        ],
+    )
+    def test_a_known_mapping_must_have_the_variables_and_actions_of_both_tasks(self, by_action, numbers, words):
+        known = {"known_by_action": by_action, "sources_by_action": numbers}
+        pair = Pair("p", "", (recorded("s", "CartPole-v1"),), "CartPole-v1", n_episodes=1, **known)
+        pair.check_known(())
+        source = (random_instances("CartPole-v1", 20),)
+        if words is None:
+            pair.check_known(source)
+            replace(pair, target=lambda: 1 / 0, known_by_action=SAME, sources_by_action=()).check_known(source)
+        else:
+            with pytest.raises(ValueError, match=f"^p: {words}"):
+                pair.check_known(source)
 
     def test_a_learner_that_does_not_exist(self):
         with pytest.raises(ValueError, match="learner must be one of fitted_rmax, q_learning, got 'sarsa'"):

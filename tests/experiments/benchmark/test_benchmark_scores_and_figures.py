@@ -1,6 +1,7 @@
 """Performance, ranks, tests and tables against naive computations on made-up runs."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -13,7 +14,15 @@ from sb3_combrel.experiments.benchmark.figures import WINDOW, _by_episodes, _by_
 from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import jobs_of
-from sb3_combrel.experiments.benchmark.scores import cells_of, compare, interquartile, mean_ranks, performances, ranks
+from sb3_combrel.experiments.benchmark.scores import (
+    cells_of,
+    compare,
+    interquartile,
+    mean_ranks,
+    n_compared,
+    performances,
+    ranks,
+)
 from sb3_combrel.experiments.suite.tasks import Source
 from sb3_combrel.runs.job import Result
 
@@ -241,6 +250,33 @@ class TestTables:
         assert [row[0] for row in table.rows] == ["a", NONE, "c", "b"]
         assert [row[-2:] for row in table.rows] == [("1", "0"), ("-", "-"), ("0", "1"), ("", "")]
 
+    @pytest.mark.parametrize(("names", "n_seeds"), [((NONE, "a"), 2), (("a", "b"), 5)])
+    def test_where_nothing_is_tested_nothing_is_counted(self, names, n_seeds):
+        methods, pair = [method_of(name) for name in names], pair_of()
+        cells = cells_of(pair, methods, made_up(dict.fromkeys(names, 0.0), n_seeds=n_seeds), range(n_seeds))
+        table = report.rank_table(methods, {pair.name: cells}, {pair.name: compare(pair, cells)})
+        assert {row[-2:] for row in table.rows} == {("-", "-")}
+
+    @pytest.mark.parametrize(
+        ("n_seeds", "n_methods", "words"),
+        [
+            (1, 1, "seeds=1 is too few for intervals and tests, .* alone; take at least 4, better 10"),
+            (
+                3,
+                1,
+                r"seeds=3 is too few for p < 0\.05: of 1 method compared with none the smallest possible is 0\.10, by Holm",
+            ),
+            (5, 17, r"of 17 methods .* is 0\.13, by Holm's method; take at least 6, better 10"),
+        ],
+    )
+    def test_too_few_seeds_for_any_difference_are_said(self, n_seeds, n_methods, words):
+        assert re.search(words, report.few_runs(n_seeds, n_methods))
+        assert not report.few_runs(10, n_methods) and not report.few_runs(3, 0)
+
+    def test_methods_that_are_compared_are_counted_once_a_run(self):
+        methods = [method_of(NONE), method_of("a"), method_of("b", same_as="a")]
+        assert n_compared([pair_of()], methods) == 1 and n_compared([pair_of()], methods[1:]) == 0
+
     def test_performance_of_all_pairs(self, found):
         pair, cells, compared, _ = found
         table = report.performance_table([pair], self.METHODS, {pair.name: cells}, {pair.name: compared})
@@ -254,6 +290,11 @@ class TestTables:
         outcomes = [outcome("made-up", each.name, 0, [], error="RuntimeError: never") for each in self.METHODS]
         made = report.write_report([pair], self.METHODS, [0], outcomes, tmp_path, ["command"], Console(quiet=True))
         assert all(path.exists() for path in made) and "RuntimeError: never" in (tmp_path / "made-up.md").read_text()
+
+    def test_names_with_dots_have_files_of_their_own(self, tmp_path):
+        pairs = [pair_of(name) for name in ("walk.1", "walk.2")]
+        made = report.write_report(pairs, self.METHODS, [0], [], tmp_path, ["command"], Console(quiet=True))
+        assert len(set(made)) == len(made) and {"walk.1.md", "walk.1.png", "walk.2.md"} <= {path.name for path in made}
 
 
 def test_a_method_whose_name_is_no_file_name_is_refused():
