@@ -7,6 +7,7 @@ the model, which says what pairs of the grid it changes, fits these anew, and sw
 
 from __future__ import annotations
 
+import reprlib
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
@@ -275,10 +276,16 @@ class FittedRMaxAgent:
                 self._prior_version = self._method.prior_version()
                 self._bound_values()
             return self.model.renew_prior()
-        changed = self._method.changed(self.model.known.reshape(self.task.n_actions, -1))
-        if isinstance(changed, np.ndarray):
-            return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
-        return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
+        known = self.model.known.reshape(self.task.n_actions, -1)
+        changed: Any = self._method.changed(known)
+        if isinstance(changed, bool | np.bool_):
+            return np.flatnonzero(~self.model.known) if changed else NO_PAIRS
+        if not isinstance(changed, np.ndarray) or changed.dtype != np.bool_ or changed.shape != known.shape:
+            raise ValueError(
+                f"{type(self._method).__name__}.changed must return True, False or an array of bools of shape {known.shape}, "
+                f"got {reprlib.repr(changed)}"
+            )
+        return np.flatnonzero(changed.reshape(-1) & ~self.model.known)
 
     def _bound_values(self) -> None:
         """Take over what a prior bounds values by."""

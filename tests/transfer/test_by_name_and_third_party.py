@@ -182,6 +182,13 @@ def test_by_default_it_is_asked_for_everything_after_each_transition():
     assert method.get_state() == {} and method.statistics() == {} and method.lowest_reward() == 0.0
 
 
+@pytest.mark.parametrize("changed", [None, 1, np.ones(3, dtype=np.bool_), np.ones((2, 2))])
+def test_what_has_changed_is_said_by_bools(changed, monkeypatch):
+    monkeypatch.setattr(Mine, "changed", lambda self, known: changed)
+    with pytest.raises(ValueError, match=r"Mine\.changed must return True, False or an array of bools of shape \(2, \d+\)"):
+        small(degree=0, transfer=Mine()).learn(5)
+
+
 def one_row(**changes):
     row = TransferredInstances(
         np.ones(1, dtype=np.int64), np.ones((1, 2)), np.zeros((1, 2, 3)), np.zeros((1, 2)), np.zeros((1, 2), dtype=np.bool_)
