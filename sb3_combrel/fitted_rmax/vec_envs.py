@@ -45,9 +45,11 @@ def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
     for part in parts:
         if isinstance(part, BaseCallback):
             warn_of_shared(env, part)
-    evaluated = getattr(callback, "eval_env", None)
-    own = {id(each.unwrapped) for each in getattr(env.unwrapped, "envs", ())}
-    if evaluated is not None and any(id(each.unwrapped) in own for each in getattr(evaluated.unwrapped, "envs", ())):
+    own, evaluated = (
+        {id(each.unwrapped) for each in getattr(getattr(which, "unwrapped", None), "envs", ())}
+        for which in (env, getattr(callback, "eval_env", None))
+    )
+    if own & evaluated:
         warnings.warn(
             f"{type(callback).__name__} evaluates in the environment that the model learns in: after each evaluation it "
             "takes a state of that for the one that its own action has led to; give it an environment of its own",
