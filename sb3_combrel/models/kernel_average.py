@@ -99,12 +99,12 @@ def near_pair(pair, instances, pairs, grid, kernel, near):
 
 
 @inlined
-def entry_distance(near, length, total, kernel, threshold):
-    """The squared distance within which a further instance would enter a list, or count in :func:`weight_ever`."""
+def entry_distance(near, length, total, kernel, threshold, known):
+    """The squared distance within which a further instance would enter a list; or count in :func:`weight_ever`, unless known."""
     breadth, min_weight, min_fraction = kernel
     least = min_weight
     if length > 0:
-        counts = min_fraction * min(total, threshold / (1.0 + min_fraction))
+        counts = min_fraction * (total if known else min(total, threshold / (1.0 + min_fraction)))
         least = max(min_weight, min(near.weight[length - 1], counts))
     return -np.log(least) * breadth * breadth * (1 + 1e-12)
 
@@ -130,7 +130,7 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         length, total = near_pair(pair, instances, pairs, grid, kernel, near)
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
         known = note_fit(pair, length, weight, threshold, transitions, pairs)
-        pairs.reach[pair] = entry_distance(near, length, total, kernel, threshold)
+        pairs.reach[pair] = entry_distance(near, length, total, kernel, threshold, known)
         joined = not known and transferred.length[done] > 0
         if known or joined:
             coordinates_of(point, grid, row_scratch.at)
