@@ -163,6 +163,9 @@ class KernelAverage(GridModel):
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
+    # Rows of dozens of successors take long to back up.
+    plans_changes = True
+
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._own_room = list_room(settings.min_fraction)
         super().__init__(mdp, settings, transfer)

@@ -23,6 +23,8 @@ class MDPArrays(NamedTuple):
     reward: np.ndarray  # float64, (n_points, n_actions): reward of the pair until its state is left
     modelled: np.ndarray  # bool, (n_pairs,): the pair has a model
     n_optimistic: np.ndarray  # int64, (n_points,): actions of a grid point that have none
+    span: np.ndarray  # int64, (n_variables,): how many grid points away, at most, a pair has led along each variable
+    changed: np.ndarray  # bool, (n_points,): a row of the point has changed; the planner takes it back
 
 
 class RowScratch(NamedTuple):
@@ -34,6 +36,7 @@ class RowScratch(NamedTuple):
     corner_weight: np.ndarray  # float64, (2 ** n_variables,)
     dense: np.ndarray  # float64, (n_points,), all 0 between calls: probability of each successor
     touched: np.ndarray  # int64, (n_points,): successors with a probability above 0
+    span: np.ndarray  # ``MDPArrays.span``
 
 
 class FiniteMDP:
@@ -59,6 +62,8 @@ class FiniteMDP:
             reward=np.zeros((n_points, n_actions)),
             modelled=np.zeros(n_pairs, dtype=np.bool_),
             n_optimistic=np.full(n_points, n_actions, dtype=np.int64),
+            span=np.zeros(d, dtype=np.int64),
+            changed=np.ones(n_points, dtype=np.bool_),
         )
         self.plain: tuple[Any, ...] = tuple(self.arrays)
         self.scratch = RowScratch(
@@ -68,6 +73,7 @@ class FiniteMDP:
             corner_weight=np.empty(2**d),
             dense=np.zeros(n_points),
             touched=np.empty(n_points, dtype=np.int64),
+            span=self.arrays.span,
         )
         self.plain_scratch = tuple(self.scratch)
 
@@ -117,7 +123,9 @@ def add_successor(p, effect, scratch, grid, n_touched):
     :param n_touched: how many of ``scratch.touched`` are filled; how many are now is returned
     """
     for k in range(len(grid.shape)):
-        scratch.position[k] = scratch.at[k] + effect[k] * grid.cells[k]
+        away = effect[k] * grid.cells[k]
+        scratch.position[k] = scratch.at[k] + away
+        scratch.span[k] = max(scratch.span[k], int(np.ceil(min(abs(away), float(grid.shape[k])))))
     for c in range(corners_of(scratch.position, grid, scratch.corner_index, scratch.corner_weight)):
         point = scratch.corner_index[c]
         if scratch.dense[point] == 0.0:
@@ -156,6 +164,7 @@ def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
     if room:
         mdp.length[point, action] = length
         mdp.reward[point, action] = infinite_reward(reward) if never_leaves else reward / leave
+        mdp.changed[point] = True
     return room
 
 
@@ -168,6 +177,7 @@ def set_modelled(mdp, pair, modelled):
             mdp.length[point, action] = 0
             mdp.reward[point, action] = 0.0
         mdp.modelled[pair] = modelled
+        mdp.changed[point] = True
         mdp.n_optimistic[point] += -1 if modelled else 1
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.planning.grid import GridArrays
 from sb3_combrel.planning.mdp import FiniteMDP
 
 
@@ -15,28 +16,102 @@ def value_of_row(values, to, weight, length, reward, point, action):
     return q
 
 
-@EntryPoint
-@compiled
-def sweep(values, mdp, upper, worth, lowest, searching, downwards):
-    """V(point) = max over a of Q(point, a), Fitted R-Max's backup, at all grid points; the largest change.
+@inlined
+def backed_up(values, mdp, upper, worth, lowest, searching, point):
+    """V(point) = max over a of Q(point, a), Fitted R-Max's backup.
 
-    :param values: updated in place
+    :param mdp: the first arrays of ``MDPArrays``
     :param upper: upper bound of each value
     :param worth: value of an optimistic action at each point; while the agent is searching, of being there
     """
     to, weight, length, reward, modelled, n_optimistic = mdp
+    best = worth[point] if searching or n_optimistic[point] > 0 else lowest
+    if best < upper[point]:
+        for action in range(reward.shape[1]):
+            if modelled[action * len(values) + point]:
+                best = max(best, value_of_row(values, to, weight, length, reward, point, action))
+        best = min(best, upper[point])
+    return best
+
+
+@EntryPoint
+@compiled
+def sweep(values, mdp, upper, worth, lowest, searching, downwards):
+    """Back up all grid points; the largest change. Parameters: see :func:`backed_up`.
+
+    :param values: updated in place
+    """
     n_points = len(values)
     largest = 0.0
     for step in range(n_points):
         point = n_points - 1 - step if downwards else step
-        best = worth[point] if searching or n_optimistic[point] > 0 else lowest
-        if best < upper[point]:
-            for action in range(reward.shape[1]):
-                if modelled[action * n_points + point]:
-                    best = max(best, value_of_row(values, to, weight, length, reward, point, action))
-            best = min(best, upper[point])
+        best = backed_up(values, mdp, upper, worth, lowest, searching, point)
         largest = max(largest, abs(best - values[point]))
         values[point] = best
+    return largest
+
+
+@inlined
+def mark_around(point, span, grid, marks, scratch):
+    """Mark the grid points from which a pair may lead to ``point``, those within ``span`` of it; how many they are."""
+    first, last, at = scratch[0], scratch[1], scratch[2]
+    n_marked, inner, rest = 1, len(span) - 1, point
+    for k in range(len(span)):
+        here = rest // grid.strides[k]
+        rest -= here * grid.strides[k]
+        first[k], last[k] = max(0, here - span[k]), min(grid.shape[k], here + span[k] + 1)
+        if grid.periodic[k] and last[k] - first[k] <= 2 * span[k]:
+            # The way around.
+            first[k], last[k] = 0, grid.shape[k]
+        at[k] = first[k]
+        n_marked *= last[k] - first[k]
+    while True:
+        base = 0
+        for k in range(inner):
+            base += at[k] * grid.strides[k]
+        marks[base + first[inner] : base + last[inner]] = True
+        k = inner - 1
+        while k >= 0:
+            at[k] += 1
+            if at[k] < last[k]:
+                break
+            at[k] = first[k]
+            k -= 1
+        if k < 0:
+            return n_marked
+
+
+@EntryPoint
+@compiled
+def sweep_changes(values, mdp, upper, worth, lowest, searching, downwards, tolerance, told, changed, span, grid, scratch):
+    """Back up the grid points on which changes of rows and values bear; the largest change. See :func:`backed_up`.
+
+    A value that has changed by more than ``tolerance`` bears on the points from which a pair may lead there. When finding these
+    is as much work as there are points, all are backed up.
+
+    :param values: updated in place
+    :param told: each value when its change was last passed on
+    :param changed: bool, shape (n_points,): points to be backed up; in place
+    :param span: see ``MDPArrays``; plain tuple for ``grid``
+    :param scratch: int64, shape (3, n_variables): work space
+    """
+    grid = GridArrays(*grid)
+    n_points = len(values)
+    largest, n_marked = 0.0, 0
+    for step in range(n_points):
+        point = n_points - 1 - step if downwards else step
+        if not changed[point]:
+            continue
+        changed[point] = n_marked >= n_points
+        values[point] = backed_up(values, mdp, upper, worth, lowest, searching, point)
+        change = abs(values[point] - told[point])
+        if change > tolerance:
+            largest = max(largest, change)
+            told[point] = values[point]
+            if n_marked < n_points:
+                n_marked += mark_around(point, span, grid, changed, scratch)
+                if n_marked >= n_points:
+                    changed[:] = True
     return largest
 
 
@@ -47,10 +122,14 @@ class Planner:
     :param max_value: value of an optimistic pair, and upper bound of all values; lower ones: see :meth:`set_upper`
     :param min_value: lower bound of all values, reached only by states that lead nowhere
     :param tolerance: sweeps end when no value changes by more
+    :param follows_changes: whether sweeps leave points out on which no change bears that is larger than the tolerance
     """
 
-    def __init__(self, mdp: FiniteMDP, *, max_value: float, min_value: float, tolerance: float):
+    def __init__(
+        self, mdp: FiniteMDP, *, max_value: float, min_value: float, tolerance: float, follows_changes: bool = False
+    ):
         self.mdp = mdp
+        self.follows_changes = follows_changes
         self.tolerance = float(tolerance)
         self.bounds = (float(min_value), float(max_value))
         #: Upper bound of the value of each grid point.
@@ -60,10 +139,25 @@ class Planner:
         #: Whether the values of some grid points are bounded by less than ``max_value``.
         self.is_bounded = False
         self.values = self.upper.copy()
+        # For sweeps that follow changes: each value when it was last passed on, what all values depend on, and work space.
+        self._told, self._rules = self.values.copy(), (self.bounds[0], False)
+        self._scratch = np.empty((3, mdp.grid.n_variables), dtype=np.int64)
 
     def sweep(self, max_sweeps: int) -> int:
-        """Back up all points, up and down the grid in turn, until little changes; the sweeps that this took."""
-        return self._back_up(self.values, self.worth, self.worth is not self.upper, max_sweeps)
+        """Back up the points, up and down the grid in turn, until little changes; the sweeps that this took."""
+        if not self.follows_changes:
+            return self._back_up(self.values, self.worth, self.worth is not self.upper, max_sweeps)
+        *rows, span, changed = self.mdp.plain
+        lowest, searching = rules = self.bounds[0], self.worth is not self.upper
+        if rules != self._rules:
+            self._rules = rules
+            changed[:] = True
+        given = self.values, tuple(rows), self.upper, self.worth, lowest, searching
+        more = self.tolerance, self._told, changed, span, self.mdp.grid.plain, self._scratch
+        for n in range(max_sweeps):
+            if sweep_changes.call(*given, n % 2 == 1, *more) <= self.tolerance:
+                return n + 1
+        return max_sweeps
 
     def cautious_values(self, max_sweeps: int) -> np.ndarray:
         """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are."""
@@ -73,8 +167,10 @@ class Planner:
         return values
 
     def _back_up(self, values: np.ndarray, worth: np.ndarray, searching: bool, max_sweeps: int) -> int:
+        *rows, _, _ = self.mdp.plain
+        given = values, tuple(rows), self.upper, worth, self.bounds[0], searching
         for n in range(max_sweeps):
-            if sweep.call(values, self.mdp.plain, self.upper, worth, self.bounds[0], searching, n % 2 == 1) <= self.tolerance:
+            if sweep.call(*given, n % 2 == 1) <= self.tolerance:
                 return n + 1
         return max_sweeps
 
@@ -83,7 +179,10 @@ class Planner:
 
         :param worth: shape (n_points,), no more than the upper bounds; None: none, optimistic actions have the upper bounds
         """
-        self.worth = self.upper if worth is None else np.maximum(worth, self.bounds[0])
+        worth = self.upper if worth is None else np.maximum(worth, self.bounds[0])
+        if self.follows_changes and worth is not self.worth:
+            self.mdp.arrays.changed[worth != self.worth] = True
+        self.worth = worth
 
     def set_max_value(self, max_value: float) -> None:
         """Change the value of what is optimistic; the others follow by sweeps."""
@@ -114,3 +213,5 @@ class Planner:
     def restore(self, values: np.ndarray) -> None:
         """Replace the values by saved ones."""
         self.values[:] = np.clip(values, self.bounds[0], self.upper)
+        self._told[:] = self.values
+        self.mdp.arrays.changed[:] = True
