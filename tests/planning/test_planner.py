@@ -23,11 +23,16 @@ def walk(seed, n, n_variables=2, goal=0.8, noise=False):
         yield state, action, reward, next_state, bool((next_state > goal).all())
 
 
-def planned(grid=((3,), 1), seed=1, n=80, gamma=0.9, max_value=2.0, tolerance=1e-12, noise=True):
+def planned(grid=((3,), 1), seed=1, n=80, gamma=0.9, max_value=2.0, tolerance=1e-12, noise=True, follows_changes=False):
     """A planner of a model that has learned a walk."""
     model = make_model(grid, KERNEL, gamma)
     learn(model, walk(seed, n, len(grid[0]), noise=noise))
-    return Planner(model.mdp, max_value=max_value, min_value=MIN_VALUE, tolerance=tolerance)
+    return planner_of(model, max_value, tolerance, follows_changes)
+
+
+def planner_of(model, max_value=2.0, tolerance=1e-12, follows_changes=False):
+    arguments = {"tolerance": tolerance, "follows_changes": follows_changes}
+    return Planner(model.mdp, max_value=max_value, min_value=MIN_VALUE, **arguments)
 
 
 def values_of_rows(planner, upper=np.inf, optimism=True):
@@ -96,6 +101,90 @@ def test_sweeps_end_when_no_value_changes_by_more_than_the_tolerance():
     assert rough.sweep(MANY) < precise.sweep(MANY)
     # What is left is a tenth, discounted for ever.
     assert 1e-6 < np.abs(rough.values - precise.values).max() <= 0.1 * 0.9 / (1.0 - 0.9)
+
+
+CHANGED_GRIDS = [((6,), 0), ((5, 4), 0), ((4, 5), 0, (True, False)), ((3, 3, 4), 0, (False, True, False))]
+CHANGES = ["learn", "learn", "upper", "worth", "max", "lowest", "restore"]
+
+
+def short_steps(seed, n, n_variables):
+    """Steps about the box and out of it, one as long as the other: all rows lead as far as any."""
+    for state, action, reward, _, terminated in walk(seed, n, n_variables, noise=True):
+        yield state, action, reward, state + (0.03 if action else -0.03), terminated
+
+
+def narrow_model(grid, gamma):
+    """A model few points of which are changed by a transition, which may lose an old one to it."""
+    model = make_model(grid, {**KERNEL, "breadth": 0.08}, gamma, max_instances=150)
+    learn(model, short_steps(0, 300, len(grid[0])))
+    return model
+
+
+def change_both(change, rng, planners, models, seed):
+    """Change the same of each planner and model."""
+    grid = models[0].grid
+    numbers, some = rng.uniform(-6.0, 2.0, grid.n_points), rng.random(grid.n_points) < 0.02
+    for planner, model in zip(planners, models, strict=True):
+        if change == "learn":
+            learn(model, short_steps(seed, 1, grid.n_variables))
+        elif change == "upper":
+            planner.set_upper(np.where(some, numbers, 2.0))
+        elif change == "worth":
+            planner.set_worth(np.where(some, np.minimum(numbers, planner.upper), planner.worth))
+        elif change == "max":
+            planner.set_max_value(float(numbers[0]) + 2.0)
+        elif change == "lowest":
+            planner.bounds = planner.bounds[0] - 3.0, planner.bounds[1]
+        else:
+            planner.restore(np.where(some, numbers, planner.values))
+
+
+@settings(deadline=None, derandomize=True, max_examples=30)
+@given(
+    st.integers(0, 10**6),
+    st.sampled_from(CHANGED_GRIDS),
+    st.lists(st.tuples(st.sampled_from(CHANGES), st.sampled_from([1, 2, MANY])), min_size=1, max_size=12),
+)
+def test_sweeps_that_follow_all_changes_find_what_sweeps_over_all_points_find(seed, grid, changes):
+    """With a tolerance of 0 to the last bit, however rows, bounds and values change in between."""
+    rng, models = np.random.default_rng(seed), [narrow_model(grid, 0.5) for _ in range(2)]
+    planners = [planner_of(model, 2.0, 0.0, k == 1) for k, model in enumerate(models)]
+    for k, (change, n) in enumerate([("learn", MANY), *changes]):
+        change_both(change, rng, planners, models, seed + k)
+        assert len({planner.sweep(n) for planner in planners}) == 1
+        np.testing.assert_array_equal(planners[0].values, planners[1].values)
+
+
+@settings(deadline=None, derandomize=True, max_examples=12)
+@given(st.integers(0, 10**6), st.sampled_from(CHANGED_GRIDS[:3]), st.sampled_from([1e-2, 1e-6]))
+def test_what_changes_leave_out_is_within_the_tolerance(seed, grid, tolerance):
+    rng, model = np.random.default_rng(seed), narrow_model(grid, 0.9)
+    planner = planner_of(model, 2.0, tolerance, follows_changes=True)
+    for k in range(12):
+        change_both(CHANGES[k % len(CHANGES)], rng, [planner], [model], seed + k)
+        planner.sweep(MANY)
+    planner.set_worth(None)
+    planner.sweep(MANY)
+    # A value may have changed by so much without being passed on, and so may what it was backed up from, discounted for ever.
+    left = np.abs(planner.values - values_of_rows(planner, planner.upper)).max()
+    assert left <= 2 * tolerance / (1.0 - 0.9)
+
+
+def test_points_on_which_no_change_bears_are_left_out():
+    model = narrow_model(((6,), 0), 0.9)
+    planner = planner_of(model, follows_changes=True)
+    planner.sweep(MANY)
+    changed, span = model.mdp.arrays.changed, model.mdp.arrays.span[0]
+    assert not changed.any() and 1 < span < 8
+    # Nobody looks at a value that nothing has changed.
+    planner.values[0] = wrong = -50.0
+    learn(model, [(np.array([0.95]), 0, 1.0, np.array([0.97]), False)])
+    assert 0 < changed.sum() < 20
+    planner.sweep(1)
+    assert planner.values[0] == wrong
+    planner.restore(planner.values)
+    planner.sweep(MANY)
+    np.testing.assert_allclose(planner.values, values_of_rows(planner), atol=1e-9)
 
 
 @settings(deadline=None, derandomize=True, max_examples=12)
@@ -204,10 +293,11 @@ def test_restored_values_are_cut_to_their_bounds_and_converge_to_the_same_as_bef
     np.testing.assert_allclose(planner.values, expected, atol=1e-7)
 
 
-def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again():
-    model, lost = make_model(((3,), 0), KERNEL, 0.9, max_instances=2), 0
-    planner = Planner(model.mdp, max_value=2.0, min_value=MIN_VALUE, tolerance=1e-12)
-    for transition in walk(2, 40, 1):
+@pytest.mark.parametrize(("resolution", "breadth", "room", "follows_changes"), [(3, 0.35, 2, False), (6, 0.08, 12, True)])
+def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again(resolution, breadth, room, follows_changes):
+    model, lost = make_model(((resolution,), 0), {**KERNEL, "breadth": breadth}, 0.9, max_instances=room), 0
+    planner = planner_of(model, follows_changes=follows_changes)
+    for transition in short_steps(2, 90, 1):
         known = model.known.copy()
         learn(model, [transition])
         lost += int((known & ~model.known).sum())
