@@ -423,8 +423,7 @@ class FittedRMaxAgent:
             return {
                 **{f"{OF_TRANSFER}{name}": array for name, array in self._method.get_state().items()},
                 **self.model.get_state(),
-                "values": self.planner.values.copy(),
-                "lowest_value": np.array([self.planner.bounds[0]]),
+                **self.planner.get_state(),
                 "has_acted": np.array([float(self.has_acted)]),
                 "rewards": self.rewards.get_state(),
                 "promises": self.promises.rows(),
@@ -444,7 +443,7 @@ class FittedRMaxAgent:
             self.model.set_state(state)
             self.planner.bounds = (float(state["lowest_value"][0]), self.planner.bounds[1])
             self._bound_values()
-            self.planner.restore(state["values"])
+            self.planner.set_state(state)
             self._search()
             self.promises.restore(state["promises"])
             self.has_acted, self._cautious = bool(state["has_acted"][0] > 0.5), None

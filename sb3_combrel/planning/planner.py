@@ -215,3 +215,21 @@ class Planner:
         self.values[:] = np.clip(values, self.bounds[0], self.upper)
         self._told[:] = self.values
         self.mdp.arrays.changed[:] = True
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Values, float64, and what sweeps that follow changes have not passed on yet: to be saved."""
+        state, arrays = {"values": self.values.copy(), "lowest_value": np.array([self.bounds[0]])}, self.mdp.arrays
+        if self.follows_changes:
+            changed = arrays.changed | (self._rules != (self.bounds[0], self.worth is not self.upper))
+            state["passed_on"] = np.column_stack([self._told, changed])
+            state["span"] = arrays.span.astype(np.float64)
+        return state
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Take over what :meth:`get_state` returned; the rows of the finite MDP are what they were then."""
+        self.restore(state["values"])
+        if self.follows_changes:
+            arrays = self.mdp.arrays
+            self._told[:], arrays.changed[:] = state["passed_on"][:, 0], state["passed_on"][:, 1] > 0.5
+            arrays.span[:] = np.maximum(arrays.span, state["span"].astype(np.int64))
+            self._rules = self.bounds[0], self.worth is not self.upper

@@ -262,6 +262,15 @@ def test_learning_goes_on_to_the_last_bit(variant, tmp_path):
         assert model.policy.transfer.mapping_counts() == loaded.policy.transfer.mapping_counts()
 
 
+def test_a_kernel_average_passes_on_after_loading_what_it_had_not_yet(tmp_path):
+    """With a large tolerance and a narrow kernel most changes wait: what waits is saved."""
+    given = dict(degree=0, model_breadth=0.03, min_fraction=0.02, resolution=6, planning_tolerance=0.1, gamma=0.9)
+    model, loaded = learnt_on(small(Walk(start=-0.5), **given).learn(150), tmp_path, 150)
+    waits = np.abs(model.agent.planner._told - model.agent.planner.values)
+    assert 0.0 < waits.max() <= 0.1 and not model.agent.mdp.arrays.changed.all()
+    assert same_parameters(model, loaded)
+
+
 BY_RELEVANCE = {
     "none": lambda: None,
     "TIMBREL": lambda: TIMBREL(walk_source(), MAPPING, relevance="near"),
