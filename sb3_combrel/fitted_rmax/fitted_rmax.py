@@ -61,8 +61,9 @@ class FittedRMax(PastData):
 
     - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables, the box for more.
     - What was known once stays known (the original falls back when a nearer instance shortens the list).
-    - Planning is full Gauss-Seidel sweeps over the grid, two a step, and until little changes when an episode ends. Staying
-      in a grid point is summed in closed form.
+    - Planning is Gauss-Seidel sweeps over the grid, two a step, and until little changes when an episode ends. With
+      ``degree=0`` they leave points out on which no change of more than ``planning_tolerance`` bears. Staying in a grid point
+      is summed in closed form.
     - With ``degree=1`` the planner's model holds an action until a cell of the grid is left: values that are interpolated at
       every step spread over the grid.
     - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``).

@@ -100,7 +100,10 @@ def near_pair(pair, instances, pairs, grid, kernel, near):
 
 @inlined
 def entry_distance(near, length, total, kernel, threshold, known):
-    """The squared distance within which a further instance would enter a list; or count in :func:`weight_ever`, unless known."""
+    """The squared distance within which an instance enters a list; while a pair is not known, or counts for it otherwise.
+
+    See :func:`weight_ever`.
+    """
     breadth, min_weight, min_fraction = kernel
     least = min_weight
     if length > 0:

@@ -86,8 +86,8 @@ def mark_around(point, span, grid, marks, scratch):
 def sweep_changes(values, mdp, upper, worth, lowest, searching, downwards, tolerance, told, changed, span, grid, scratch):
     """Back up the grid points on which changes of rows and values bear; the largest change. See :func:`backed_up`.
 
-    A value that has changed by more than ``tolerance`` bears on the points from which a pair may lead there. When finding these
-    is as much work as there are points, all are backed up.
+    A value that has changed by more than ``tolerance`` bears on the points from which a pair may lead there. When as many have
+    been marked as there are points, all are backed up.
 
     :param values: updated in place
     :param told: each value when its change was last passed on
@@ -125,9 +125,7 @@ class Planner:
     :param follows_changes: whether sweeps leave points out on which no change bears that is larger than the tolerance
     """
 
-    def __init__(
-        self, mdp: FiniteMDP, *, max_value: float, min_value: float, tolerance: float, follows_changes: bool = False
-    ):
+    def __init__(self, mdp: FiniteMDP, *, max_value: float, min_value: float, tolerance: float, follows_changes: bool = False):
         self.mdp = mdp
         self.follows_changes = follows_changes
         self.tolerance = float(tolerance)

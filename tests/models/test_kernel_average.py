@@ -106,6 +106,22 @@ def test_an_exact_state_is_known_for_ever_once_some_of_its_instances_alone_reach
         assert known_now == (total >= 1.0) or abs(total - 1.0) < 1e-9
 
 
+def test_a_known_pair_is_left_alone_by_an_instance_that_enters_no_list_of_its():
+    kernel = dict(breadth=0.5, min_weight=0.01, min_fraction=0.37)
+    model = kernel_models.make_model(((4,), 0), kernel)
+    here, away = np.array([0.5]), np.array([0.625])
+    point = int(np.flatnonzero(model.grid.points()[:, 0] == here[0])[0])
+    kernel_models.learn(model, [(here, 0, 0.0, here, False)] * 30)
+    # It would weigh enough to make the pair known, and less than the least of what counts at it.
+    assert model.known[point] and 0.37 < np.exp(-(((away - here) / 0.5) ** 2).sum()) < 1.0
+    before = [array[point].copy() for array in model.mdp.arrays[:4]]
+    due = model.add(away, 0, 5.0, here, False)
+    assert point not in due and len(due) > 0
+    model.update_all_rows()
+    for one, other in zip(before, model.mdp.arrays[:4], strict=True):
+        np.testing.assert_array_equal(one, other[point])
+
+
 def test_rows_and_instances_are_complete_after_their_arrays_have_grown():
     grid, kernel = ((4, 4), 0), dict(breadth=0.4, min_weight=0.01, min_fraction=0.001)
     model, naive = kernel_models.model_and_definition(grid, kernel)
