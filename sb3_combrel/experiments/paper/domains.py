@@ -18,6 +18,7 @@ class Setting:
     """How the methods are set in one domain."""
 
     learner: Mapping[str, Any]  # arguments of :class:`~sb3_combrel.FittedRMax`
+    n_runs: int  # runs of each method, by default
     max_episode_steps: int  # steps after which an episode is cut off
     mappings: str  # the set that COMBREL chooses from, and from which random mappings are drawn
     combrel: Mapping[str, Any] = field(default_factory=dict)  # arguments of :class:`~sb3_combrel.COMBREL` besides the set
@@ -38,7 +39,6 @@ class Domain:
     title: str  # in figures
     target_id: str  # id of the target task
     learn_source: Callable[[int], SourceInstances]  # learns the source and returns its instances; a function of the seed
-    n_runs: int  # runs of each method, by default
     n_episodes: int  # episodes of each run, by default
     first_seed: int  # seed of the first run; no setting was chosen with this seed or those after it
     thresholds: tuple[int, ...]  # steps of an episode; the training needed to get there is reported for each
@@ -67,13 +67,14 @@ _CAR_PAPER = Setting(
         "min_weight": 0.01,
         "bounds": [[-1.2, -1.2, -0.07, -0.07], [0.6, 0.6, 0.07, 0.07]],
     },
+    n_runs=5,
     max_episode_steps=4000,
     mappings="paper_mountain_car",
     combrel={"breadth": 0.4, "n_neighbors": 3},
     timbrel={"breadth": 0.4, "breadth_decay": 1.0},
     paper=True,
 )
-_CAR_BEST = Setting(learner={}, max_episode_steps=2000, mappings="signed_factored", timbrel={"use": "prior"})
+_CAR_BEST = Setting(learner={}, n_runs=15, max_episode_steps=2000, mappings="signed_factored", timbrel={"use": "prior"})
 
 # Table 3.
 _ICUB_PAPER = Setting(
@@ -85,6 +86,7 @@ _ICUB_PAPER = Setting(
         "bounds": [[-95.5, 0.0, -37.0, 15.0], [10.0, 160.8, 80.0, 106.0]],
         **icub_arm.LEARNER,
     },
+    n_runs=10,
     max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
     mappings="paper_icub",
     combrel={"breadth": 0.1, "n_neighbors": 3},
@@ -92,18 +94,27 @@ _ICUB_PAPER = Setting(
     paper=True,
 )
 _ICUB_BEST = Setting(
-    learner={}, max_episode_steps=icub_arm.MAX_EPISODE_STEPS, mappings="signed_factored", timbrel={"use": "prior"}
+    learner={},
+    n_runs=10,
+    max_episode_steps=icub_arm.MAX_EPISODE_STEPS,
+    mappings="signed_factored",
+    timbrel={"use": "prior"},
 )
 
 #: This package's instance transfer from Mountain Car, at breadths of the learner's kernel that are told beside it.
-DIAGNOSED = Setting(learner={"degree": 0}, max_episode_steps=2000, mappings="injective", combrel={"use": "instances"})
+DIAGNOSED = Setting(
+    learner={"degree": 0},
+    n_runs=_CAR_PAPER.n_runs,
+    max_episode_steps=2000,
+    mappings="injective",
+    combrel={"use": "instances"},
+)
 
 MOUNTAIN_CAR = Domain(
     name="mountain_car",
     title="Mountain Car 4D",
     target_id=mountain_car.TARGET_ID,
     learn_source=mountain_car.learn_source,
-    n_runs=15,
     n_episodes=200,
     first_seed=26000,
     thresholds=(400, 300, 250),
@@ -116,7 +127,6 @@ ICUB = Domain(
     title="iCub, arm",
     target_id=icub_arm.TARGET_ID,
     learn_source=icub_arm.learn_source,
-    n_runs=10,
     n_episodes=300,
     first_seed=26000,
     thresholds=(200, 150, 100, 75, 50, 40),
