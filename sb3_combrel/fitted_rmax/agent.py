@@ -126,7 +126,7 @@ class FittedRMaxAgent:
         self._asked = self.correspondence.of_learner(self._method) if self._method.informs_model else None
         self.model = self.model_class(self.mdp, self.model_settings, self._asked)
         bounds = {"max_value": max_value, "min_value": min(0.0, max_value) - 1.0}
-        self.planner = Planner(self.mdp, **bounds, tolerance=tolerance, follows_changes=self.model.plans_changes)
+        self.planner = Planner(self.mdp, **bounds, tolerance=tolerance, follows_changes=self.model.follows_changes)
         self.promises = Promises(self.grid.arrays, self.task.n_actions)
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.

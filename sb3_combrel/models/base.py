@@ -75,7 +75,7 @@ class Model(ABC):
     #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.optimism``).
     searches: ClassVar[bool] = False
     #: Whether the planner leaves points out on which no change bears that is larger than its tolerance.
-    plans_changes: ClassVar[bool] = False
+    follows_changes: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp, self.grid, self.n_actions = mdp, mdp.grid, mdp.n_actions

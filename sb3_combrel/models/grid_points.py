@@ -8,7 +8,7 @@ from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
 from sb3_combrel.common.constants import MAX_SURPRISE, SHARE_OF_LIST
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.regression import PER_BREADTH
-from sb3_combrel.planning.grid import GridArrays
+from sb3_combrel.planning.grid import GridArrays, next_row
 
 ROUNDING = 1e-12
 
@@ -163,12 +163,5 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
                 if look_at(base + j, distance, widest, why, pairs, instance, at, grid, rules, scratch.predicted):
                     scratch.pair[due] = base + j
                     due += 1
-        k = inner - 1
-        while k >= 0:
-            at[k] += 1
-            if at[k] < last[k]:
-                break
-            at[k] = first[k]
-            k -= 1
-        if k < 0:
+        if not next_row(at, first, last):
             return due

@@ -100,9 +100,9 @@ def near_pair(pair, instances, pairs, grid, kernel, near):
 
 @inlined
 def entry_distance(near, length, total, kernel, threshold, known):
-    """The squared distance within which an instance enters a list; while a pair is not known, or counts for it otherwise.
+    """The squared distance within which an instance changes a list, or whether a pair that is not known yet is known.
 
-    See :func:`weight_ever`.
+    The latter see :func:`weight_ever`.
     """
     breadth, min_weight, min_fraction = kernel
     least = min_weight
@@ -167,7 +167,7 @@ class KernelAverage(GridModel):
     """
 
     # Rows of dozens of successors take long to back up.
-    plans_changes = True
+    follows_changes = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._own_room = list_room(settings.min_fraction)

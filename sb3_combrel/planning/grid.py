@@ -47,6 +47,22 @@ def wrapped(at, n):
     return at if at < n else 0.0
 
 
+@inlined
+def next_row(at, first, last):
+    """Move ``at`` on to the next row of a box of grid points, a row being along the last variable; whether there is one.
+
+    :param first: int64, shape (n_variables,): the box's first grid coordinate of each variable; ``last``: one past its last
+    """
+    k = len(at) - 2
+    while k >= 0:
+        at[k] += 1
+        if at[k] < last[k]:
+            break
+        at[k] = first[k]
+        k -= 1
+    return k >= 0
+
+
 def n_corners(n_variables: int) -> int:
     """Grid points between which is interpolated: those of a cell, or of a simplex of it for more than four variables."""
     return int(2**n_variables if n_variables <= MAX_MULTILINEAR else n_variables + 1)

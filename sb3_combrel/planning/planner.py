@@ -1,9 +1,11 @@
 """Dynamic programming on the grid: plain Gauss-Seidel sweeps of Bellman backups, up and down in turn."""
 
+from typing import Any
+
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
-from sb3_combrel.planning.grid import GridArrays
+from sb3_combrel.planning.grid import GridArrays, next_row
 from sb3_combrel.planning.mdp import FiniteMDP
 
 
@@ -70,14 +72,7 @@ def mark_around(point, span, grid, marks, scratch):
         for k in range(inner):
             base += at[k] * grid.strides[k]
         marks[base + first[inner] : base + last[inner]] = True
-        k = inner - 1
-        while k >= 0:
-            at[k] += 1
-            if at[k] < last[k]:
-                break
-            at[k] = first[k]
-            k -= 1
-        if k < 0:
+        if not next_row(at, first, last):
             return n_marked
 
 
@@ -143,32 +138,33 @@ class Planner:
 
     def sweep(self, max_sweeps: int) -> int:
         """Back up the points, up and down the grid in turn, until little changes; the sweeps that this took."""
-        if not self.follows_changes:
-            return self._back_up(self.values, self.worth, self.worth is not self.upper, max_sweeps)
-        *rows, span, changed = self.mdp.plain
         lowest, searching = rules = self.bounds[0], self.worth is not self.upper
+        given = self.values, self._rows, self.upper, self.worth, lowest, searching
+        if not self.follows_changes:
+            return self._repeat(sweep, given, (), max_sweeps)
+        span, changed = self.mdp.arrays.span, self.mdp.arrays.changed
         if rules != self._rules:
             self._rules = rules
             changed[:] = True
-        given = self.values, tuple(rows), self.upper, self.worth, lowest, searching
         more = self.tolerance, self._told, changed, span, self.mdp.grid.plain, self._scratch
-        for n in range(max_sweeps):
-            if sweep_changes.call(*given, n % 2 == 1, *more) <= self.tolerance:
-                return n + 1
-        return max_sweeps
+        return self._repeat(sweep_changes, given, more, max_sweeps)
 
     def cautious_values(self, max_sweeps: int) -> np.ndarray:
         """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are."""
         values = np.full(len(self.values), self.bounds[0])
         # What nobody has seen is worth the least there is.
-        self._back_up(values, values.copy(), False, max_sweeps)
+        self._repeat(sweep, (values, self._rows, self.upper, values.copy(), self.bounds[0], False), (), max_sweeps)
         return values
 
-    def _back_up(self, values: np.ndarray, worth: np.ndarray, searching: bool, max_sweeps: int) -> int:
-        *rows, _, _ = self.mdp.plain
-        given = values, tuple(rows), self.upper, worth, self.bounds[0], searching
+    @property
+    def _rows(self) -> tuple[np.ndarray, ...]:
+        """What :func:`backed_up` needs of the finite MDP."""
+        return self.mdp.plain[:-2]
+
+    def _repeat(self, sweep_once: EntryPoint, given: tuple[Any, ...], more: tuple[Any, ...], max_sweeps: int) -> int:
+        """Sweep until little changes, up and down in turn; how often."""
         for n in range(max_sweeps):
-            if sweep.call(*given, n % 2 == 1) <= self.tolerance:
+            if sweep_once.call(*given, n % 2 == 1, *more) <= self.tolerance:
                 return n + 1
         return max_sweeps
 

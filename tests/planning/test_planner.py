@@ -293,11 +293,14 @@ def test_restored_values_are_cut_to_their_bounds_and_converge_to_the_same_as_bef
     np.testing.assert_allclose(planner.values, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("resolution", "breadth", "room", "follows_changes"), [(3, 0.35, 2, False), (6, 0.08, 12, True)])
-def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again(resolution, breadth, room, follows_changes):
+@pytest.mark.parametrize(
+    ("resolution", "breadth", "room", "transitions", "follows_changes"),
+    [(3, 0.35, 2, list(walk(2, 40, 1)), False), (6, 0.08, 12, list(short_steps(2, 90, 1)), True)],
+)
+def test_a_pair_that_has_lost_its_instances_is_worth_max_value_again(resolution, breadth, room, transitions, follows_changes):
     model, lost = make_model(((resolution,), 0), {**KERNEL, "breadth": breadth}, 0.9, max_instances=room), 0
     planner = planner_of(model, follows_changes=follows_changes)
-    for transition in short_steps(2, 90, 1):
+    for transition in transitions:
         known = model.known.copy()
         learn(model, [transition])
         lost += int((known & ~model.known).sum())

@@ -266,8 +266,9 @@ def test_a_kernel_average_passes_on_after_loading_what_it_had_not_yet(tmp_path):
     """With a large tolerance and a narrow kernel most changes wait: what waits is saved."""
     given = dict(degree=0, model_breadth=0.03, min_fraction=0.02, resolution=6, planning_tolerance=0.1, gamma=0.9)
     model, loaded = learnt_on(small(Walk(start=-0.5), **given).learn(150), tmp_path, 150)
-    waits = np.abs(model.agent.planner._told - model.agent.planner.values)
-    assert 0.0 < waits.max() <= 0.1 and not model.agent.mdp.arrays.changed.all()
+    state = model.agent.planner.get_state()
+    waits = np.abs(state["passed_on"][:, 0] - state["values"])
+    assert 0.0 < waits.max() <= 0.1 and not state["passed_on"][:, 1].all()
     assert same_parameters(model, loaded)
 
 
