@@ -262,16 +262,15 @@ def fitting_grid(
         resolution = max({1: 6, 2: 6, 3: 4}.get(n_variables, 3), coarsest_in_reach(n_variables, reach))
         while resolution > 1 and _n_points(n_variables, resolution, margin, periodic) * n_actions > MAX_PAIRS_BY_DEFAULT:
             resolution -= 1
-    n_points = _n_points(n_variables, resolution, margin, periodic)
-    size = n_points * (n_actions * BYTES_PER_PAIR + BYTES_PER_POINT)
-    if size > _memory() / 2:
+    n_points, of_point = _n_points(n_variables, resolution, margin, periodic), n_actions * BYTES_PER_PAIR + BYTES_PER_POINT
+    if n_points * of_point > _memory() / 2:
         fits = int(np.max(resolution))
-        while fits > 1 and _n_points(n_variables, fits, margin, periodic) * (n_actions * BYTES_PER_PAIR) > _memory() / 2:
+        while fits > 0 and _n_points(n_variables, fits, margin, periodic) * of_point > _memory() / 2:
             fits -= 1
         raise ValueError(
             f"resolution={resolution} with {n_variables} state variables and {n_actions} actions means {n_points:,} grid "
-            f"points and about {size / 2**30:,.1f} GiB of memory, more than half of what this machine has; "
-            f"resolution={fits} fits"
+            f"points and about {n_points * of_point / 2**30:,.1f} GiB of memory, more than half of what this machine has; "
+            + (f"resolution={fits} fits" if fits > 0 else "no resolution fits: fewer state variables or actions would")
         )
     if n_variables <= MAX_VARIABLES:
         _warn_if_too_coarse(n_variables, resolution, reach, model_breadth)

@@ -9,6 +9,7 @@ from helpers.naive_fitted_rmax import NaiveGrid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel.planning import grid as grid_module
 from sb3_combrel.planning.grid import StateGrid, fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
 
@@ -157,6 +158,26 @@ def test_a_default_grid_has_a_million_pairs_at_most():
     with pytest.warns(UserWarning, match="coarse"):
         grid = fitting_grid(4, 5, None, 0.01, 0.01)
     assert 5 * grid.n_points <= 10**6 < 5 * (2 ** (grid.resolution[0] + 1) + 1) ** 4
+
+
+@pytest.mark.parametrize("resolution", [9, [9, 2, 2, 9]])
+def test_the_resolution_that_an_error_proposes_is_the_finest_that_is_accepted(resolution, monkeypatch):
+    def of_grid(resolution):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return fitting_grid(4, 1, resolution, 0.5, 0.01)
+
+    # A little less, and a little more, than a grid of resolution 3 is estimated at: 1,200 bytes a point with one action.
+    for memory, proposed in ((2 * 1200 * 9**4 - 1, 2), (2 * 1200 * 9**4, 3)):
+        monkeypatch.setattr(grid_module, "_memory", lambda memory=memory: float(memory))
+        with pytest.raises(ValueError, match=rf"resolution={proposed} fits"):
+            of_grid(resolution)
+        of_grid(proposed)
+        with pytest.raises(ValueError, match="GiB"):
+            of_grid(proposed + 1)
+    monkeypatch.setattr(grid_module, "_memory", lambda: 1000.0)
+    with pytest.raises(ValueError, match="no resolution fits"):
+        of_grid(1)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def test_swapped_variables_are_found_from_a_few_transitions():
     assert ((predicted.effect - expected) ** 2).sum() < 0.01 * (expected**2).sum()
     assert predicted.weight.min() > 0.35
     assert method.statistics()["transfer/prediction_error"] < 0.1
-    assert 10 <= method.statistics()["transfer/steps_to_find_mapping"] <= 100
+    assert 10 <= method.statistics()["transfer/mapping_last_changed"] <= 100
 
 
 def test_a_mirrored_variable_and_renamed_actions_are_found():

@@ -102,7 +102,7 @@ class SoftHomomorphism(Transfer):
         self._evidence = PriorEvidence(task.n_actions, d)
         self._own: OwnPrediction | None = None
         self._squares = np.zeros(2)  # squared errors of predictions, and squared effects, of transitions as they came
-        self._n_observed = self._n_fits = self._version = self._steps_to_find = 0
+        self._n_observed = self._n_fits = self._version = self._last_changed = 0
         self._fit_due, self._seconds = float(FIRST_RENEWAL), 0.0
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
@@ -157,7 +157,7 @@ class SoftHomomorphism(Transfer):
         found = self._state_mappings()
         self._use(soft.fit(self._logits, self._shape, self._readings, data, self.n_starts, int(self.rng.integers(2**63))))
         if self._state_mappings() != found:
-            self._steps_to_find = self._n_observed
+            self._last_changed = self._n_observed
         self._evidence.renew()
         self._n_fits += 1
         self._version += 1
@@ -218,7 +218,7 @@ class SoftHomomorphism(Transfer):
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
             "transfer/prior_strength": float(self._evidence.strength_of_actions().mean()),
             "transfer/mapping_probability": float(of_mapping.max(axis=1).mean()),
-            "transfer/steps_to_find_mapping": self._steps_to_find,
+            "transfer/mapping_last_changed": self._last_changed,
             "transfer/fits": self._n_fits,
             "transfer/fit_seconds": self._seconds,
             "transfer/target_transitions": self._n_observed,
@@ -226,7 +226,7 @@ class SoftHomomorphism(Transfer):
 
     def get_state(self) -> dict[str, np.ndarray]:
         logits = self._shape if self._logits is None else self._logits
-        figures = self._n_observed, self._n_fits, self._version, self._steps_to_find, self._fit_due, *self._squares
+        figures = self._n_observed, self._n_fits, self._version, self._last_changed, self._fit_due, *self._squares
         return {
             "transitions": self._transitions.rows(),
             "soft_state_logits": logits.state.ravel().copy(),
@@ -238,7 +238,7 @@ class SoftHomomorphism(Transfer):
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         self._transitions.restore(state["transitions"], self._bound_task.n_actions)
         *counts, self._fit_due, wrong, baseline = state["soft_figures"].tolist()
-        self._n_observed, self._n_fits, self._version, self._steps_to_find = (int(count) for count in counts)
+        self._n_observed, self._n_fits, self._version, self._last_changed = (int(count) for count in counts)
         self._squares = np.array([wrong, baseline])
         if self._n_fits:
             given = state["soft_state_logits"], state["soft_action_logits"]
