@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
@@ -43,10 +44,12 @@ class ComparedRun(Job):
 
     :param is_shown: whether the result has values and policy too, for the page
     :param in_use: what the transfer method is once it is bound to the task, as :func:`settings_of` describes it
+    :param classes: of the environment and its wrappers
     """
 
     is_shown: bool = False
     in_use: Any = None
+    classes: tuple[type, ...] = ()
 
     @property
     def name(self) -> str:
@@ -113,9 +116,9 @@ def compare(
         Results do not depend on it.
     :param progress_bar: show which runs are complete; None: in a terminal or notebook
     :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from
-        there. Where the source of the environment's class or function, or that of a method's class, has changed, it is
-        refused, as where that of a class which these inherit from has. What a function calls is not noticed, such as the
-        class of the environment that it makes: take another folder then
+        there. Where the source of the environment's class, its wrappers or the function that makes it, or that of a
+        method's class, has changed, it is refused, as where that of a class which these inherit from has. What else these
+        call is not noticed: take another folder then
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
     :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument
@@ -154,7 +157,9 @@ def compare(
         except ValueError as error:
             warnings.warn(f"there is no control ({error}): controls=False leaves it out without a warning", stacklevel=2)
     if folder is not None:
-        first = {method: replace(run, in_use=_kept_settings(method, in_use[method])) for method, run in first.items()}
+        classes = _classes_of(next(iter(first.values())))
+        kept = {method: _kept_settings(method, in_use[method]) for method in first}
+        first = {method: replace(run, in_use=kept[method], classes=classes) for method, run in first.items()}
     runs = [replace(run, seed=seed, is_shown=seed == numbers[0]) for run in first.values() for seed in numbers]
     console = Console(stderr=True)
     shown = console.is_terminal or console.is_jupyter if progress_bar is None else progress_bar
@@ -186,6 +191,16 @@ def _try_out(run: ComparedRun) -> Transfer | None:
         # Subclasses may ask for more than a message.
         kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
         raise kind(f"{run.method}: {error}") from error
+
+
+def _classes_of(run: ComparedRun) -> tuple[type, ...]:
+    """The classes of a run's environment, from the outermost wrapper on."""
+    with closing(run.make_env()) as env:
+        classes, inner = [type(env)], env
+        while isinstance(inner, gym.Wrapper):
+            inner = inner.env
+            classes.append(type(inner))
+    return tuple(classes)
 
 
 def _kept_settings(method: str, transfer: Transfer | None) -> Any:

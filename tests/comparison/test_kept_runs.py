@@ -200,6 +200,31 @@ def test_an_edited_base_class_makes_another_environment(tmp_path, monkeypatch):
     assert described(one) != before
 
 
+class Slippery(Walk):
+    """The walk, as a class of its own."""
+
+
+class Padded(gym.Wrapper):
+    """A wrapper that changes nothing."""
+
+
+@pytest.mark.parametrize("change", [Slippery, lambda: Padded(Walk())])
+def test_the_class_of_an_environment_that_a_function_makes_tells_runs_apart(change, carried_out, tmp_path):
+    made = [Walk]
+
+    def make():
+        return made[0]()
+
+    quietly(env=make, output=tmp_path)
+    carried_out.clear()
+    quietly(env=make, output=tmp_path)
+    assert not carried_out
+    made[0] = change
+    with pytest.raises(ValueError, match="classes"):
+        quietly(env=make, output=tmp_path)
+    assert not carried_out
+
+
 TYPED_IN = """
 import abc
 
