@@ -83,7 +83,7 @@ class CompareResult:
     @property
     def table(self) -> str:
         """Taylor & Stone's measures, as Markdown, with raw p-values and those corrected by Holm's method."""
-        return markdown_table(*self.rows, n_names=2)
+        return markdown_table(*self.rows, n_names=2, aligned=True)
 
     @property
     def rows(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -192,11 +192,13 @@ def evaluate(
     counts = counts_within(shortest)
     if threshold is None:
         threshold = float(np.median(asymptotic_return(curves[baseline], counts["n_last"])))
-    # All comparisons are of the same number of steps, so that their figures can be compared.
+    # All comparisons are of the same number of steps, and above the same floor, so that their figures can be compared.
     n_steps = min(int(each.n_steps.min()) for each in curves.values())
+    floor = min(0.0, *(float(np.nanmin(each.returns)) for each in curves.values()))
+    window = min(WINDOW, shortest)
     measures = {
         method: compare_learning(
-            each, curves[baseline], threshold=threshold, **counts, window=min(WINDOW, shortest), n_steps=n_steps
+            each, curves[baseline], threshold=threshold, **counts, window=window, floor=floor, n_steps=n_steps
         )
         for method, each in curves.items()
         if method != baseline

@@ -35,10 +35,19 @@ class Table(NamedTuple):
         return f"**{self.title}**\n\n{markdown_table(self.header, self.rows)}\n"
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], n_names: int = 1) -> str:
-    """Return a table in GitHub's Markdown; the first ``n_names`` columns hold names, the others numbers, at the right."""
-    lines = [header, ["---"] * n_names + ["---:"] * (len(header) - n_names), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], n_names: int = 1, aligned: bool = False) -> str:
+    """Return a table in GitHub's Markdown; the first ``n_names`` columns hold names, the others numbers, at the right.
+
+    :param aligned: whether columns are as wide as their widest cell, to be read as they are
+    """
+    lines = [[cell.replace("|", "\\|") for cell in line] for line in (header, *rows)]
+    widths = [max(4, *map(len, column)) if aligned else 0 for column in zip(*lines, strict=True)]
+    cells = [
+        [c.ljust(w) if k < n_names else c.rjust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True))]
+        for line in lines
+    ]
+    rules = [max(w, 3) * "-" if k < n_names else max(w - 1, 3) * "-" + ":" for k, w in enumerate(widths)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (cells[0], rules, *cells[1:]))
 
 
 def write_tables(tables: Sequence[Table], path: Path, console: Console) -> list[Path]:

@@ -42,6 +42,12 @@ def test_each_run_is_that_of_the_learner_with_its_seed(result):
             np.testing.assert_array_equal(curves.steps[row, :n], recorder.episodes.steps)
 
 
+def cells_of(table):
+    """The cells of each line of a Markdown table, but for the rule, without the spaces around them."""
+    lines = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table.splitlines()]
+    return [lines[0], *lines[2:]]
+
+
 def test_measures_are_those_of_taylor_and_stone(result):
     with_transfer, without = result.curves["TIMBREL"], result.curves["none"]
     n = min(10, *with_transfer.n_episodes, *without.n_episodes)
@@ -56,18 +62,18 @@ def test_measures_are_those_of_taylor_and_stone(result):
 
 
 def test_the_table_has_a_row_for_each_measure_and_the_figure_a_curve_for_each_method(result):
-    lines = result.table.splitlines()
-    assert [line.split(" | ")[0][2:] for line in lines[2:]] == [
+    assert len({len(line) for line in result.table.splitlines()}) == 1, "columns stand below each other"
+    header, *lines = cells_of(result.table)
+    assert [line[0] for line in lines] == [
         "jumpstart",
         "asymptotic performance",
         "mean return over steps",
         "transfer ratio, over steps",
         f"steps to a return of {result.threshold:.4g}",
     ]
-    assert len({line.count("|") for line in lines}) == 1
-    assert lines[0] == "| measure | method | none | with | difference | 95% interval | p | p (Holm) |"
+    assert header == ["measure", "method", "none", "with", "difference", "95% interval", "p", "p (Holm)"]
     measure = result.measures["TIMBREL"].total_reward_by_steps
-    assert lines[4].split(" | ")[2:5] == [
+    assert lines[2][2:5] == [
         f"{measure.without.mean() / result.n_steps:.4g}",
         f"{measure.with_transfer.mean() / result.n_steps:.4g}",
         f"{measure.effect / result.n_steps:+.3g}",
@@ -150,15 +156,19 @@ def test_with_several_methods_more_seeds_are_asked_for(monkeypatch):
 def test_several_methods_are_corrected_for_their_number(monkeypatch):
     runs = {"none": around(-60.0, 5), "one": around(-50.0, 5), "two": around(-40.0, 5)}
     found = made_up(monkeypatch, runs, threshold=-10)
-    assert "steps to a return of -10 | one | not reached | not reached | — |" in found.table
+    assert ["steps to a return of -10", "one", "not reached", "not reached", "—"] in [row[:5] for row in cells_of(found.table)]
     assert "inf" not in str(found) and "nan" not in str(found)
     smallest = 2 / 252
     assert found.p_values == pytest.approx({"one": 2 * smallest, "two": 2 * smallest})
     assert found.sentence.count("transfer helped") == 2
     assert found.sentence.count("(p = 0.016, by Holm's correction for 2 comparisons)") == 2
-    [mean_of_one, _] = [line for line in found.table.splitlines() if line.startswith("| mean return over steps")]
-    assert mean_of_one.endswith("| 0.0079 | 0.016 |")
-    assert [line.split(" | ")[1] for line in found.table.splitlines()[2:]] == ["one"] * 5 + ["two"] * 5
+    [mean_of_one, _] = [row for row in cells_of(found.table) if row[0] == "mean return over steps"]
+    assert mean_of_one[-2:] == ["0.0079", "0.016"]
+    assert [row[1] for row in cells_of(found.table)[1:]] == ["one"] * 5 + ["two"] * 5
+    # Ratios above different floors could not be compared: the third method has the lowest return of all.
+    lowest = made_up(monkeypatch, {**runs, "three": around(-90.0, 5)}, threshold=-10)
+    floors = [each.floor for each in lowest.measures.values()]
+    assert floors == [float(np.nanmin(lowest.curves["three"].returns))] * 3
 
 
 def test_few_seeds_and_few_episodes_are_warned_of(monkeypatch):
