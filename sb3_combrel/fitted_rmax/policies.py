@@ -23,6 +23,9 @@ from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
 
+# With so many instances an observation that makes a scale wider by more than this is a surprise.
+MANY_INSTANCES, MANY_RANGES = 100, 20
+
 
 class FittedRMaxPolicy(BasePolicy):
     """Acts on the action values of a :class:`~sb3_combrel.fitted_rmax.agent.FittedRMaxAgent`, :attr:`agent`.
@@ -66,7 +69,7 @@ class FittedRMaxPolicy(BasePolicy):
         self._first_action = int(action_space.start)
         self._settings = settings
         self._model_class = model_class
-        self._warned_beyond_space = False
+        self._warned_beyond_space = self._warned_far = False
 
     def _renew_to_unit(self) -> None:
         #: Observations, raw units, to unit coordinates; what is outside fixed bounds is moved to the boundary, or wrapped.
@@ -103,10 +106,11 @@ class FittedRMaxPolicy(BasePolicy):
         """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
         if self.scales.fixed or not (episode_ended or self.to_unit.went_beyond):
             return False
-        scaling = self.scales.renewed(episode_ended, self.agent.transfers)
+        before, scaling = self.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
         if scaling is not None:
             try:
                 self._warn_beyond_space()
+                self._warn_of_far_observation(before)
                 self.agent.rescale(scaling, self.scales.bounds)
             except BaseException:
                 self.scales.scaling = self.agent.task.scaling
@@ -125,6 +129,21 @@ class FittedRMaxPolicy(BasePolicy):
         space = ", ".join(f"from {self.scales.low[k]:.4g} to {self.scales.high[k]:.4g}" for k in beyond)
         warnings.warn(
             f"observations are outside the observation space: {seen}, but the space says {space}; they are taken as they are",
+            stacklevel=4,
+        )
+
+    def _warn_of_far_observation(self, before: StateScaling) -> None:
+        wider = self.scales.widened(before)
+        k = int(wider.argmax())
+        if self._warned_far or self.agent.model.n_instances < MANY_INSTANCES or wider[k] <= MANY_RANGES:
+            return
+        self._warned_far = True
+        least, most = self.scales.observed[:, k]
+        name, value = self.agent.task.state_names[k], least if before.low[k] - least > most - before.high[k] else most
+        warnings.warn(
+            f"{name}={value:.4g} is far from all observations before, from {before.low[k]:.4g} to {before.high[k]:.4g}, and "
+            "variables without bounds are scaled by the range of what is observed: if it is an error of a sensor, mend it in "
+            "the environment, or pass bounds=(low, high)",
             stacklevel=4,
         )
 

@@ -87,6 +87,11 @@ class FoundScales:
         beyond: np.ndarray = self._found & ((least < self.low - tolerated) | (most > self.high + tolerated))
         return beyond
 
+    def widened(self, before: StateScaling) -> np.ndarray:
+        """By how much wider than before each variable without bounds is scaled, shape (n_variables,); 0 for the others."""
+        wider: np.ndarray = (self.scaling.high - self.scaling.low) / (before.high - before.low)
+        return np.where(self._by_use, wider, 0.0)
+
     def get_state(self) -> np.ndarray:
         """What :meth:`set_state` takes: bounds in use, range of the observations, and whether instances have been transferred.
 

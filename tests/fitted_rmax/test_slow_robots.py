@@ -129,6 +129,33 @@ def test_degrees_and_errors_of_sensors_are_warned_of():
         FittedRMax(Line(low=-np.inf, high=np.inf)).load_instances(table)
 
 
+class Glitch(gym.ObservationWrapper):
+    """Its sensor is wrong once, at observation ``at``."""
+
+    at, n = 200, 0
+
+    def observation(self, observation):
+        self.n += 1
+        return np.array([-9999.0, observation[1]]) if self.n == self.at else observation
+
+
+def test_an_error_of_a_sensor_while_it_learns_is_warned_of_once():
+    model = FittedRMax(Glitch(Line(low=-np.inf, high=np.inf)), seed=0)
+    with pytest.warns(
+        UserWarning, match=r"s0=-9999 is far from all observations before, from .* bounds=\(low, high\)"
+    ) as all_:
+        model.learn(400)
+    assert sum("is far from all" in str(each.message) for each in all_) == 1
+    early = Glitch(Line(low=-np.inf, high=np.inf))
+    early.at = 50
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Few observations are no measure of what is far, and a space with bounds says what there can be.
+        FittedRMax(early, seed=0).learn(150)
+        FittedRMax(Line(low=-np.inf, high=np.inf), seed=0).learn(400)
+        FittedRMax(Glitch(Line(low=-10_000.0, high=10_000.0)), seed=0).learn(400)
+
+
 def test_evaluating_in_the_environment_that_is_learned_in_is_warned_of():
     model = FittedRMax(Line(), seed=0)
     shared = EvalCallback(model.get_env(), n_eval_episodes=1, eval_freq=1000, verbose=0)
