@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.methods.combrel import DEFAULT_OF_PRIOR
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.methods.timbrel import TIMBREL
+from sb3_combrel.transfer.prior.prior_sets import PRACTICAL_SETS
 
 #: Its name among the methods.
 CONTROL = "random mapping"
@@ -40,7 +40,7 @@ def random_control(in_use: Mapping[str, Transfer | None]) -> TIMBREL | None:
     choosing = [each for each in with_mappings if not _is_given(each)]
     method = (choosing or with_mappings)[0]
     # Where the mapping is given there is no set to draw from but the default one.
-    default = DEFAULT_OF_PRIOR if method.use == "prior" else "injective"
+    default = PRACTICAL_SETS[0] if method.use == "prior" else "injective"
     same = {name: getattr(method, name) for name in _SAME}
     return TIMBREL(method.source, "random", mappings=method.mappings if choosing else default, **same)
 

@@ -37,12 +37,18 @@ def state_mappings_using_sources(n_source: int, n_target: int, *, once: bool, al
     return rows
 
 
+def count_copies(n_source: int, n_target: int, signed: bool = False) -> int:
+    """How many :func:`copies_of_source` there are; ``signed``: with all choices of signs."""
+    sizes = range(1, min(n_source, n_target) + 1)
+    return sum(comb(n_source, k) * perm(n_target, k) * (2**k if signed else 1) for k in sizes)
+
+
 def copies_of_source(n_source: int, n_target: int) -> Ints:
     """State mappings of every copy of the source, or of some of its variables: of different ones, most variables first."""
     check_count("n_source_variables", n_source, max=MAX_SOURCE_VARIABLES)
     check_count("n_target_variables", n_target, max=MAX_TARGET_VARIABLES)
     largest = min(n_source, n_target)
-    _check_n_state_mappings(sum(comb(n_source, k) * perm(n_target, k) for k in range(1, largest + 1)))
+    _check_n_state_mappings(count_copies(n_source, n_target))
     rows = []
     for size in range(largest, 0, -1):
         for used, taken in product(combinations(range(n_source), size), permutations(range(n_target), size)):

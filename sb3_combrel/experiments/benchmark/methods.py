@@ -24,9 +24,9 @@ from sb3_combrel.experiments.benchmark.oracle import KnownCopies
 from sb3_combrel.experiments.benchmark.pair import Pair, check_name
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.transfer.base import Transfer
-from sb3_combrel.transfer.methods.combrel import DEFAULT_OF_PRIOR
 from sb3_combrel.transfer.methods.learned_translation import DEFAULT_SAMPLE_STEPS
 from sb3_combrel.transfer.methods.master import DEFAULT_RANDOM_STEPS
+from sb3_combrel.transfer.prior.prior_sets import PRACTICAL_SETS
 
 #: Instances of a pair's source, or a list of those of several.
 Sources = SourceInstances | list[SourceInstances]
@@ -107,7 +107,7 @@ def _soft_homomorphism(sources: Sources, pair: Pair) -> Transfer:
 
 def _same_as_factored(pair: Pair) -> str | None:
     """COMBREL by default is COMBREL with the pair's factored mappings if it has mirrored ones, for which the default looks."""
-    return FACTORED if pair.mappings == DEFAULT_OF_PRIOR else None
+    return FACTORED if pair.mappings == PRACTICAL_SETS[0] else None
 
 
 FACTORED = "COMBREL-factored"

@@ -9,18 +9,15 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import MappingsLike, SourceLike
+from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.instances.compliance_selector import ComplianceSelector, SelectionOptions
 from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_either
-from sb3_combrel.transfer.prior.prior_sets import is_factored
+from sb3_combrel.transfer.prior.prior_sets import PRACTICAL_SETS, WITHOUT_COPIES, is_factored, practical_set
 from sb3_combrel.transfer.prior.report_of_prior import compliance_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
-
-#: Variables of the target may be mirrored ones of the source.
-DEFAULT_OF_PRIOR = "signed_factored"
 
 
 @dataclass(repr=False, eq=False)
@@ -50,10 +47,10 @@ class COMBREL(MappingTransfer):
 
     :param source: as there; of several sources is selected as well
     :param mappings: a set as there, by default "injective" with ``use="instances"``; with ``use="prior"`` also
-        "signed_factored", the default, or "factored": the target's variables are divided among copies of the source, or of
-        some of its variables, as they are or, where that explains twice as much, mirrored, each moved by a source action of
-        its own, and variables that stay; or a ``FactoredMapping``. Where every target variable is mapped, as in "surjective",
-        translated instances lie on diagonals of the target's space and help much less
+        "signed_factored", the default where there are at most 2,000 copies, or "factored": the target's variables are divided
+        among copies of the source, or of some of its variables, as they are or, where that explains twice as much, mirrored,
+        each moved by a source action of its own, and variables that stay; or a ``FactoredMapping``. Where all target variables
+        are mapped, as in "surjective", translated instances lie on diagonals of the target's space and help much less
     :param n_neighbors: how many of the nearest target transitions are averaged over; k of Algorithm 1 (the paper: 3)
     :param neighbors: "action": the nearest transitions with the same action are averaged over; or "state_action": the nearest
         whatever their action, each judged by the source action that the mapping has for *its* action; at most 20,000 mappings
@@ -110,7 +107,7 @@ class COMBREL(MappingTransfer):
         if self.use is None:
             self.use = "prior" if self.mappings is not None and is_factored(self.mappings) else "instances"
         if self.mappings is None:
-            self.mappings = DEFAULT_OF_PRIOR if self.use == "prior" else "injective"
+            self.mappings = PRACTICAL_SETS[0] if self.use == "prior" else WITHOUT_COPIES
         super().__post_init__()
 
     @classmethod
@@ -126,7 +123,8 @@ class COMBREL(MappingTransfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         if self._left_open:
-            self.mappings = DEFAULT_OF_PRIOR if task.takes_prior else "injective"
+            self.source = load_sources(self.source)
+            self.mappings = practical_set(self.source, task) if task.takes_prior else WITHOUT_COPIES
         super().bind(task, rng)
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:

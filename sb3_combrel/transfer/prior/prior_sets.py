@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.mapping_set import FACTORED_SETS
 from sb3_combrel.mappings.named_sets import InterTaskMapping, resolve
-from sb3_combrel.mappings.state_mappings import copies_of_source, with_mirrored
+from sb3_combrel.mappings.state_mappings import copies_of_source, count_copies, with_mirrored
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike, load_sources, sizes
@@ -29,6 +30,8 @@ from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 # Each copy predicts every transition with each source action.
 MAX_COPIES = 2000
+# What COMBREL looks through by default, the largest set that is practical; and where neither is.
+PRACTICAL_SETS, WITHOUT_COPIES = ("signed_factored", "factored"), "injective"
 
 
 def is_factored(mappings: Any) -> bool:
@@ -81,6 +84,32 @@ def make_prior(
     )
 
 
+def practical_set(sources: Sequence[SourceInstances], task: TargetTask) -> str:
+    """The name of the largest set that COMBREL looks through by default, with a warning where it is not the usual one."""
+    usual = PRACTICAL_SETS[0]
+    for name in PRACTICAL_SETS:
+        if task.n_variables <= MAX_FACTORED_VARIABLES and _count_copies(name, sources, task) <= MAX_COPIES:
+            break
+    else:
+        name = WITHOUT_COPIES
+    if name != usual:
+        without = "variables are not mirrored" + (
+            ", and one source action moves all of them" if name == WITHOUT_COPIES else ""
+        )
+        warnings.warn(
+            f'mappings="{usual}", the default, has {_count_copies(usual, sources, task):,} copies from these source tasks to '
+            f'{task.n_variables} state variables, more than the {MAX_COPIES:,} that are practical: "{name}" is taken instead, '
+            f"in which {without}. Fewer variables, or mappings of your own, avoid that",
+            stacklevel=2,
+        )
+    return name
+
+
+def _count_copies(name: str, sources: Sequence[SourceInstances], task: TargetTask) -> int:
+    signed = name.startswith("signed_")
+    return sum(count_copies(source.n_variables, task.n_variables, signed) for source in sources)
+
+
 def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> Copies:
     """Every copy of every source, or of some of its variables."""
     if task.n_variables > MAX_FACTORED_VARIABLES:
@@ -88,14 +117,16 @@ def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTas
             f'mappings="{name}" is for targets of at most {MAX_FACTORED_VARIABLES} state variables, got {task.n_variables}; '
             "give a FactoredMapping"
         )
+    n_copies = _count_copies(name, sources, task)
+    if n_copies > MAX_COPIES:
+        raise ValueError(
+            f'mappings="{name}" has {n_copies:,} copies from these source tasks to {task.n_variables} state variables, '
+            f'more than the {MAX_COPIES:,} that are practical; leave mappings out, or give "{WITHOUT_COPIES}", whose mappings '
+            "are whole, or a FactoredMapping"
+        )
     states = [copies_of_source(source.n_variables, task.n_variables) for source in sources]
     signed = [with_mirrored(state) if name.startswith("signed_") else (state, np.ones_like(state)) for state in states]
     number = np.repeat(np.arange(len(signed)), [len(state) for state, _ in signed])
-    if len(number) > MAX_COPIES:
-        raise ValueError(
-            f'mappings="{name}" has {len(number)} copies from these source tasks to {task.n_variables} state variables, '
-            f"more than the {MAX_COPIES} that are practical; give a FactoredMapping"
-        )
     state, sign = map(np.concatenate, zip(*signed, strict=True))
     return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
 
