@@ -87,4 +87,6 @@ def tables_in(text: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    import tyro
+
+    tyro.cli(main)

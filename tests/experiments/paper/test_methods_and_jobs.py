@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.pages import ROOT
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, MappingSet
+from sb3_combrel.experiments.numbers import cells_of
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import BEST, DIAGNOSED, DOMAINS, ICUB, MOUNTAIN_CAR, PAPER, SETTINGS
 from sb3_combrel.experiments.paper.jobs import (
@@ -19,6 +21,7 @@ from sb3_combrel.experiments.paper.jobs import (
     uses_of,
 )
 from sb3_combrel.experiments.paper.targets import methods_of, targets_of
+from sb3_combrel.experiments.tasks import icub_arm, mountain_car
 from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.models.kernel_average import KernelAverage
 from sb3_combrel.runs.job import chosen_on_purpose, make_env
@@ -282,3 +285,14 @@ def test_the_jobs_of_the_diagnosis_differ_in_breadth_alone(short, sources):
         assert method in DIAGNOSED_METHODS
         assert job.learner == {**DIAGNOSED.learner, "model_breadth": float(breadth)}
         assert (job.transfer is None) == (method == DIAGNOSED_METHODS[0]) and not job.records_selections
+
+
+def test_the_page_has_the_parameters_of_tables_1_and_3():
+    text = (ROOT / "docs/results.md").read_text()
+    _, rows = cells_of(text[text.index("| parameter | Mountain Car | iCub |") :].partition("\n\n")[0])
+    for column, (domain, task) in enumerate([(MOUNTAIN_CAR, mountain_car), (ICUB, icub_arm)], start=1):
+        learner, combrel = domain.settings[PAPER].learner, domain.settings[PAPER].combrel
+        names = "model_breadth", "min_fraction", "min_weight"
+        expected = [*(learner[name] for name in names), task.N_INSTANCES, combrel["n_neighbors"]]
+        assert [float(row[column]) for row in rows] == expected
+        assert combrel["breadth"] == learner["model_breadth"]
