@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 def names_of(env: VecEnv) -> dict[str, Any]:
     """Return names of state variables and actions, where the environment has as many of them as it must have."""
     lengths = {"state_names": (env.observation_space.shape or (0,))[0], "action_names": getattr(env.action_space, "n", 0)}
-    found = {name: _list_of(env, name, n, (str,)) for name, n in lengths.items()}
-    return {name: names for name, names in found.items() if names is not None}
+    found = {name: _list_of(env, name, int(n), (str,)) for name, n in lengths.items()}
+    return {name: names for name, names in found.items() if names}
 
 
 def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any]:
@@ -30,12 +30,6 @@ def periodic_of(env: VecEnv) -> list[bool] | None:
     """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
     n_variables = (env.observation_space.shape or (0,))[0]
     flags = _list_of(env, "periodic", n_variables, (bool, np.bool_))
-    if flags is None and env.has_attr("periodic"):
-        warnings.warn(
-            f"the environment's periodic={env.get_attr('periodic', 0)[0]!r} is not one bool for each of the {n_variables} "
-            "variables of the observations, and is ignored: pass FittedRMax(env, periodic=[...])",
-            stacklevel=4,
-        )
     return None if flags is None else [bool(flag) for flag in flags]
 
 
@@ -58,12 +52,22 @@ def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
 
 
 def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[Any] | None:
-    """Return an attribute of the first environment, if it is ``n`` values of some types."""
+    """Return an attribute of the first environment, if it is ``n`` values of some types; a warning if it is something else."""
     # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
-    value = env.get_attr(name, 0)[0] if n > 0 and env.has_attr(name) else None
-    if not isinstance(value, Sequence | np.ndarray) or len(value) != n or not all(isinstance(each, types) for each in value):
+    if n == 0 or not env.has_attr(name):
         return None
-    return list(value)
+    value = env.get_attr(name, 0)[0]
+    is_list = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
+    if is_list and len(value) == n and all(isinstance(each, types) for each in value):
+        return list(value)
+    if not (types == (str,) and (value is None or (is_list and len(value) == 0))):
+        what = "action" if name == "action_names" else "variable"
+        warnings.warn(
+            f"the environment's {name}={value!r} is not one {types[0].__name__} for each of the {n} {what}s, and is ignored: "
+            f"{'pass FittedRMax(env, periodic=[...])' if name == 'periodic' else 'an environment may leave it out'}",
+            stacklevel=5,
+        )
+    return None
 
 
 def refuse_normalized_observations(env: VecEnv) -> None:

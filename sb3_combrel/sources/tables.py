@@ -54,6 +54,7 @@ def read_table(
         )
     flags = periodic_flags(periodic, len(names))
     check_periods(np.array(flags) & (bounds is None))
+    _warn_of_no_ends(frame, names)
     steps, next_states = _with_next_states(frame, names)
     states = _numbers(steps, names)
     actions = _actions(steps, action_names)
@@ -160,6 +161,17 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
     if len(chosen) == 0:
         raise ValueError(f"the table has no transition: it needs columns {following}, or two rows of one episode")
     return frame.iloc[chosen], _numbers(frame.iloc[chosen + 1], names)
+
+
+def _warn_of_no_ends(frame: pd.DataFrame, names: Sequence[str]) -> None:
+    """Warn of a table none of whose columns says where episodes end."""
+    if {TERMINATED, DONE, TRUNCATED, EPISODE}.intersection(frame.columns):
+        return
+    if any(f"{NEXT}{name}" in frame.columns for name in names):
+        what = "no transition is taken to end an episode: add"
+    else:
+        what = f"all {len(frame)} rows are taken as one episode that does not end: add {EPISODE!r} or {TRUNCATED!r}, and"
+    warnings.warn(f"no column of the table says where episodes end, and {what} {TERMINATED!r} where they do", stacklevel=5)
 
 
 def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:

@@ -108,6 +108,35 @@ def test_flags_of_periodic_variables_that_do_not_fit_the_observations_are_warned
         FittedRMax(env)
 
 
+@pytest.mark.parametrize("names", [["x"], "xv", ["x", 3], np.array([1.0, 2.0])])
+def test_names_that_do_not_fit_the_task_are_warned_of(names):
+    with pytest.warns(UserWarning, match="state_names=.* is not one str for each of the 2 variables, and is ignored"):
+        model = FittedRMax(Line(names=names))
+    assert model.agent.task.state_names == ("s0", "s1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert FittedRMax(Line(names=["x", "v"])).agent.task.state_names == ("x", "v")
+        for none in ((), None):
+            env = Line()
+            env.state_names = none
+            FittedRMax(env)
+
+
+def test_a_log_that_does_not_say_where_episodes_end_is_warned_of():
+    table = log_of(Line(), 60)
+    following = [name for name in table.columns if name.startswith("next_")]
+    with pytest.warns(
+        UserWarning, match="all 60 rows are taken as one episode that does not end: add 'episode' or 'truncated'"
+    ):
+        assert len(FittedRMax(Line()).load_instances(table.drop(columns=[*following, "terminated"])).source_instances()) == 59
+    with pytest.warns(UserWarning, match="no transition is taken to end an episode: add 'terminated'"):
+        FittedRMax(Line()).load_instances(table.drop(columns="terminated"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        FittedRMax(Line()).load_instances(table)
+        FittedRMax(Line()).load_instances(table.drop(columns=following).assign(terminated=False, episode=0))
+
+
 def test_actions_that_may_be_counted_from_another_number_are_warned_of():
     table = log_of(Line(), 60)
     table = table[table.action > 0]

@@ -61,6 +61,27 @@ class TestQLearning:
         assert learner.predict(np.array([0.0]), deterministic=True) == (4, None)
         assert learner.predict(np.array([[0.1], [0.9]]), deterministic=True)[0].tolist() == [4, 4]
 
+    @pytest.mark.parametrize(("gamma", "trace_decay"), [(1.0, 0.9), (0.9, 0.5)])
+    def test_values_are_those_of_traces_of_all_tiles(self, gamma, trace_decay):
+        learner, steps = QLearning("MountainCar-v0", gamma=gamma, trace_decay=trace_decay, epsilon=0.2, seed=0), []
+        learner.learn(700, lambda *step: steps.append(step))
+        weights, traces, arrived = np.zeros_like(learner.weights), np.zeros_like(learner.weights), None
+        for state, action, reward, following, terminated in steps:
+            if arrived is None or not np.array_equal(state, arrived):
+                traces[:] = 0.0
+            tiles, next_tiles = (learner.coding.tiles(learner.scaling.to_unit(each)) for each in (state, following))
+            values = weights[tiles].sum(axis=0)
+            if values[action] < values.max():
+                traces[:] = 0.0
+            best = 0.0 if terminated else weights[next_tiles].sum(axis=0).max()
+            traces *= gamma * trace_decay
+            traces[tiles] = 0.0
+            traces[tiles, action] = 1.0
+            weights += 0.3 / 8 * (reward + gamma * best - values[action]) * traces
+            arrived = following
+        assert len(learner.episode_lengths) > 2 and weights.any()
+        np.testing.assert_array_equal(learner.weights, weights)
+
     def test_it_solves_mountain_car_and_its_experience_is_a_source(self):
         source = SourceInstances.from_q_learning(MOUNTAIN_CAR, n_instances=1000, seed=0, total_timesteps=10_000)
         assert len(source) == 1000 and source.state_names == ("x", "v")
