@@ -276,20 +276,22 @@ class FittedRMax(PastData):
     ) -> SelfFittedRMax:
         """Learn, and return the trained model.
 
-        :param total_timesteps: environment steps, of all environments together
+        :param total_timesteps: environment steps, of all environments together; with 0 it returns at once
         :param callback: callback(s) called at every step
         :param log_interval: episodes between two logs; None for none
         :param tb_log_name: the name of the run for TensorBoard logging, which Stable-Baselines3 numbers. None: with the
             transfer method and the seed, so that runs can be told apart, such as ``FittedRMax_COMBREL_seed3``
         :param reset_num_timesteps: whether to count steps from 0 again (what was learned is kept in any case)
         :param progress_bar: display a progress bar using tqdm and rich
-        :raises ValueError: if an argument is out of its range, or the environment returns something that is not finite
+        :raises ValueError: if an argument is out of its range, the environment returns something that is not finite, or an
+            argument of the constructor was changed afterwards
         """
-        total_timesteps = as_count("total_timesteps", total_timesteps, max=MAX_TIMESTEPS)
+        total_timesteps = as_count("total_timesteps", total_timesteps, min=0, max=MAX_TIMESTEPS)
         check_count("log_interval", log_interval, none_allowed=True)
         check_type("tb_log_name", tb_log_name, (str, type(None)), "text or None")
         check_boolean("reset_num_timesteps", reset_num_timesteps)
         check_boolean("progress_bar", progress_bar)
+        self._refuse_changes()
         if self.env is None:
             raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")
         run_name = self._run_name() if tb_log_name is None else tb_log_name
@@ -309,6 +311,16 @@ class FittedRMax(PastData):
             callback.on_training_end()
         self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
         return self
+
+    def _refuse_changes(self) -> None:
+        """:raises ValueError: if an attribute has been given another value, which what was learned would not follow"""
+        for name in FittedRMaxSettings.names():
+            now, used = getattr(self, name), getattr(self.agent.settings, name)
+            if now is not used and repr(now) != repr(used):
+                raise ValueError(
+                    f"{name} must be what the model was made with, {used!r}, got {now!r}: set it back, or save the model and "
+                    f"call FittedRMax.load(path, {name}={now!r}), which follows if that can be changed"
+                )
 
     def _run_name(self) -> str:
         method = "" if self.transfer is None else f"_{type(self.transfer).__name__}"

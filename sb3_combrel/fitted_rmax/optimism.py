@@ -46,6 +46,11 @@ class RewardRange:
         return DISCOUNT if self.largest >= 0.0 or never_ends else 1.0
 
     @property
+    def finds_max_value(self) -> bool:
+        """Whether ``max_value`` is found, as the user has not given it."""
+        return self._max_value is None
+
+    @property
     def max_value(self) -> float:
         """The largest return that is possible, as far as one knows."""
         if self._max_value is not None:

@@ -59,10 +59,13 @@ class ProgressWatch:
             value = reward + self.gamma * value
             best = max(best, value)
         if best > self.max_value + 1e-6 * max(1.0, abs(self.max_value)):
+            advice = "pass a larger max_value"
+            if self.rewards.finds_max_value and self.gamma == 1.0:
+                advice = "with gamma=1 and rewards above 0 none is found: leave gamma out, pass one below 1, or pass max_value"
             self._warn(
                 "exceeded",
                 f"max_value={self.max_value:g} must be an upper bound on the return (discounted with gamma={self.gamma:g}), "
-                f"but a return of {best:g} was observed; pass a larger max_value, or the agent will stop exploring too soon",
+                f"but a return of {best:g} was observed; {advice}, or the agent will stop exploring too soon",
             )
 
     def _note_cost(self, rewards: Sequence[float], terminated: bool) -> None:

@@ -53,6 +53,9 @@ def explain(
     """
     if output is not None:
         check_matplotlib("leave output out")
+    elif variables is not None or at is not None:
+        given = f"variables={variables!r}" if variables is not None else f"at={at!r}"
+        raise ValueError(f"output must be a folder where {given} says what is drawn, got None: pictures are written there")
     if not isinstance(model, FittedRMax | str | os.PathLike):
         raise ValueError(f"model must be a FittedRMax model or the path of its file, got {model!r}")
     if not isinstance(model, FittedRMax):

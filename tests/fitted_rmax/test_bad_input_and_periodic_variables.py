@@ -125,7 +125,7 @@ def unlearned():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *[("total_timesteps", value) for value in (0, 0.5, 1e16, np.nan, True, "many", None)],
+        *[("total_timesteps", value) for value in (-1, 0.5, 1e16, np.nan, True, "many", None)],
         *[("log_interval", value) for value in (0, -4, True, 2.5)],
         *[("tb_log_name", 3), ("reset_num_timesteps", "False"), ("progress_bar", 1)],
     ],

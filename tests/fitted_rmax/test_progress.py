@@ -29,6 +29,14 @@ def shown(watch, episodes, explores=True):
     return messages
 
 
+def test_where_no_max_value_is_found_the_warning_says_why():
+    # What is given can be larger; with gamma 1 and rewards above 0 none is found, however large.
+    [(_, found)] = shown(watch_with(None, 1.0), [([1.0] * 4, True)], explores=False)
+    assert "with gamma=1 and rewards above 0 none is found: leave gamma out" in found and "a larger max_value" not in found
+    [(_, given)] = shown(watch_with(2.0, 1.0), [([1.0] * 4, True)], explores=False)
+    assert "pass a larger max_value, or" in given
+
+
 @pytest.mark.parametrize(
     ("max_value", "gamma", "rewards", "terminated", "observed"),
     [

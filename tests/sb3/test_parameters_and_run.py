@@ -134,3 +134,24 @@ def test_learning_counts_steps_and_episodes(make):
     assert model.num_timesteps == 30, "steps are counted from 0 again"
     assert model.agent.model.n_instances == 130, "what was learned is kept"
     assert model.learn(1e1).num_timesteps == 10, "as it is often written"
+
+
+def test_no_steps_are_learned_at_once_as_the_rest_of_a_run_that_is_complete():
+    model = small().learn(60)
+    learned = {name: tensor.clone() for name, tensor in model.get_parameters()["policy"].items()}
+    assert model.learn(60 - model.num_timesteps, reset_num_timesteps=False) is model and model.num_timesteps == 60
+    assert all(th.equal(learned[name], tensor) for name, tensor in model.get_parameters()["policy"].items())
+    assert small().learn(0).num_timesteps == 0
+
+
+@pytest.mark.parametrize(("name", "value"), [("gamma", 0.5), ("max_value", 3.0), ("bounds", ([0.0, 0.0], [9.0, 9.0]))])
+def test_an_argument_that_is_changed_afterwards_is_refused_and_a_saved_model_follows(name, value, tmp_path):
+    model = small().learn(30)
+    before = getattr(model, name)
+    setattr(model, name, value)
+    with pytest.raises(ValueError, match=f"{name} must be what the model was made with, .* got .*load\\(path, {name}="):
+        model.learn(10)
+    setattr(model, name, before)
+    model.learn(10).save(tmp_path / "model")
+    assert repr(getattr(FittedRMax.load(tmp_path / "model", **{name: value}).agent.settings, name)) == repr(value)
+    FittedRMax.load(tmp_path / "model", env=Walk(), **{name: value}).learn(10)

@@ -234,3 +234,10 @@ def test_the_command_prints_the_report_and_writes_it_with_the_pictures(saved, tm
     assert all(str(file) in written for file in tmp_path.iterdir()) and len(list(tmp_path.glob("*.png"))) == 2
     status, written = call_for_all_output("explain", tmp_path / "nowhere.zip")
     assert status == 1 and "there is no model file" in written and "Traceback" not in written
+
+
+@pytest.mark.parametrize("drawn", [{"variables": [("x", "nonsense")]}, {"at": [1.0, 2.0, 3.0]}])
+def test_what_is_to_be_drawn_needs_a_folder(drawn):
+    [name] = drawn
+    with pytest.raises(ValueError, match=rf"output must be a folder where {name}=.* says what is drawn, got None"):
+        explain(walker().learn(20), **drawn)
