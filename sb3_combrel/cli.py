@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[experiments]'"
 OF_EXTRA = ("combrel_envs", "matplotlib", "mujoco", "dm_control", "moviepy", "tyro")
@@ -46,13 +48,15 @@ def record(
     method: str = "random",
     overwrite: bool = False,
 ) -> None:
-    """Learn a source task by Q-learning and keep a sample of its experience as source instances.
+    """Learn a source task and keep a sample of its experience as source instances.
+
+    By Q-learning; where state variables have no bounds, by 100 episodes of Fitted R-Max.
 
     :param env_id: id of a task with few state variables and discrete actions, such as combrel/MountainCar2D-v0 or
         package:Task-v0
     :param output: file to write
     :param n_instances: instances to keep
-    :param total_timesteps: steps of learning
+    :param total_timesteps: steps of Q-learning
     :param seed: seed of learner, task and sample
     :param method: how to choose the instances, "random" or "covering"
     :param overwrite: replace the file if it exists
@@ -61,17 +65,20 @@ def record(
 
     from sb3_combrel import SourceInstances
     from sb3_combrel.runs.job import make_env
+    from sb3_combrel.sources.recipes import has_bounds
 
     console = Console()
     file = output if output.suffix == ".npz" else output.with_name(output.name + ".npz")
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists; use --overwrite or another --output")
-    env = make_env(env_id)
-    with console.status(f"Learning {env_id} for {total_timesteps:,} steps ..."):
-        source = SourceInstances.from_q_learning(
-            env, n_instances=n_instances, seed=seed, total_timesteps=total_timesteps, method=method
-        )
-    env.close()
+    asked: dict[str, Any] = {"n_instances": n_instances, "seed": seed, "method": method}
+    with closing(make_env(env_id)) as env:
+        if has_bounds(env_id):
+            with console.status(f"Learning {env_id} by Q-learning for {total_timesteps:,} steps ..."):
+                source = SourceInstances.from_q_learning(env, total_timesteps=total_timesteps, **asked)
+        else:
+            with console.status(f"Learning {env_id} by Fitted R-Max, as its state variables have no bounds ..."):
+                source = SourceInstances.from_fitted_rmax(env, **asked)
     console.print(source, markup=False, soft_wrap=True)
     console.print(f"written to {source.save(file)}; use it as COMBREL({str(file)!r})", soft_wrap=True)
 

@@ -27,6 +27,12 @@ class TestRecord:
         assert call_for_all_output("record", *self.SHORT, "--output", file, "--overwrite")[0] == 0
         assert len(SourceInstances.load(file)) == 20
 
+    @pytest.mark.long
+    def test_a_task_without_bounds_is_learned_by_fitted_rmax(self, tmp_path):
+        status, written = call_for_all_output("record", "CartPole-v1", "--n-instances", "20", "--output", tmp_path / "pole")
+        source = SourceInstances.load(tmp_path / "pole.npz")
+        assert status == 0 and len(source) == 20 and source.origin["recorder"] == "FittedRMax", written
+
     @pytest.mark.parametrize(
         ("env_id", "message"),
         [("Nowhere-v0", "Nowhere"), ("no_such_package:Task-v0", "no_such_package"), ("Pendulum-v1", "Discrete")],

@@ -29,6 +29,8 @@ KINDS = (
     "SourceInstances, a file (.npz, .csv or a saved model's .zip), a pandas DataFrame, a Minari dataset or its id, a replay "
     "buffer, a model, or a controller: a function of the state that returns an action"
 )
+# What pandas reads, besides CSV files.
+TABLES_OF_PANDAS = (".parquet", ".pq", ".feather", ".json", ".jsonl", ".tsv", ".xlsx", ".xls", ".h5", ".hdf5")
 # Warnings: an angle that spans more periods, and a value that lies beyond nearly all others by more ranges of theirs.
 MANY_PERIODS, MANY_RANGES = 10, 20
 
@@ -122,6 +124,8 @@ class PastData(SavedAlgorithm):
         buffer = given if isinstance(given, ReplayBuffer) else getattr(given, "replay_buffer", None)
         if isinstance(buffer, ReplayBuffer) and buffer.size() > 0:
             return _of_buffer(buffer, task)
+        if isinstance(given, ReplayBuffer):
+            raise ValueError(f"instances must be transitions, got a {type(given).__name__} that is empty")
         if isinstance(given, type) or not (hasattr(given, "predict") or callable(given)):
             raise ValueError(f"instances must be {KINDS}, got {reprlib.repr(given)}")
         return self._act(given, n_instances)
@@ -143,12 +147,16 @@ class PastData(SavedAlgorithm):
         if path.suffix.lower() in (".pkl", ".pickle") and path.is_file():
             raise ValueError(
                 f"{path} is a pickle, which may run any program when it is read: if you trust it, read it with "
-                "stable_baselines3.common.save_util.load_from_pkl, and pass the replay buffer"
+                "stable_baselines3.common.save_util.load_from_pkl, or pandas.read_pickle, and pass what it holds"
             )
         if is_table(path):
             return SourceInstances.from_table(path, **names)
         if _is_saved_model(path):
             return type(self).load(path).source_instances()
+        if path.is_dir():
+            raise ValueError(f"instances must be a file, got the folder {path}")
+        if path.suffix.lower() in TABLES_OF_PANDAS and path.is_file():
+            raise ValueError(f"instances must be {KINDS}; read {path} with pandas, and pass the DataFrame")
         if path.is_file() or path.suffix == ".npz" or path.with_name(f"{path.name}.npz").is_file():
             return SourceInstances.load(path)
         for suffix in (".zip", ".pkl"):

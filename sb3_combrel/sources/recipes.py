@@ -12,15 +12,17 @@ import reprlib
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from sb3_combrel.common.scaling import StateScaling, without_bounds
 from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.sources.transitions import LEARNERS
+from sb3_combrel.sources.transitions import LEARNERS, make_env
 
 CACHE_VARIABLE = "SB3_COMBREL_CACHE"
 RENEW_VARIABLE = "SB3_COMBREL_RENEW"
@@ -47,8 +49,8 @@ def find_source(source: Any) -> SourceInstances:
 
     :param source: source instances; the path of a file of them, or of a CSV file
         (:meth:`~sb3_combrel.SourceInstances.from_table`); the id of an environment, learnt with
-        :data:`DEFAULT_RECIPE`; or a recipe: a dict with ``env``, the id, and arguments of
-        :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
+        :data:`DEFAULT_RECIPE`, or, if variables have no bounds, by Fitted R-Max; or a recipe: a dict with ``env``, the id, and
+        arguments of :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
         :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
     :raises FileNotFoundError: if there is neither a file nor a task of that name
     :raises ValueError: if it is none of these, or if the task cannot be learnt so
@@ -116,6 +118,13 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     if not isinstance(renew, bool):
         raise ValueError(f"renew must be true or false, got {renew!r}")
     file = cache_file(recipe)
+    if (
+        "learner" not in arguments
+        and arguments.keys() <= {"env", "method", *DEFAULT_RECIPE}
+        and not has_bounds(arguments["env"])
+    ):
+        arguments["learner"] = "fitted_rmax"
+        del arguments["total_timesteps"]
     wanted_anew = (renew or os.environ.get(RENEW_VARIABLE, "0") not in ("", "0")) and file not in _SEEN
     env_id, learner = arguments.pop("env"), arguments.pop("learner", "q_learning")
     if file.is_file() and not wanted_anew:
@@ -138,6 +147,17 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     source.save(file)
     _SEEN.add(file)
     return source
+
+
+def has_bounds(env_id: str) -> bool:
+    """Whether all state variables of a task have bounds, without which Q-learning has no tiles; True if that is not known."""
+    try:
+        env = make_env(env_id)
+    except (gym.error.Error, ImportError):
+        return True
+    with closing(env), suppress(ValueError):
+        return not without_bounds(*StateScaling.limits_of(env.observation_space)).any()
+    return True
 
 
 def _time_of(file: Path) -> str:

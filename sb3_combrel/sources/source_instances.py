@@ -338,7 +338,9 @@ class SourceInstances:
         try:
             return cls.from_bytes(file.read_bytes())
         except ValueError as error:
-            raise ValueError(f"{file}: {error}; write it again with SourceInstances.record(...).save(path)") from error
+            table = ", or read a table with SourceInstances.from_table(path)" if file.suffix != ".npz" else ""
+            again = f"write it again with SourceInstances.record(...).save(path){table}"
+            raise ValueError(f"{file}: {error}; {again}") from error
 
     def to_bytes(self) -> bytes:
         """The content of the file that :meth:`save` writes."""

@@ -76,6 +76,32 @@ def test_a_source_is_renewed_once_in_a_process(by, monkeypatch, tmp_path, capsys
     assert [file] == list((tmp_path / "cache").iterdir())
 
 
+class Boundless(Walk):
+    """Its space says of the second variable nothing but that it is a number."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gymnasium.spaces.Box(np.float32([-1.0, -np.inf]), np.float32([1.0, np.inf]))
+
+
+@pytest.mark.filterwarnings("ignore:.*is coarse")
+def test_a_task_without_bounds_is_learned_by_fitted_rmax(capsys):
+    task = "BoundlessForRecipes-v0"
+    gymnasium.register(task, Boundless)
+    try:
+        found = find_source(task)
+        assert "by fitted_rmax" in capsys.readouterr().out and len(found) == 40
+        assert_same(found, SourceInstances.from_fitted_rmax(task, n_instances=40, seed=0))
+        # Who asks for Q-learning, or gives arguments of it, is told what it needs.
+        for more in ({"learner": "q_learning"}, {"epsilon": 0.1}):
+            with pytest.raises(ValueError, match=r"pass bounds=\(low, high\)"):
+                find_source({"env": task, **more})
+        assert len(find_source({"env": task, "bounds": [[-1.0, 0.0], [1.0, 2.0]]})) == 40
+        assert recipes.has_bounds(WALK) and recipes.has_bounds("Nowhere-v0")
+    finally:
+        del gymnasium.registry[task]
+
+
 class OtherWalk(Walk):
     """Another class with the same dynamics."""
 
