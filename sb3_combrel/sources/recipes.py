@@ -124,7 +124,7 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
         and not has_bounds(arguments["env"])
     ):
         arguments["learner"] = "fitted_rmax"
-        del arguments["total_timesteps"]
+        arguments.pop("total_timesteps", None)
     wanted_anew = (renew or os.environ.get(RENEW_VARIABLE, "0") not in ("", "0")) and file not in _SEEN
     env_id, learner = arguments.pop("env"), arguments.pop("learner", "q_learning")
     if file.is_file() and not wanted_anew:
