@@ -1,6 +1,6 @@
 # make demo    learn with and without transfer; figure, table, video in demo_output/
 # make test    the tests that are quick   make test-all   all of them   make test-oldest   quick ones, oldest Numba and NumPy
-# make build   wheel and source distribution in dist/   make smoke   install the wheel into an empty environment, and try it
+# make build   wheel and source distribution in dist/   make smoke   install wheel and source distribution into an empty environment, and try them
 # make bench   speed and memory                make lint, type, format, check-codestyle, commit-checks   as in Stable-Baselines3
 # make reproduce   the figures and tables of the COMBREL paper, with controls, in reproduction/; REPRODUCE_ARGS="fig2 --runs 2"
 # make results   takes what was reproduced, and the results of the benchmark, into docs/
@@ -152,11 +152,15 @@ build: $(VENV)/.installed-all
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 
-# Away from the clone, so that only what the wheel has installed can be imported.
+# Away from the clone, so that only what the wheel, and then the source distribution, has installed can be imported.
+smoke_test = root="$$PWD" && cd "$$(mktemp -d)" && "$(abspath $(VENV)-smoke/bin/python)" "$$root/tests/helpers/smoke.py"
+
 smoke: build
 	$(call new_venv,$(VENV)-smoke)
 	$(call pip,$(VENV)-smoke) "$$(echo dist/*.whl)[all]"
-	root="$$PWD" && cd "$$(mktemp -d)" && "$(abspath $(VENV)-smoke/bin/python)" "$$root/tests/helpers/smoke.py"
+	$(call smoke_test)
+	$(call pip,$(VENV)-smoke) --no-deps --force-reinstall dist/*.tar.gz
+	$(call smoke_test)
 
 # The source folder is that of the repository: see docs/conf.py.
 doc: $(VENV)/.installed-all

@@ -31,7 +31,7 @@ def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> N
     warnings.warn(
         f"what was transferred from {names} predicts the target worse than that nothing changes: on {n} "
         f"transitions its mean squared error is {error:.2f} times as large; try another mapping or source",
-        stacklevel=3,
+        stacklevel=8,
     )
 
 

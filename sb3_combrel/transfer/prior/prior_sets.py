@@ -100,7 +100,7 @@ def practical_set(sources: Sequence[SourceInstances], task: TargetTask) -> str:
             f'mappings="{usual}", the default, has {_count_copies(usual, sources, task):,} copies from these source tasks to '
             f'{task.n_variables} state variables, more than the {MAX_COPIES:,} that are practical: "{name}" is taken instead, '
             f"in which {without}. Fewer variables, or mappings of your own, avoid that",
-            stacklevel=2,
+            stacklevel=8,
         )
     return name
 
