@@ -234,4 +234,4 @@ def test_it_says_why_the_sources_values_bound_nothing():
 
 
 def test_a_mapping_that_was_left_to_chance_is_shown():
-    assert repr(TIMBREL(walk_source(), use="prior")).endswith("mapping='random', use='prior')")
+    assert repr(TIMBREL(walk_source(), "random", use="prior")).endswith("mapping='random', use='prior')")

@@ -1,6 +1,7 @@
 """Sources, mappings and arguments of transfer that cannot work: an error that says what to change, before the first step."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -253,3 +254,12 @@ def test_by_default_combrel_looks_for_mirrored_variables_without_a_word_where_th
     method = COMBREL(naive.random_source(np.random.default_rng(0), 30, 2, 2))
     method.bind(dataclasses.replace(f.target_task(4, 2), takes_prior=True), np.random.default_rng(0))
     assert method.mappings == "signed_factored"
+
+
+def test_timbrel_without_a_mapping_is_warned_of():
+    with pytest.warns(UserWarning, match="mapping is left out, and random ones are drawn, which is the control") as caught:
+        assert TIMBREL(walk_source()).mapping == "random"
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        TIMBREL(walk_source(), "random")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -38,7 +39,8 @@ class TIMBREL(MappingTransfer):
     :param mapping: one mapping; a sequence with one mapping for each target action; "random" for a mapping of ``mappings``
         drawn state by state (the baseline of the iCub experiment): for a state of the finite sample whenever it is asked for,
         elsewhere with each transition; or "pool" for the translations by all of ``mappings`` in one pool (Figure 3). With
-        ``use="prior"`` also a ``FactoredMapping``; and "random" is drawn once, for the whole run
+        ``use="prior"`` also a ``FactoredMapping``; and "random" is drawn once, for the whole run. None: "random", with a
+        warning
     :param mappings: the set that "random" and "pool" draw from; also "factored" and "signed_factored" (``use="prior"`` only:
         of as many variables as possible, in as few copies as possible)
     :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
@@ -48,10 +50,17 @@ class TIMBREL(MappingTransfer):
 
     of_prior: ClassVar[tuple[str, ...]] = (*MappingTransfer.of_prior, "mapping")
 
-    mapping: str | InterTaskMapping | FactoredMapping | Sequence[InterTaskMapping] | dict[str, Any] = "random"
+    mapping: str | InterTaskMapping | FactoredMapping | Sequence[InterTaskMapping] | dict[str, Any] | None = None
     mappings: MappingsLike = field(default="injective", kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.mapping is None:
+            warnings.warn(
+                "mapping is left out, and random ones are drawn, which is the control: give mapping=InterTaskMapping(...), or "
+                '"random" where that is meant; COMBREL(source) finds a mapping itself',
+                stacklevel=3,
+            )
+            self.mapping = "random"
         if isinstance(self.mapping, str):
             if self.mapping not in ("random", "pool"):
                 message = 'mapping must be an InterTaskMapping, one for each action, "random" or "pool", got'
