@@ -10,6 +10,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_combrel.common.user_warnings import warn_user
+
 
 def names_of(env: VecEnv) -> dict[str, Any]:
     """Return names of state variables and actions, where the environment has as many of them as it must have."""
@@ -62,10 +64,9 @@ def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[An
         return list(value)
     if not (types == (str,) and (value is None or (is_list and len(value) == 0))):
         what = "action" if name == "action_names" else "variable"
-        warnings.warn(
+        warn_user(
             f"the environment's {name}={value!r} is not one {types[0].__name__} for each of the {n} {what}s, and is ignored: "
-            f"{'pass FittedRMax(env, periodic=[...])' if name == 'periodic' else 'an environment may leave it out'}",
-            stacklevel=5,
+            f"{'pass FittedRMax(env, periodic=[...])' if name == 'periodic' else 'an environment may leave it out'}"
         )
     return None
 

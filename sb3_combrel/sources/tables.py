@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from sb3_combrel.common.periodic import check_periods, periodic_flags
 from sb3_combrel.common.scaling import Bounds, check_bounds
 from sb3_combrel.common.suggestions import did_you_mean
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.sources.transitions import Floats, Transitions
 
 if TYPE_CHECKING:
@@ -164,14 +164,17 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
 
 
 def _warn_of_no_ends(frame: pd.DataFrame, names: Sequence[str]) -> None:
-    """Warn of a table none of whose columns says where episodes end."""
-    if {TERMINATED, DONE, TRUNCATED, EPISODE}.intersection(frame.columns):
+    """Warn of a table that does not say where episodes end, by columns, or by rows with an empty action."""
+    leads = any(f"{NEXT}{name}" in frame.columns for name in names)
+    if {TERMINATED, DONE, TRUNCATED}.intersection(frame.columns) or (EPISODE in frame.columns and not leads):
         return
-    if any(f"{NEXT}{name}" in frame.columns for name in names):
+    if leads:
         what = "no transition is taken to end an episode: add"
+    elif frame[ACTION].iloc[:-1].isna().any():
+        return
     else:
         what = f"all {len(frame)} rows are taken as one episode that does not end: add {EPISODE!r} or {TRUNCATED!r}, and"
-    warnings.warn(f"no column of the table says where episodes end, and {what} {TERMINATED!r} where they do", stacklevel=5)
+    warn_user(f"no column of the table says where episodes end, and {what} {TERMINATED!r} where they do")
 
 
 def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:
@@ -223,10 +226,9 @@ def _terminated(frame: pd.DataFrame) -> np.ndarray:
         return _flags(frame, TERMINATED)
     done = _flags(frame, DONE)
     if done.any() and TRUNCATED not in frame.columns:
-        warnings.warn(
+        warn_user(
             f"the table has a column {DONE!r}, but none of {TRUNCATED!r}: all {done.sum()} ends count as terminal states, "
-            "time limits as well",
-            stacklevel=5,
+            "time limits as well"
         )
     return done & ~_flags(frame, TRUNCATED)
 

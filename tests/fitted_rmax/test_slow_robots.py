@@ -131,10 +131,30 @@ def test_a_log_that_does_not_say_where_episodes_end_is_warned_of():
         assert len(FittedRMax(Line()).load_instances(table.drop(columns=[*following, "terminated"])).source_instances()) == 59
     with pytest.warns(UserWarning, match="no transition is taken to end an episode: add 'terminated'"):
         FittedRMax(Line()).load_instances(table.drop(columns="terminated"))
+    with pytest.warns(UserWarning, match="no transition is taken to end an episode"):
+        FittedRMax(Line()).load_instances(table.drop(columns="terminated").assign(episode=0))
+    arrived = table.drop(columns=[*following, "terminated"])
+    arrived["action"] = arrived["action"].astype(float).mask(arrived.index == 30)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         FittedRMax(Line()).load_instances(table)
+        FittedRMax(Line()).load_instances(arrived)
         FittedRMax(Line()).load_instances(table.drop(columns=following).assign(terminated=False, episode=0))
+
+
+def test_a_warning_points_at_the_line_of_the_user_whichever_way_it_comes(tmp_path):
+    table = log_of(Line(), 60).drop(columns="terminated")
+    table.to_csv(tmp_path / "log.csv", index=False)
+    for warned in (
+        lambda: SourceInstances.from_table(table),
+        lambda: FittedRMax(Line()).load_instances(table),
+        lambda: FittedRMax(Line(), instances=tmp_path / "log.csv"),
+        lambda: FittedRMax(Line(), transfer=COMBREL(tmp_path / "log.csv")),
+        lambda: FittedRMax(Line(names=["x"])),
+    ):
+        with pytest.warns(UserWarning) as caught:
+            warned()
+        assert [each.filename for each in caught] == [__file__]
 
 
 def test_actions_that_may_be_counted_from_another_number_are_warned_of():
