@@ -83,6 +83,8 @@ def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
                 return file
         if task_spec(str(source)) is not None:
             return {**DEFAULT_RECIPE, "env": str(source)}
+        if str(source) and path.is_dir():
+            raise ValueError(f"source must be a file of instances, or the id of an environment, got the folder {source}")
         file = Path(str(source) or "source").with_suffix(".npz")
         raise FileNotFoundError(
             f"there is no source file {source}, looked for in {Path.cwd()}, and no environment of that name; write one with "

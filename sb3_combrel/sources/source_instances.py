@@ -333,6 +333,8 @@ class SourceInstances:
         :raises ValueError: if it is another kind of file, or is cut short
         """
         file = Path(path) if Path(path).is_file() else _with_suffix(path)
+        if not file.is_file() and Path(path).is_dir():
+            raise ValueError(f"path must be that of a file, got the folder {path}")
         if not file.is_file():
             raise FileNotFoundError(f"there is no source file {file}; write one with SourceInstances.record(...).save(path)")
         try:
@@ -370,6 +372,8 @@ class SourceInstances:
 
 def _with_suffix(path: str | os.PathLike[str]) -> Path:
     target = Path(path)
+    if not target.name:
+        raise ValueError(f"path must be that of a file, got the folder {target}")
     return target if target.suffix == ".npz" else target.with_name(target.name + ".npz")
 
 

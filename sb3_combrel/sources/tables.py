@@ -73,6 +73,8 @@ def _read(table: Table) -> pd.DataFrame:
 
     if isinstance(table, pd.DataFrame):
         return table
+    if os.path.isdir(table):
+        raise ValueError(f"table must be a CSV file or a pandas DataFrame, got the folder {os.fspath(table)}")
     try:
         frame = pd.read_csv(table, skipinitialspace=True)
     except FileNotFoundError as error:

@@ -1,10 +1,12 @@
 """What learners and recorders of source tasks refuse: environments that return nonsense, numbers that are no counts."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_combrel import SourceInstances
+from sb3_combrel import COMBREL, SourceInstances
 from sb3_combrel.sources.q_learning import QLearning
 from sb3_combrel.sources.source_recorder import SourceRecorder
 
@@ -111,3 +113,18 @@ def test_a_method_of_choice_that_does_not_exist_is_refused_before_learning():
     for learn in (SourceInstances.from_q_learning, SourceInstances.from_fitted_rmax):
         with pytest.raises(ValueError, match="method must be 'random' or 'covering', got 'best'"):
             learn("no such task", 5, method="best")
+
+
+@pytest.mark.parametrize("folder", [".", "..", "/", "inner"])
+def test_a_folder_is_no_file_of_instances(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "inner").mkdir()
+    for read in (SourceInstances.load, SourceInstances.from_table, COMBREL):
+        with pytest.raises(ValueError, match=f"must be .* file.* got the folder {re.escape(folder)}$"):
+            read(folder)
+    # A file of that name beside it is found.
+    made = SourceInstances.record(None, TASK, 20, seed=0)
+    made.save("inner")
+    assert len(SourceInstances.load("inner")) == 20
+    with pytest.raises(ValueError, match="path must be that of a file"):
+        made.save(".")
