@@ -138,6 +138,12 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
                 f"(renew: true in the recipe, or {RENEW_VARIABLE}=1, learns them again)"
             )
         return source
+    if learner == "q_learning" and "bounds" not in arguments and not has_bounds(env_id):
+        given = f"'env': {env_id!r}"
+        raise ValueError(
+            f"{env_id} has state variables without bounds, which Q-learning needs: give lowest and highest values in the "
+            f"recipe, {{{given}, 'bounds': [[...], [...]]}}, or have it learned by {{{given}, 'learner': 'fitted_rmax'}}"
+        )
     print(f"Learning the source task {env_id} by {learner}{_reason(file)}; kept in {file}")
     try:
         source = getattr(SourceInstances, f"from_{learner}")(env_id, **arguments)

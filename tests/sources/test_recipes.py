@@ -94,8 +94,10 @@ def test_a_task_without_bounds_is_learned_by_fitted_rmax(capsys):
         assert_same(found, SourceInstances.from_fitted_rmax(task, n_instances=40, seed=0))
         # Who asks for Q-learning, or gives arguments of it, is told what it needs.
         for more in ({"learner": "q_learning"}, {"epsilon": 0.1}):
-            with pytest.raises(ValueError, match=r"pass bounds=\(low, high\)"):
+            says = r"which Q-learning needs: .* {'env': '%s', 'bounds': \[.*\]}.* {'env': '%s', 'learner': 'fitted_rmax'}"
+            with pytest.raises(ValueError, match=says % (task, task)):
                 find_source({"env": task, **more})
+            assert not capsys.readouterr().out
         assert len(find_source({"env": task, "bounds": [[-1.0, 0.0], [1.0, 2.0]]})) == 40
         assert recipes.has_bounds(WALK) and recipes.has_bounds("Nowhere-v0")
     finally:
