@@ -123,6 +123,7 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     if (
         "learner" not in arguments
         and arguments.keys() <= {"env", "method", *DEFAULT_RECIPE}
+        and arguments.get("total_timesteps") in (None, DEFAULT_RECIPE["total_timesteps"])
         and not has_bounds(arguments["env"])
     ):
         arguments["learner"] = "fitted_rmax"

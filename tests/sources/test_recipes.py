@@ -93,7 +93,7 @@ def test_a_task_without_bounds_is_learned_by_fitted_rmax(capsys):
         assert "by fitted_rmax" in capsys.readouterr().out and len(found) == 40
         assert_same(found, SourceInstances.from_fitted_rmax(task, n_instances=40, seed=0))
         # Who asks for Q-learning, or gives arguments of it, is told what it needs.
-        for more in ({"learner": "q_learning"}, {"epsilon": 0.1}):
+        for more in ({"learner": "q_learning"}, {"epsilon": 0.1}, {"total_timesteps": 300}):
             says = r"which Q-learning needs: .* {'env': '%s', 'bounds': \[.*\]}.* {'env': '%s', 'learner': 'fitted_rmax'}"
             with pytest.raises(ValueError, match=says % (task, task)):
                 find_source({"env": task, **more})
