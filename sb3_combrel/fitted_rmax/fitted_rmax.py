@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
 from sb3_combrel.common.observations import with_own_arrays
+from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import DEFAULT_POLICY, MAX_SEED, check_actions, check_policy, check_type, policy_and_env
 from sb3_combrel.fitted_rmax.past_data import PastData
@@ -316,7 +317,7 @@ class FittedRMax(PastData):
         """:raises ValueError: if an attribute has been given another value, which what was learned would not follow"""
         for name in FittedRMaxSettings.names():
             now, used = getattr(self, name), getattr(self.agent.settings, name)
-            if now is not used and repr(now) != repr(used):
+            if not _are_alike(now, used):
                 raise ValueError(
                     f"{name} must be what the model was made with, {used!r}, got {now!r}: set it back, or save the model and "
                     f"call FittedRMax.load(path, {name}={now!r}), which follows if that can be changed"
@@ -417,3 +418,13 @@ class FittedRMax(PastData):
         super().set_env(env, force_reset)
         assert self.env is not None
         self._vec_normalize_env = unwrap_vec_normalize(self.env)
+
+
+def _are_alike(one: Any, other: Any) -> bool:
+    """Whether two arguments say the same, as 1 and 1.0 do, or a list and a tuple."""
+    if one is other or repr(one) == repr(other):
+        return True
+    try:
+        return bool(to_plain(one) == to_plain(other))
+    except TypeError:
+        return False

@@ -3,6 +3,7 @@
 import inspect
 import io
 
+import numpy as np
 import pytest
 import torch as th
 from helpers.walk import METHODS, OBSERVATIONS, Walk, same_parameters, small
@@ -155,3 +156,21 @@ def test_an_argument_that_is_changed_afterwards_is_refused_and_a_saved_model_fol
     model.learn(10).save(tmp_path / "model")
     assert repr(getattr(FittedRMax.load(tmp_path / "model", **{name: value}).agent.settings, name)) == repr(value)
     FittedRMax.load(tmp_path / "model", env=Walk(), **{name: value}).learn(10)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "alike"),
+    [
+        ("gamma", 1.0, 1),
+        ("max_value", 3.0, np.float64(3.0)),
+        ("resolution", [4, 4], (4, 4)),
+        ("bounds", ([-9.0, -9.0], [9.0, 9.0]), (np.full(2, -9.0), np.full(2, 9.0))),
+    ],
+)
+def test_an_argument_that_is_written_in_another_way_is_not_changed(name, given, alike):
+    model = small(**{name: given}).learn(10)
+    setattr(model, name, alike)
+    assert model.learn(10).num_timesteps == 10
+    setattr(model, name, object())
+    with pytest.raises(ValueError, match=f"{name} must be what the model was made with"):
+        model.learn(10)
