@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ from gymnasium import spaces
 from sb3_combrel.common.compiled import EntryPoint, compiled
 from sb3_combrel.common.periodic import flag_array
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.user_warnings import warn_user
 
 # Excess over the bounds, in unit coordinates, that rounding can explain.
 ROUNDING = 1e-6
@@ -109,10 +109,9 @@ class ObservationScaler:
         self.went_beyond = True
         if self._fixed and not self._warned and np.abs(excess).max() > ROUNDING:
             self._warned = True
-            warnings.warn(
+            warn_user(
                 f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
-                "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)",
-                stacklevel=3,
+                "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)"
             )
 
     def warn_of_share(self, observed: np.ndarray, names: Sequence[str]) -> None:
@@ -127,9 +126,8 @@ class ObservationScaler:
         low = np.round(np.minimum(self.scaling.low, observed[0]), 3).tolist()
         high = np.round(np.maximum(self.scaling.high, observed[1]), 3).tolist()
         shares = ", ".join(f"{names[k]} in {100 * share[k]:.0f} %" for k in many.tolist())
-        warnings.warn(
+        warn_user(
             f"observations were outside the bounds and counted as the nearest state inside: {shares} of "
             f"{self.n_outside[-1]:.0f} observations; all are inside bounds=({low}, {high}), or leave bounds out, and they are "
-            "found",
-            stacklevel=3,
+            "found"
         )

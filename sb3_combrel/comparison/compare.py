@@ -6,7 +6,6 @@ import hashlib
 import inspect
 import json
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_combrel.common.checks import as_count, check_boolean, check_count, check_finite
 from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.common.suggestions import did_you_mean
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.comparison.controls import CONTROL, is_control, name_of_control, random_control
 from sb3_combrel.comparison.result import CompareResult, evaluate
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
@@ -155,7 +155,7 @@ def compare(
         try:
             in_use[CONTROL], first[CONTROL] = _try_out(run), run
         except ValueError as error:
-            warnings.warn(f"there is no control ({error}): controls=False leaves it out without a warning", stacklevel=2)
+            warn_user(f"there is no control ({error}): controls=False leaves it out without a warning")
     if folder is not None:
         classes = _classes_of(next(iter(first.values())))
         kept = {method: _kept_settings(method, in_use[method]) for method in first}
@@ -172,7 +172,7 @@ def compare(
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(first)}
     found = evaluate(by_method, baseline, threshold, _name_of(env), name_of_control(in_use))
     for words in found.warnings:
-        warnings.warn(words, stacklevel=2)
+        warn_user(words)
     return found
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import reprlib
-import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.scaling import LARGEST_BOUND, StateScaling
 from sb3_combrel.common.task import Task
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
 from sb3_combrel.sources.recipes import is_table
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -185,10 +185,9 @@ class PastData(SavedAlgorithm):
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
             )
         if first > 0 and _are_numbered(found.action_names) and found.actions.min() >= first:
-            warnings.warn(
+            warn_user(
                 f"the instances have actions from {found.actions.min()} to {found.actions.max()}, which count from 0 on; "
-                f"those of the environment count from {first}: if the instances do so too, subtract that",
-                stacklevel=3,
+                f"those of the environment count from {first}: if the instances do so too, subtract that"
             )
         columns = _columns_of_variables(found.state_names, tuple(task.state_names), other)
         self._check_units(found.states, columns)
@@ -224,12 +223,11 @@ def _warn_of_values(name: str, values: np.ndarray, width: float, periodic: bool)
     """Warn of an angle in other units, and, where the space has no bounds, of a value far from all others."""
     if periodic and np.ptp(values) > MANY_PERIODS * width:
         wrong = f"{name} from {values.min():.4g} to {values.max():.4g}, many periods of {width:.4g}"
-        warnings.warn(f"the instances have {wrong}: convert it if its units are others than the task's, degrees", stacklevel=5)
+        warn_user(f"the instances have {wrong}: convert it if its units are others than the task's, degrees")
     if not width < LARGEST_BOUND and (far := _far_beyond(values)) is not None:
-        warnings.warn(
+        warn_user(
             f"the instances have {name}={far:.4g}, far from nearly all others, and variables without bounds are scaled by the "
-            "range of what is observed: leave such rows out if they are errors of a sensor",
-            stacklevel=5,
+            "range of what is observed: leave such rows out if they are errors of a sensor"
         )
 
 
@@ -266,10 +264,7 @@ def _columns_of_variables(given: tuple[str, ...], own: tuple[str, ...], other: s
         raise ValueError(f"instances must have the state variables {own}, got {given}, without {lacking}{other}")
     if not all(numbered):
         taken = ", ".join(f"{name} as {of_task}" for name, of_task in zip(given, own, strict=True))
-        warnings.warn(
-            f"state variables of the instances have other names than the task's and are taken in their order: {taken}",
-            stacklevel=4,
-        )
+        warn_user(f"state variables of the instances have other names than the task's and are taken in their order: {taken}")
     return np.arange(len(own))
 
 
@@ -302,10 +297,9 @@ def _of_buffer(buffer: ReplayBuffer, task: Task) -> SourceInstances:
     limits = np.full(states.shape[1], -np.inf), np.full(states.shape[1], np.inf)
     scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
     if not buffer.handle_timeout_termination and buffer.dones.any():
-        warnings.warn(
+        warn_user(
             "the replay buffer has handle_timeout_termination=False and does not say which episodes a time limit ended: "
-            f"all {int(buffer.dones[rows].sum())} ends count as terminal states",
-            stacklevel=4,
+            f"all {int(buffer.dones[rows].sum())} ends count as terminal states"
         )
     ended, truncated = column(buffer.dones)[:, 0] > 0.5, column(buffer.timeouts)[:, 0] > 0.5
     actions = column(buffer.actions)[:, 0].astype(np.int64) - int(buffer.action_space.start)

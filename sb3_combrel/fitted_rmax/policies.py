@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from sb3_combrel.common.observations import ObservationScaler
 from sb3_combrel.common.periodic import flag_array, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.scales import FoundScales
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
@@ -127,9 +127,8 @@ class FittedRMaxPolicy(BasePolicy):
         least, most, names = *self.scales.observed, self.agent.task.state_names
         seen = ", ".join(f"{names[k]} from {least[k]:.4g} to {most[k]:.4g}" for k in beyond)
         space = ", ".join(f"from {self.scales.low[k]:.4g} to {self.scales.high[k]:.4g}" for k in beyond)
-        warnings.warn(
-            f"observations are outside the observation space: {seen}, but the space says {space}; they are taken as they are",
-            stacklevel=4,
+        warn_user(
+            f"observations are outside the observation space: {seen}, but the space says {space}; they are taken as they are"
         )
 
     def _warn_of_far_observation(self, before: StateScaling) -> None:
@@ -140,11 +139,10 @@ class FittedRMaxPolicy(BasePolicy):
         self._warned_far = True
         least, most = self.scales.observed[:, k]
         name, value = self.agent.task.state_names[k], least if before.low[k] - least > most - before.high[k] else most
-        warnings.warn(
+        warn_user(
             f"{name}={value:.4g} is far from all observations before, from {before.low[k]:.4g} to {before.high[k]:.4g}, and "
             "variables without bounds are scaled by the range of what is observed: if it is an error of a sensor, mend it in "
-            "the environment, or pass bounds=(low, high)",
-            stacklevel=4,
+            "the environment, or pass bounds=(low, high)"
         )
 
     @property

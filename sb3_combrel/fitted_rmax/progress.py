@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.optimism import RewardRange
 
 # So many episodes in a row are no coincidence.
@@ -108,4 +108,4 @@ class ProgressWatch:
     def _warn(self, of: str, message: str) -> None:
         if of not in self._warned:
             self._warned.add(of)
-            warnings.warn(message, stacklevel=7)
+            warn_user(message)

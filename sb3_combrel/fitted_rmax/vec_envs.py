@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -46,10 +45,9 @@ def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
         for which in (env, getattr(callback, "eval_env", None))
     )
     if own & evaluated:
-        warnings.warn(
+        warn_user(
             f"{type(callback).__name__} evaluates in the environment that the model learns in: after each evaluation it "
-            "takes a state of that for the one that its own action has led to; give it an environment of its own",
-            stacklevel=4,
+            "takes a state of that for the one that its own action has led to; give it an environment of its own"
         )
 
 

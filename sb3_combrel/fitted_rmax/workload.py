@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import NamedTuple
 
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.models.base import ModelSettings
 from sb3_combrel.planning.grid import MAX_VARIABLES, StateGrid
 
@@ -46,17 +46,15 @@ def workload(grid: StateGrid, n_actions: int, settings: ModelSettings, transfers
 def warn_if_long(work: Workload, grid: StateGrid) -> None:
     """Warn of a grid that takes long, before it does, and of more state variables than a grid is good for."""
     if grid.n_variables > MAX_VARIABLES:
-        warnings.warn(
+        warn_user(
             f"{grid.n_variables} state variables are many for a grid, with {grid.arrays.shape.min()} points along some of "
             f"them: {work}. Fewer variables, chosen with gymnasium.wrappers.FilterObservation or a wrapper of your own, are "
-            "learned in fewer steps; for more there are DQN and PPO of Stable-Baselines3",
-            stacklevel=6,
+            "learned in fewer steps; for more there are DQN and PPO of Stable-Baselines3"
         )
     elif work.setup_seconds > LONG_SETUP_SECONDS or work.step_seconds > LONG_STEP_SECONDS:
-        warnings.warn(
+        warn_user(
             f"resolution={list(grid.resolution)} means {work}; a lower resolution takes less time, each number less by one "
-            "about half",
-            stacklevel=6,
+            "about half"
         )
 
 

@@ -1,7 +1,6 @@
 """The finite sample of states on which Fitted R-Max plans: a uniform grid over the unit box."""
 
 import os
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined, inner
 from sb3_combrel.common.periodic import flag_array
+from sb3_combrel.common.user_warnings import warn_user
 
 # More variables are interpolated between by simplices.
 MAX_MULTILINEAR = 4
@@ -295,10 +295,9 @@ def _warn_if_too_coarse(n_variables: int, resolution: int | Sequence[int], reach
     sides = 0.5 ** np.broadcast_to(np.asarray(resolution, dtype=np.float64), (n_variables,))
     diagonal = float(np.linalg.norm(sides))
     if diagonal > reach:
-        warnings.warn(
+        warn_user(
             f"resolution={resolution} is coarse for model_breadth={model_breadth:g}: a grid cell's diagonal is "
             f"{diagonal:.3g}, but an instance reaches only {reach:.3g}, so some grid points may stay optimistic for "
             f"ever; resolution={coarsest_in_reach(n_variables, reach)} or model_breadth="
-            f"{model_breadth * diagonal / reach:.3g} would be enough",
-            stacklevel=5,
+            f"{model_breadth * diagonal / reach:.3g} would be enough"
         )

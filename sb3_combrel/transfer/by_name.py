@@ -5,12 +5,12 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
 from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
 from sb3_combrel.common.suggestions import did_you_mean
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.transfer.base import Transfer
 
 SAVED = "transfer"
@@ -87,10 +87,9 @@ def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:
         arguments = to_plain(transfer.arguments())
     except (AttributeError, TypeError) as error:
         arguments = None
-        warnings.warn(
+        warn_user(
             f"{name} is not saved with the model ({error}): give it the method arguments(), or pass it again when the "
-            f"model is loaded, load(..., transfer={type(transfer).__name__}(...))",
-            stacklevel=3,
+            f"model is loaded, load(..., transfer={type(transfer).__name__}(...))"
         )
     return {KIND: SAVED, "method": name, "arguments": arguments}
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.report import MIN_IN_PART, Contradiction
@@ -28,10 +28,9 @@ _N, _ERROR, _EFFECT, _WORSE = range(4)
 def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> None:
     """Warn that what was transferred predicts ``n`` transitions worse than "no change", by ``error`` times."""
     names = ", ".join(str(source.origin.get("env", source)) for source in sources)
-    warnings.warn(
+    warn_user(
         f"what was transferred from {names} predicts the target worse than that nothing changes: on {n} "
         f"transitions its mean squared error is {error:.2f} times as large; try another mapping or source",
-        stacklevel=8,
     )
 
 

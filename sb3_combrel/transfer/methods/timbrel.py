@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
@@ -55,10 +55,9 @@ class TIMBREL(MappingTransfer):
 
     def __post_init__(self) -> None:
         if self.mapping is None:
-            warnings.warn(
+            warn_user(
                 "mapping is left out, and random ones are drawn, which is the control: give mapping=InterTaskMapping(...), or "
-                '"random" where that is meant; COMBREL(source) finds a mapping itself',
-                stacklevel=3,
+                '"random" where that is meant; COMBREL(source) finds a mapping itself'
             )
             self.mapping = "random"
         if isinstance(self.mapping, str):

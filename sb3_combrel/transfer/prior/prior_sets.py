@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.mapping_set import FACTORED_SETS
 from sb3_combrel.mappings.named_sets import InterTaskMapping, resolve
@@ -96,11 +96,10 @@ def practical_set(sources: Sequence[SourceInstances], task: TargetTask) -> str:
         without = "variables are not mirrored" + (
             ", and one source action moves all of them" if name == WITHOUT_COPIES else ""
         )
-        warnings.warn(
+        warn_user(
             f'mappings="{usual}", the default, has {_count_copies(usual, sources, task):,} copies from these source tasks to '
             f'{task.n_variables} state variables, more than the {MAX_COPIES:,} that are practical: "{name}" is taken instead, '
             f"in which {without}. Fewer variables, or mappings of your own, avoid that",
-            stacklevel=8,
         )
     return name
 
