@@ -322,6 +322,11 @@ class FittedRMax(PastData):
                     f"{name} must be what the model was made with, {used!r}, got {now!r}: set it back, or save the model and "
                     f"call FittedRMax.load(path, {name}={now!r}), which follows if that can be changed"
                 )
+        if self.transfer is not self.policy.transfer:
+            raise ValueError(
+                f"transfer must be what the model was made with, {self.policy.transfer!r}, got {self.transfer!r}: set it "
+                "back, or make a new model with what was learned: FittedRMax(env, transfer=..., instances=model)"
+            )
 
     def _run_name(self) -> str:
         method = "" if self.transfer is None else f"_{type(self.transfer).__name__}"

@@ -174,3 +174,14 @@ def test_an_argument_that_is_written_in_another_way_is_not_changed(name, given, 
     setattr(model, name, object())
     with pytest.raises(ValueError, match=f"{name} must be what the model was made with"):
         model.learn(10)
+
+
+@pytest.mark.parametrize("made_with", [None, METHODS["COMBREL"]()], ids=["none", "COMBREL"])
+def test_a_transfer_method_that_is_changed_afterwards_is_refused_and_a_new_model_follows(made_with):
+    model = small(transfer=made_with).learn(30)
+    before, model.transfer = model.transfer, METHODS["TIMBREL"]()
+    with pytest.raises(ValueError, match=r"transfer must be what the model was made with, .*, got TIMBREL\(.*instances=model"):
+        model.learn(10)
+    assert len(small(transfer=model.transfer, instances=model).learn(10).source_instances()) == 40
+    model.transfer = before
+    assert model.learn(10).num_timesteps == 10
