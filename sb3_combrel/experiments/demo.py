@@ -272,7 +272,7 @@ def load_car(path: Path) -> FittedRMax:
 def _epilogue(output: Path, n_seeds: int, console: Console) -> None:
     what = {FIGURE: "steps to goal, episode by episode", TABLES: "the tables above", RESULTS: "every episode of every run"}
     what |= {VIDEO: "the trained car", MODEL: "the trained model: FittedRMax.load"}
-    what |= {SOURCES: "source instances, a source for each seed: SourceInstances.load", FOLDER: "result and model of each run"}
+    what |= {SOURCES: "source instances of each seed: SourceInstances.load", FOLDER: "result and model of each run"}
     what |= {TENSORBOARD: "logs of each run"}
     console.print(f"\nEverything is in {output.resolve()}:", highlight=False, soft_wrap=True)
     for name, meaning in what.items():
