@@ -64,8 +64,8 @@ def record(
     from rich.console import Console
 
     from sb3_combrel import SourceInstances
+    from sb3_combrel.common.scaling import has_bounds
     from sb3_combrel.runs.job import make_env
-    from sb3_combrel.sources.recipes import has_bounds
 
     console = Console()
     file = output if output.suffix == ".npz" else output.with_name(output.name + ".npz")
@@ -73,7 +73,7 @@ def record(
         raise ValueError(f"{file} exists; use --overwrite or another --output")
     asked: dict[str, Any] = {"n_instances": n_instances, "seed": seed, "method": method}
     with closing(make_env(env_id)) as env:
-        if has_bounds(env_id):
+        if has_bounds(env.observation_space):
             with console.status(f"Learning {env_id} by Q-learning for {total_timesteps:,} steps ..."):
                 source = SourceInstances.from_q_learning(env, total_timesteps=total_timesteps, **asked)
         else:

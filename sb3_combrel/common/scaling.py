@@ -112,6 +112,11 @@ def without_bounds(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArr
     return ~((np.maximum(np.abs(low), np.abs(high)) < LARGEST_BOUND) & (np.asarray(low) < high))
 
 
+def has_bounds(space: spaces.Space[Any]) -> bool:
+    """Whether a space has bounds for all variables; a ValueError if it is no Box of a few of them."""
+    return not without_bounds(*StateScaling.limits_of(space)).any()
+
+
 def around_zero(low: NDArray[np.float64], high: NDArray[np.float64]) -> Limits:
     """Make bounds that reach about as far on either side of 0 reach equally far: 0 is a grid point then.
 

@@ -427,9 +427,7 @@ class FittedRMax(PastData):
 
 def _are_alike(one: Any, other: Any) -> bool:
     """Whether two arguments say the same, as 1 and 1.0 do, or a list and a tuple."""
-    if one is other or repr(one) == repr(other):
-        return True
     try:
-        return bool(to_plain(one) == to_plain(other))
+        return one is other or bool(to_plain(one) == to_plain(other))
     except TypeError:
         return False

@@ -19,7 +19,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from sb3_combrel.common.scaling import StateScaling, without_bounds
+from sb3_combrel.common.scaling import has_bounds
 from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.sources.transitions import LEARNERS, make_env
@@ -120,34 +120,23 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     if not isinstance(renew, bool):
         raise ValueError(f"renew must be true or false, got {renew!r}")
     file = cache_file(recipe)
-    if (
-        "learner" not in arguments
-        and arguments.keys() <= {"env", "method", *DEFAULT_RECIPE}
-        and arguments.get("total_timesteps") in (None, DEFAULT_RECIPE["total_timesteps"])
-        and not has_bounds(arguments["env"])
-    ):
-        arguments["learner"] = "fitted_rmax"
-        arguments.pop("total_timesteps", None)
     wanted_anew = (renew or os.environ.get(RENEW_VARIABLE, "0") not in ("", "0")) and file not in _SEEN
-    env_id, learner = arguments.pop("env"), arguments.pop("learner", "q_learning")
+    env_id = arguments["env"]
     if file.is_file() and not wanted_anew:
         source = SourceInstances.load(file)
         if file not in _SEEN:
             _SEEN.add(file)
+            by = "fitted_rmax" if source.origin.get("recorder") == "FittedRMax" else "q_learning"
             print(
-                f"Source task {env_id}: {len(source):,} instances learned by {learner} on {_time_of(file)}, from {file} "
+                f"Source task {env_id}: {len(source):,} instances learned by {by} on {_time_of(file)}, from {file} "
                 f"(renew: true in the recipe, or {RENEW_VARIABLE}=1, learns them again)"
             )
         return source
-    if learner == "q_learning" and "bounds" not in arguments and not has_bounds(env_id):
-        given = f"'env': {env_id!r}"
-        raise ValueError(
-            f"{env_id} has state variables without bounds, which Q-learning needs: give lowest and highest values in the "
-            f"recipe, {{{given}, 'bounds': [[...], [...]]}}, or have it learned by {{{given}, 'learner': 'fitted_rmax'}}"
-        )
+    arguments = _with_learner(arguments)
+    learner = arguments.pop("learner")
     print(f"Learning the source task {env_id} by {learner}{_reason(file)}; kept in {file}")
     try:
-        source = getattr(SourceInstances, f"from_{learner}")(env_id, **arguments)
+        source = getattr(SourceInstances, f"from_{learner}")(**arguments)
     except (TypeError, gym.error.Error) as error:
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         known = (*inspect.signature(getattr(SourceInstances, f"from_{learner}")).parameters, "learner", "renew")
@@ -158,14 +147,33 @@ def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:
     return source
 
 
-def has_bounds(env_id: str) -> bool:
-    """Whether all state variables of a task have bounds, without which Q-learning has no tiles; True if that is not known."""
+def _with_learner(recipe: dict[str, Any]) -> dict[str, Any]:
+    """The recipe with its learner: Q-learning, or Fitted R-Max where variables have no bounds and nothing is asked for.
+
+    :raises ValueError: if variables have no bounds, and Q-learning is asked for, or anything of it
+    """
+    if recipe.get("learner", "q_learning") != "q_learning" or "bounds" in recipe or _has_bounds(recipe["env"]):
+        return {"learner": "q_learning", **recipe}
+    others = dict(recipe)
+    if others.get("total_timesteps") == DEFAULT_RECIPE["total_timesteps"]:
+        del others["total_timesteps"]
+    if others.keys() <= {"env", "method", "n_instances", "seed"}:
+        return {"learner": "fitted_rmax", **others}
+    given = f"'env': {recipe['env']!r}"
+    raise ValueError(
+        f"{recipe['env']} has state variables without bounds, which Q-learning needs: give lowest and highest values in the "
+        f"recipe, {{{given}, 'bounds': [[...], [...]]}}, or have it learned by {{{given}, 'learner': 'fitted_rmax'}}"
+    )
+
+
+def _has_bounds(env_id: str) -> bool:
+    """Whether all state variables of a task have bounds; True if that is not known."""
     try:
         env = make_env(env_id)
     except (gym.error.Error, ImportError):
         return True
     with closing(env), suppress(ValueError):
-        return not without_bounds(*StateScaling.limits_of(env.observation_space)).any()
+        return has_bounds(env.observation_space)
     return True
 
 

@@ -99,7 +99,7 @@ def test_a_task_without_bounds_is_learned_by_fitted_rmax(capsys):
                 find_source({"env": task, **more})
             assert not capsys.readouterr().out
         assert len(find_source({"env": task, "bounds": [[-1.0, 0.0], [1.0, 2.0]]})) == 40
-        assert recipes.has_bounds(WALK) and recipes.has_bounds("Nowhere-v0")
+        assert recipes._has_bounds(WALK) and recipes._has_bounds("Nowhere-v0")
     finally:
         del gymnasium.registry[task]
 
