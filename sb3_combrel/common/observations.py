@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from typing import Any
 
 import gymnasium as gym
@@ -50,15 +52,31 @@ def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, un
             if periodic[k]:
                 # Not a number if the observation is infinite.
                 unit -= np.floor(unit)
-            if noted:
+            if noted and np.isfinite(states[i, k]):
                 observed[0, k] = min(observed[0, k], states[i, k])
                 observed[1, k] = max(observed[1, k], states[i, k])
             inside = min(max(unit, 0.0), 1.0)
             units[i, k] = inside if fixed or periodic[k] else unit
             if inside != unit:
                 outside = True
-                n_outside[k] += noted and abs(unit - inside) > ROUNDING
+                n_outside[k] += noted and ROUNDING < abs(unit - inside) < np.inf
     return outside
+
+
+def wider_bounds(scaling: StateScaling, observed: np.ndarray) -> tuple[list[float], list[float]]:
+    """Bounds that observations are inside of: those of ``scaling``, or beyond these with three digits of the range.
+
+    :param observed: the least and the largest, raw units, shape (2, n_variables)
+    """
+    low, high = scaling.low.tolist(), scaling.high.tolist()
+    for k, (least, most) in enumerate(observed.T.tolist()):
+        width = max(high[k], most) - min(low[k], least)
+        digit = Decimal(1).scaleb(math.floor(math.log10(width)) - 2)
+        if least < low[k]:
+            low[k] = float(Decimal(least + ROUNDING * width).quantize(digit, ROUND_FLOOR))
+        if most > high[k]:
+            high[k] = float(Decimal(most - ROUNDING * width).quantize(digit, ROUND_CEILING))
+    return low, high
 
 
 class ObservationScaler:
@@ -123,8 +141,7 @@ class ObservationScaler:
         many = np.flatnonzero(share > MANY_OUTSIDE)
         if not self._fixed or len(many) == 0:
             return
-        low = np.round(np.minimum(self.scaling.low, observed[0]), 3).tolist()
-        high = np.round(np.maximum(self.scaling.high, observed[1]), 3).tolist()
+        low, high = wider_bounds(self.scaling, observed)
         shares = ", ".join(f"{names[k]} in {100 * share[k]:.0f} %" for k in many.tolist())
         warn_user(
             f"observations were outside the bounds and counted as the nearest state inside: {shares} of "

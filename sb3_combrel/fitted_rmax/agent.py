@@ -90,8 +90,8 @@ class FittedRMaxAgent:
         #: Whether to measure the time of planning, which takes some itself.
         self.timed = False
         self.planning_seconds = 0.0
-        # One thread at a time: predicting in one while another learns must be safe.
-        self._lock = threading.RLock()
+        #: One thread at a time: predicting in one while another learns must be safe.
+        self.lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
         # Most methods leave all actions to the agent: they are not asked at every step.
         self._transfer_decides = type(self._method).action is not Transfer.action
@@ -135,7 +135,7 @@ class FittedRMaxAgent:
 
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""
-        with self._lock:
+        with self.lock:
             if self.transfer is not None and self.model.n_instances == 0:
                 self._plan(SWEEPS_AT_EPISODE_END)
 
@@ -151,7 +151,7 @@ class FittedRMaxAgent:
         :return: the action, from 0 on
         :raises ValueError: if a transfer method decides on something that is no action
         """
-        with self._lock:
+        with self.lock:
             if not explore:
                 return self._exploit(state)
             decided = self._decided_by_transfer(state, environment) if self._transfer_decides else None
@@ -202,7 +202,7 @@ class FittedRMaxAgent:
         :param terminated: whether ``next_state`` is a terminal state; a time limit is none
         :param environment: see :meth:`act`
         """
-        with self._lock:
+        with self.lock:
             self.has_acted = True
             self._note_reward(reward, terminated)
             self._method.environment = environment
@@ -216,7 +216,7 @@ class FittedRMaxAgent:
         :param truncated: whether the episode ended by its time limit
         :param environment: see :meth:`act`
         """
-        with self._lock:
+        with self.lock:
             self.rewards.n_truncated += bool(truncated)
             self.promises.end_episode(environment)
             self._method.environment = environment
@@ -329,7 +329,7 @@ class FittedRMaxAgent:
 
     def sample_action(self, state: np.ndarray) -> int:
         """Choose an action as in learning, optimistic ones first, but for a prediction: it does not change what is learned."""
-        with self._lock:
+        with self.lock:
             self._evaluate(state)
             return int(self._prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
 
@@ -342,7 +342,7 @@ class FittedRMaxAgent:
         :param values: at the grid points; by default the planner's, optimistic ones
         :return: shape (n_actions,)
         """
-        with self._lock:
+        with self.lock:
             self._evaluate(np.ascontiguousarray(state, dtype=np.float64), values)
             return self._q.q.copy()
 
@@ -351,7 +351,7 @@ class FittedRMaxAgent:
 
         :param transitions: state, action, reward, next state and terminated of each, as :meth:`update` takes them
         """
-        with self._lock:
+        with self.lock:
             for _, _, reward, _, terminated in transitions:
                 self._note_reward(reward, terminated)
             self._follow_rewards()
@@ -377,7 +377,7 @@ class FittedRMaxAgent:
 
         :param scaling: raw <-> unit coordinates from now on; ``bounds``: as of :class:`~sb3_combrel.common.task.Task`
         """
-        with self._lock:
+        with self.lock:
             attributes, generator, of_transfer = dict(vars(self)), self.rng.bit_generator.state, self._method.get_state()
             try:
                 self._rescale(scaling, bounds)
@@ -407,7 +407,7 @@ class FittedRMaxAgent:
 
     def plan_anew(self) -> None:
         """Plan from the upper bounds on: what values were before does not count."""
-        with self._lock:
+        with self.lock:
             self.planner.restore(self.planner.upper)
             self._plan(SWEEPS_AT_EPISODE_END)
 
@@ -419,7 +419,7 @@ class FittedRMaxAgent:
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What has been learned, float64 arrays by name; only the number of rows of arrays with several axes ever changes."""
-        with self._lock:
+        with self.lock:
             return {
                 **{f"{OF_TRANSFER}{name}": array for name, array in self._method.get_state().items()},
                 **self.model.get_state(),
@@ -433,7 +433,7 @@ class FittedRMaxAgent:
         self, state: dict[str, np.ndarray], scaling: StateScaling | None = None, bounds: StateScaling | None = None
     ) -> None:
         """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``, in place of what was learned."""
-        with self._lock:
+        with self.lock:
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds)
             self.rewards.set_state(state["rewards"])
             self._bind()
@@ -449,14 +449,14 @@ class FittedRMaxAgent:
             self.has_acted, self._cautious = bool(state["has_acted"][0] > 0.5), None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_lock"}
+        return {name: value for name, value in vars(self).items() if name != "lock"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _lock=threading.RLock())
+        vars(self).update(state, lock=threading.RLock())
 
     def statistics(self) -> dict[str, float]:
         """Figures for the logger, by name."""
-        with self._lock:
+        with self.lock:
             modelled, known = float(self.mdp.arrays.modelled.mean()), float(self.model.known.mean())
             return {
                 "model/instances": self.model.n_instances,

@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
 from sb3_combrel.common.observations import with_own_arrays
@@ -52,7 +52,7 @@ class FittedRMax(PastData):
     """Fitted R-Max: model-based exploration in continuous state spaces.
 
     Paper: Jong & Stone, "Model-based exploration in continuous state spaces" (SARA 2007). Transfer: Taylor, Jong &
-    Stone 2008 (TIMBREL); Fachantidis et al. (COMBREL). For small Box observation spaces (up to about five state
+    Stone 2008 (TIMBREL); Fachantidis et al. (COMBREL). For small Box observation spaces (up to six state
     variables) and Discrete actions, where every environment step counts.
 
     Every state variable is divided by its range. A kernel model per action predicts rewards and relative effects from
@@ -98,8 +98,9 @@ class FittedRMax(PastData):
     :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach. None: 0.05 with
         ``degree=1``, 0.01 with ``degree=0``
     :param exploration_threshold: weight of instances that makes a state-action pair known
-    :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: at
-        least 6 for one or two variables, 4 for three, 3 for more, and finer if the breadth needs it and memory allows.
+    :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: 6
+        for one or two variables, 4 for three, 3 for more, finer if the breadth needs it, and coarser where there would be more
+        than a million state-action pairs
     :param max_value: an upper bound on the return from any state, the value of what is unknown. None: found from the rewards
         seen so far, as the largest return that they allow, see :class:`~sb3_combrel.fitted_rmax.optimism.RewardRange`
     :param gamma: discount factor, in (0, 1]. None: found as well: 0.99, or 1 where every step costs and episodes end
@@ -418,8 +419,7 @@ class FittedRMax(PastData):
         self.logger.dump(step=self.num_timesteps)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        if isinstance(env, VecEnv):
-            refuse_normalized_observations(env)
+        refuse_normalized_observations(env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env]))
         super().set_env(env, force_reset)
         assert self.env is not None
         self._vec_normalize_env = unwrap_vec_normalize(self.env)

@@ -57,7 +57,8 @@ class RewardRange:
             return float(self._max_value)
         if self.largest == 0.0 and self.largest_end <= 0.0:
             # What costs nothing would keep the agent from what is unknown: nothing that it can pay is too much for that.
-            return -self.lowest / (1.0 - self.gamma) if self.lowest < 0.0 else WORTH_TRYING
+            discount = self.gamma if self.gamma < 1.0 else DISCOUNT
+            return -self.lowest / (1.0 - discount) if self.lowest < 0.0 else WORTH_TRYING
         for_ever = self.largest / (1.0 - self.gamma) if self.largest > 0.0 and self.gamma < 1.0 else 0.0
         return max(0.0, self.largest_end, for_ever)
 

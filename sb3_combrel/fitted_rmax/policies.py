@@ -106,17 +106,19 @@ class FittedRMaxPolicy(BasePolicy):
         """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
         if self.scales.fixed or not (episode_ended or self.to_unit.went_beyond):
             return False
-        before, scaling = self.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
-        if scaling is not None:
-            try:
-                self._warn_beyond_space()
-                self._warn_of_far_observation(before)
-                self.agent.rescale(scaling, self.scales.bounds)
-            except BaseException:
-                self.scales.scaling = self.agent.task.scaling
-                raise
-            finally:
-                self._renew_to_unit()
+        # No other thread may see new scales with old instances.
+        with self.agent.lock:
+            before, scaling = self.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
+            if scaling is not None:
+                try:
+                    self._warn_beyond_space()
+                    self._warn_of_far_observation(before)
+                    self.agent.rescale(scaling, self.scales.bounds)
+                except BaseException:
+                    self.scales.scaling = self.agent.task.scaling
+                    raise
+                finally:
+                    self._renew_to_unit()
         return scaling is not None
 
     def _warn_beyond_space(self) -> None:
@@ -161,14 +163,16 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """The best known actions; without ``deterministic`` optimistic actions first, as in learning."""
-        states = self.to_unit(observation.cpu().numpy())  # type: ignore[union-attr]
         agent = self.agent
-        chosen = [agent.act(state, explore=False) if deterministic else agent.sample_action(state) for state in states]
+        with agent.lock:
+            states = self.to_unit(observation.cpu().numpy())  # type: ignore[union-attr]
+            chosen = [agent.act(state, explore=False) if deterministic else agent.sample_action(state) for state in states]
         actions = np.array(chosen, dtype=np.int64) + self._first_action
         return th.as_tensor(actions, device=observation.device)  # type: ignore[union-attr]
 
     def _learned(self) -> dict[str, np.ndarray]:
-        return {**self.agent.get_state(), "scales": self.scales.get_state()}
+        with self.agent.lock:
+            return {**self.agent.get_state(), "scales": self.scales.get_state()}
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
@@ -218,11 +222,11 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _replace_learned(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`_learned` returned, in place of what was learned."""
-        self.scales.set_state(arrays["scales"])
-        self.agent.set_state(
-            {name: arrays[name] for name in arrays if name != "scales"}, self.scales.scaling, self.scales.bounds
-        )
-        self._renew_to_unit()
+        of_agent = {name: array for name, array in arrays.items() if name != "scales"}
+        with self.agent.lock:
+            self.scales.set_state(arrays["scales"])
+            self.agent.set_state(of_agent, self.scales.scaling, self.scales.bounds)
+            self._renew_to_unit()
 
 
 def _misfit(name: str, tensor: Any, expected: np.ndarray) -> str:

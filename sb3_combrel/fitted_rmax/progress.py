@@ -19,8 +19,8 @@ class ProgressWatch:
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
       ``max_value`` of what is unknown, and nothing draws the agent to the unknown.
     - Episodes that all end by their time limit, with gamma 1.
-    - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time: nothing that
-      exploration reaches makes a difference.
+    - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time or nothing has
+      told states apart: nothing that exploration reaches makes a difference.
     """
 
     def __init__(self, rewards: RewardRange, tolerance: float):
@@ -93,16 +93,17 @@ class ProgressWatch:
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:
         total = sum(rewards)
         # Where rewards are collected until the time limit it is a success to reach it.
-        stuck = explored and not terminated and min(rewards) <= 0.0
+        searches = explored or not self.rewards.differ
+        stuck = searches and not terminated and min(rewards) <= 0.0
         self._n_equal = (self._n_equal + 1 if total == self._last_return else 1) if stuck else 0
         self._last_return = total
         if self._n_equal == EQUAL_RETURNS:
             self._warn(
                 "equal",
-                f"the last {EQUAL_RETURNS} returns are all {total:g}, though the agent still tries actions for the first time "
-                f"(max_value={self.max_value:g}, gamma={self.gamma:g}): nothing that it has reached makes a difference. "
-                "max_value must be above the return of a good policy, but not by far; with a larger model_breadth, or a "
-                "longer time limit, exploration gets farther",
+                f"the last {EQUAL_RETURNS} returns are all {total:g}, though the agent explores, with "
+                f"max_value={self.max_value:g} and gamma={self.gamma:g}: nothing that it has reached makes a difference. A "
+                "max_value must be above the return of a good policy, but not by far; with a larger model_breadth, or a longer "
+                "time limit, exploration gets farther",
             )
 
     def _warn(self, of: str, message: str) -> None:

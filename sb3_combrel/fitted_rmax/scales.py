@@ -82,10 +82,10 @@ class FoundScales:
     def beyond_space(self) -> np.ndarray:
         """Which variables have been observed outside the observation space, bool, shape (n_variables,)."""
         least, most = self.observed
-        with np.errstate(invalid="ignore"):  # nothing is beyond a space without bounds
-            tolerated = np.nan_to_num(BEYOND * (self.high - self.low), posinf=0.0)
-        beyond: np.ndarray = self._found & ((least < self.low - tolerated) | (most > self.high + tolerated))
-        return beyond
+        # Of a variable without a lower or an upper bound the range in use.
+        width = np.where(np.isfinite(self.high - self.low), self.high - self.low, self.scaling.high - self.scaling.low)
+        beyond: np.ndarray = (least < self.low - BEYOND * width) | (most > self.high + BEYOND * width)
+        return self._found & beyond
 
     def widened(self, before: StateScaling) -> np.ndarray:
         """By how much wider than before each variable without bounds is scaled, shape (n_variables,); 0 for the others."""

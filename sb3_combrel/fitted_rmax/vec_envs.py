@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -70,12 +71,13 @@ def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[An
 
 
 def refuse_normalized_observations(env: VecEnv) -> None:
-    """:raises ValueError: if a ``VecNormalize`` normalizes the observations"""
+    """:raises ValueError: if a ``VecNormalize``, or a ``NormalizeObservation``, normalizes observations by running means"""
     normalizer = unwrap_vec_normalize(env)
-    if normalizer is not None and normalizer.norm_obs:
+    of_each = env.env_is_wrapped(gym.wrappers.NormalizeObservation)
+    if (normalizer is not None and normalizer.norm_obs) or (any(of_each) and any(env.get_attr("update_running_mean"))):
         raise ValueError(
-            "FittedRMax needs VecNormalize(norm_obs=False), for it scales observations by their bounds itself: the statistics "
-            "of norm_obs=True drift, and the model's grid is fixed"
+            "FittedRMax needs VecNormalize(norm_obs=False), and no NormalizeObservation whose update_running_mean is True: "
+            "it scales observations itself, and means that run would move them under a model that has learned"
         )
 
 

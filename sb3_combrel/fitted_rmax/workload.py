@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.models.base import ModelSettings
-from sb3_combrel.planning.grid import MAX_VARIABLES, StateGrid
+from sb3_combrel.planning.grid import FEWER_VARIABLES, MAX_VARIABLES, StateGrid
 
 # In seconds, without and with transfer: for each state-action pair until the first step, and for each grid point that an
 # instance reaches in a step.
@@ -48,8 +48,7 @@ def warn_if_long(work: Workload, grid: StateGrid) -> None:
     if grid.n_variables > MAX_VARIABLES:
         warn_user(
             f"{grid.n_variables} state variables are many for a grid, with {grid.arrays.shape.min()} points along some of "
-            f"them: {work}. Fewer variables, chosen with gymnasium.wrappers.FilterObservation or a wrapper of your own, are "
-            "learned in fewer steps; for more there are DQN and PPO of Stable-Baselines3"
+            f"them: {work}; {FEWER_VARIABLES}"
         )
     elif work.setup_seconds > LONG_SETUP_SECONDS or work.step_seconds > LONG_STEP_SECONDS:
         warn_user(

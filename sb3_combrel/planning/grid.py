@@ -241,6 +241,10 @@ BYTES_PER_POINT = 200
 MAX_PAIRS_BY_DEFAULT = 1_000_000
 # Of more state variables than these a grid is coarse in any case.
 MAX_VARIABLES = 6
+FEWER_VARIABLES = (
+    "fewer variables, chosen with a gymnasium.ObservationWrapper, and fewer actions are learned in fewer steps; for more "
+    "there are DQN and PPO of Stable-Baselines3"
+)
 
 
 def fitting_grid(
@@ -270,7 +274,7 @@ def fitting_grid(
         raise ValueError(
             f"resolution={resolution} with {n_variables} state variables and {n_actions} actions means {n_points:,} grid "
             f"points and about {n_points * of_point / 2**30:,.1f} GiB of memory, more than half of what this machine has; "
-            + (f"resolution={fits} fits" if fits > 0 else "no resolution fits: fewer state variables or actions would")
+            + (f"resolution={fits} fits" if fits > 0 else f"no resolution fits: {FEWER_VARIABLES}")
         )
     if n_variables <= MAX_VARIABLES:
         _warn_if_too_coarse(n_variables, resolution, reach, model_breadth)

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from sb3_combrel.common.observations import ROUNDING, wider_bounds
 from sb3_combrel.common.scaling import StateScaling
 
 BOX = gym.spaces.Box(np.array([-1.2, -0.07]), np.array([0.6, 0.07]), dtype=np.float64)
@@ -96,3 +97,15 @@ def test_other_spaces_are_refused(space, message):
 def test_wrong_vectors_are_refused(low, high, message):
     with pytest.raises(ValueError, match=message):
         StateScaling(low, high)
+
+
+@given(st.floats(-1e3, 1e3), st.floats(1e-6, 1e6), st.floats(0.0, 100.0), st.floats(0.0, 100.0))
+def test_proposed_bounds_hold_what_was_observed_and_are_not_much_wider(low, width, below, above):
+    given_bounds = StateScaling(np.array([low]), np.array([low + width]))
+    observed = np.array([[low - below * width], [low + width + above * width]])
+    [least], [most] = wider_bounds(given_bounds, observed)
+    whole = (1.0 + below + above) * width
+    allowed = 1.1 * ROUNDING * whole + 1e-9
+    assert least <= observed[0, 0] + allowed and most >= observed[1, 0] - allowed
+    assert most - least <= 1.03 * whole + 1e-9
+    assert (least == low or below > 0.0) and (most == low + width or above > 0.0)

@@ -98,6 +98,7 @@ def test_what_is_not_finite_is_refused(what, value):
         model.learn(40)
     assert model.agent.model.n_instances == 4, "what came before is kept"
     assert np.isfinite(model.agent.planner.values).all()
+    assert np.isfinite(model.policy.scales.observed).all(), "and learning can go on"
     with pytest.raises(ValueError, match=r"observation.*not finite"):
         model.predict(np.array([0.0, value]))
 

@@ -51,6 +51,8 @@ def test_where_the_most_is_nothing_the_unknown_is_worth_what_the_worst_costs_for
     assert rewards.gamma == DISCOUNT
     assert rewards.max_value == pytest.approx(worst / (1.0 - DISCOUNT) if worst > 0.0 else WORTH_TRYING)
     assert rewards.max_value > 0.0, "more than what costs nothing, or nothing would draw the agent on"
+    undiscounted = after([(0.0, False), *((-cost, False) for cost in costs), *((end, True) for end in ends)], gamma=1.0)
+    assert undiscounted.max_value == rewards.max_value
 
 
 @given(STEPS, REWARDS, st.floats(0.1, 1.0), st.integers(0, 3))

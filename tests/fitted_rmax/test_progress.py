@@ -70,12 +70,15 @@ def test_episodes_that_cost_nothing_give_one_warning(max_value, gamma):
     ],
 )
 def test_other_episodes_give_no_warning_of_their_cost(max_value, gamma, episode):
-    assert not shown(watch_with(max_value, gamma), [episode] * 50, explores=False)
+    watch = watch_with(max_value, gamma)
+    watch.rewards.note(-1.0, True)
+    assert not shown(watch, [episode] * 50, explores=False)
 
 
 def test_equal_returns_give_one_warning_while_exploration_goes_on():
     alike = ([-1.0, -1.0], False)
     watch = watch_with(7.0, 0.95)
+    watch.rewards.note(-1.0, True)
     [(number, message)] = shown(watch, [([-1.0], True), *[alike] * 3, ([-1.0], False), *[alike] * 60])
     assert number == 5 + EQUAL_RETURNS and f"the last {EQUAL_RETURNS} returns are all -2" in message
     assert "max_value=7" in message and "model_breadth" in message
@@ -93,7 +96,17 @@ def test_equal_returns_give_one_warning_while_exploration_goes_on():
     ids=["no exploration", "the goal is reached", "rewards are collected", "different returns", "now and then the goal"],
 )
 def test_other_returns_give_no_warning(episodes, explores):
-    assert not shown(watch_with(100.0, 1.0), episodes, explores)
+    watch = watch_with(100.0, 1.0)
+    watch.rewards.note(-1.0, True)
+    assert not shown(watch, episodes, explores)
+
+
+def test_equal_returns_give_one_warning_as_long_as_nothing_has_told_states_apart():
+    """All actions have been tried wherever the agent gets to."""
+    watch = watch_with(100.0, 0.99)
+    watch.rewards.note(-1.0, False)
+    [(number, message)] = shown(watch, [([-1.0, -1.0], False)] * 60, explores=False)
+    assert number == EQUAL_RETURNS and "nothing that it has reached makes a difference" in message
 
 
 class Corridor(gym.Env):

@@ -65,6 +65,13 @@ def test_what_lies_beyond_the_space_is_scaled_once(observations):
     np.testing.assert_array_equal(scales.beyond_space(), (np.abs(observations) > 1.0 + 2.0 * BEYOND).any(axis=0))
 
 
+@pytest.mark.parametrize(("most", "beyond"), [(np.float64(np.float32(0.07)), False), (0.3, True)])
+def test_rounding_is_not_beyond_a_space_with_one_bound(most, beyond):
+    scales = FoundScales(box([-np.inf], [0.07]), None, np.zeros(1, dtype=np.bool_))
+    note(scales, np.array([[-0.05], [most]]))
+    assert scales.beyond_space().tolist() == [beyond]
+
+
 class Wider(Walk):
     """It says that it ends halfway."""
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_combrel import FittedRMax
+from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 
@@ -107,6 +108,23 @@ def test_predictions_in_a_thread_while_learning_change_nothing_that_is_learned(n
         sys.setswitchinterval(interval)
     assert thread.error is None and thread.n_asked > 0
     assert_learned_the_same(plain.learn(n_steps), predicting)
+
+
+def test_a_checkpoint_of_another_thread_waits_while_scales_are_found_anew(monkeypatch):
+    """It would have instances in unit coordinates of one scale, and another scale."""
+    model = FittedRMax(Walk(limit=7), bounds=None, seed=0)
+    waited, rescale = [], FittedRMaxAgent.rescale
+
+    def slowly(agent, *scales):
+        thread = threading.Thread(target=model.get_parameters, daemon=True)
+        thread.start()
+        thread.join(timeout=0.1)
+        waited.append(thread.is_alive())
+        rescale(agent, *scales)
+
+    monkeypatch.setattr(FittedRMaxAgent, "rescale", slowly)
+    model.learn(40)
+    assert waited and all(waited)
 
 
 def stochastic(model, n=5):

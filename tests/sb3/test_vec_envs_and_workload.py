@@ -56,6 +56,17 @@ def test_normalized_observations_are_refused_by_constructor_set_env_and_load(tmp
         FittedRMax.load(tmp_path / "model", env=normalized)
 
 
+def test_observations_normalized_by_running_means_are_refused_in_an_environment_as_well():
+    normalized = gym.wrappers.NormalizeObservation(Walk())
+    with pytest.raises(ValueError, match="no NormalizeObservation"):
+        small(normalized)
+    model = small()
+    with pytest.raises(ValueError, match="no NormalizeObservation"):
+        model.set_env(normalized)
+    normalized.update_running_mean = False
+    small(normalized)
+
+
 def test_of_normalized_rewards_the_original_ones_are_stored(tmp_path):
     env = VecNormalize(VecMonitor(DummyVecEnv([Walk])), norm_obs=False, norm_reward=True)
     recorder = Recorder()
