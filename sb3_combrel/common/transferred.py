@@ -1,5 +1,6 @@
 """What transfer methods give to the model: transferred instances, or predictions as a prior."""
 
+import reprlib
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +57,24 @@ class PriorPredictions(NamedTuple):
     def nothing(cls, n: int, n_variables: int) -> "PriorPredictions":
         """Say nothing of any of ``n`` pairs."""
         return cls(np.zeros((n, n_variables)), np.zeros((n, n_variables)))
+
+
+def check_prior(given: PriorPredictions, method: object, n: int, n_variables: int) -> None:
+    """Check what a transfer method predicts of ``n`` pairs before it joins any fit.
+
+    :raises ValueError: if arrays have other shapes, a number is not finite, or a weight is below 0
+    """
+    name = type(method).__name__
+    if not isinstance(given, PriorPredictions):
+        raise ValueError(f"{name}.prior must return PriorPredictions, got {reprlib.repr(given)}")
+    for field, array in zip(given._fields, given, strict=True):
+        if np.shape(array) != (n, n_variables):
+            raise ValueError(f"{name}.prior returned {field} of shape {np.shape(array)}; it must be {(n, n_variables)}")
+        wrong = ~np.isfinite(array) | ((array < 0.0) & (field == "weight"))
+        if wrong.any():
+            row = int(np.flatnonzero(wrong.any(axis=1))[0])
+            least = ", and at least 0" if field == "weight" else ""
+            raise ValueError(f"{name}.prior returned {field} {array[row]} for row {row}; it must be finite{least}")
 
 
 _TYPES = tuple(map(np.dtype, (np.int64, np.float64, np.float64, np.float64, np.bool_)))

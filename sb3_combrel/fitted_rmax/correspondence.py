@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_combrel.common.scaling import StateScaling
-from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances, check_transferred
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances, check_prior, check_transferred
 from sb3_combrel.transfer.base import Transfer
 
 
@@ -50,6 +50,7 @@ class OfLearner:
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         given = self._transfer.prior(self._correspondence.states(states), actions)
+        check_prior(given, self._transfer, *states.shape)
         return given._replace(effect=self._correspondence.effects_of_learner(given.effect))
 
     def prior_version(self) -> int:

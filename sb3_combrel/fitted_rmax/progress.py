@@ -102,8 +102,8 @@ class ProgressWatch:
                 "equal",
                 f"the last {EQUAL_RETURNS} returns are all {total:g}, though the agent explores, with "
                 f"max_value={self.max_value:g} and gamma={self.gamma:g}: nothing that it has reached makes a difference. A "
-                "max_value must be above the return of a good policy, but not by far; with a larger model_breadth, or a longer "
-                "time limit, exploration gets farther",
+                "max_value must be above the return of a good policy, but not by far; with a larger model_breadth, or a "
+                "longer time limit, exploration gets farther",
             )
 
     def _warn(self, of: str, message: str) -> None:

@@ -61,7 +61,8 @@ class SavedAlgorithm(BaseAlgorithm):
         returns. What cannot be written so is left out, with a warning, and must be passed to :meth:`load`.
 
         A loaded model predicts what this one does, and learns on as this one would, bit for bit. Not saved but computed again
-        are ``TIMBREL``'s random draws.
+        are ``TIMBREL``'s random draws; and instances that ``max_instances`` has removed leave no trace, which until then they
+        have where pairs of the grid were fitted to them.
 
         :param path: of the file; .zip is added if it has no suffix
         :param exclude: names of attributes that are excluded as well

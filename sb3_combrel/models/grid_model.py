@@ -107,7 +107,6 @@ class GridModel(Model):
         self._make_prediction(self._own_room)
         # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
         self.n_added = 0
-        self._replays = False
         self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         self._renew_arrivals()
 
@@ -240,7 +239,7 @@ class GridModel(Model):
 
     def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
         """Transferred instances for pairs; known ones need none."""
-        if self._giver is None or self._replays or len(pairs) == 0:
+        if self._giver is None or len(pairs) == 0:
             if len(self._nothing.length) < len(pairs):
                 self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
             return self._nothing
@@ -288,27 +287,23 @@ class GridModel(Model):
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Replay the transitions, and fit each pair when it was last fitted; for a new model."""
-        self._replays = True
         self.update_all(self.renew_prior())
         rows, d = state["instances"][np.argsort(state["instances"][:, -1], kind="stable")], self.grid.n_variables
         actions = np.clip(rows[:, 0], 0, self.n_actions - 1).astype(np.int64)
         self._make_room(int(np.bincount(actions, minlength=self.n_actions).max()))
         n_added, self._informed_at = (int(number) for number in state["n_added"])
-        due = when_fitted(state["fitted_at"].astype(np.int64))
+        fitted_at = state["fitted_at"].astype(np.int64)
+        due = when_fitted(fitted_at)
+        if self._giver is not None and len(rows) > 0:
+            self.update_all(np.flatnonzero(fitted_at == 0))
         for action, row in zip(actions.tolist(), rows, strict=True):
             self._fit_until(due, int(row[-1]))
             self.n_added = int(row[-1]) - 1
             at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
         self._fit_until(due, n_added + 1)
-        self.n_added, self._replays = n_added, False
+        self.n_added = n_added
         self._put_in_order(state["instances"])
-        if self._giver is not None:
-            # What is transferred now may be something else than when they were fitted, which stays as it was.
-            before = [array.copy() for array in self.pairs]
-            self.update_all(np.flatnonzero(~self.known))
-            for array, copied in zip(self.pairs, before, strict=True):
-                array[:] = copied
 
     def _put_in_order(self, rows: np.ndarray) -> None:
         """Put instances where they were: sums over all of them depend on their order, in the last bit."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 def finite_array(name: str, values: object, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """States or rewards: finite numbers of a certain shape, one row an instance."""
     try:
+        if np.ma.is_masked(values):
+            raise TypeError("some are masked")
         given = np.asarray(values)
         # NumPy would also convert text, dates and complex numbers.
         if given.dtype.kind not in "biufO":
             raise TypeError(f"{given.dtype} are no numbers")
         array = np.array(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers of shape {shape}, got {values!r}") from error
+        raise ValueError(f"{name} must be numbers of shape {shape}, got {reprlib.repr(values)}") from error
     if array.shape != shape:
         raise ValueError(f"{name} must have the shape {shape}, got {array.shape}")
     wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
@@ -46,6 +49,8 @@ def terminal_flags(terminated: object, n: int) -> NDArray[np.bool_]:
 
 def checked_names(name: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
     """Names of ``n`` variables or actions; if none are given, the letter and a number."""
+    if not isinstance(names, Sequence | np.ndarray):
+        raise ValueError(f"{name} must be a sequence of names, got {names!r}")
     if len(names) not in (0, n):
         raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
     if len(set(names)) < len(names):

@@ -48,7 +48,7 @@ def evidence(agent: FittedRMaxAgent) -> dict[str, float]:
     if not isinstance(transfer, MappingTransfer) or transfer.use != "prior":
         return {}
     prior = transfer.source_prior
-    strengths = prior.evidence.strength_of_actions().tolist()
+    strengths = np.nan_to_num(prior.strengths()).tolist()
     found = {f"evidence/{name}": strength for name, strength in zip(agent.task.action_names, strengths, strict=True)}
     bound = prior.value_bound()
     return found if bound is None else {**found, "transfer/value_bound": float(bound.mean())}

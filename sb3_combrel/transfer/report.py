@@ -101,6 +101,8 @@ class TransferReport:
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
     why_unbounded: str = ""  #: with ``use="prior"``: why not
+    #: What bounds values: a mirror image of the mapping in use that foretells ends better; "" for the mapping itself.
+    bounded_through: str = ""
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
     source_actions: tuple[str, ...] = ()  #: with ``use="instances"``, the names of the source actions of all sources
     history: tuple[EvidencePoint, ...] = ()  #: the evidence over time; empty where none is kept
@@ -115,6 +117,8 @@ class TransferReport:
         """How well the source explained the target, in one sentence."""
         if self.use == "none":
             return "The model has no transfer method: what it knows is its own."
+        if self._says_nothing:
+            return NO_MAPPING
         if not self.n_compared or np.isnan(self.error):
             return "Nothing can be said of the source: none of its predictions has been compared with what happened."
         well = "well" if self.error < 0.5 else "in part" if self.error < 1.0 else "no better than that nothing changes"
@@ -122,6 +126,12 @@ class TransferReport:
         judged = f"its prediction error is {_text(self.error)} (no change: 1), worse than no change on {worse:.0f} % of"
         more = ", and its values bound those of what is unknown" if self.bounds_values else ""
         return f"The source explains the target {well}: {judged} {self.n_compared:,} steps{more}."
+
+    @property
+    def _says_nothing(self) -> bool:
+        """Whether a source was compared with the target, and is taken for nothing."""
+        nothing = self.use == "prior" and bool(self.mappings) and all(np.isnan(each.strength) for each in self.mappings)
+        return nothing and bool(self.n_steps)
 
     def __str__(self) -> str:
         if self.use == "none":
@@ -142,7 +152,8 @@ class TransferReport:
         if self.bounds_values:
             more = self.statistics.get("transfer/bound_exceeded", 0.0)
             raised = f", and {more:.3g} more, by which returns exceeded it" if more > 0.0 else ""
-            lines.append(f"The value of what is unknown is bounded by the source's value there{raised}.")
+            through = f", seen through {self.bounded_through}" if self.bounded_through else ""
+            lines.append(f"The value of what is unknown is bounded by the source's value there{through}{raised}.")
         elif self.why_unbounded:
             lines.append(f"The source's values do not bound that of what is unknown: {self.why_unbounded}.")
         return "\n".join(lines)
@@ -169,6 +180,8 @@ class TransferReport:
         return "\n".join(lines)
 
     def _contradictions(self) -> str:
+        if self._says_nothing:
+            return NO_MAPPING
         if not self.n_compared:
             return "No prediction of the source has been compared with what happened." if self.mappings else ""
         lines = [
@@ -197,6 +210,7 @@ def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
     )
 
 
+NO_MAPPING = "The source is taken for nothing: no mapping explains the target better than that nothing changes."
 _FIGURES = ("compliance", "next best", "no change", "error", "next best's", "strength")
 _EXPLANATIONS = {
     "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and "

@@ -262,6 +262,20 @@ def test_learning_goes_on_to_the_last_bit(variant, tmp_path):
         assert model.policy.transfer.mapping_counts() == loaded.policy.transfer.mapping_counts()
 
 
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("n_steps", [25, 60])
+def test_in_mid_episode_what_is_not_known_waits_after_loading_as_it_did(degree, n_steps, tmp_path):
+    """A pair with transferred instances takes new ones of its own in when its episode ends, or when they are many."""
+    model = small(transfer=COMBREL(walk_source(), use="instances"), degree=degree, exploration_threshold=2.0).learn(n_steps)
+    assert (model.agent.model.end_episode()).size > 0, "nothing waits: the test tests nothing"
+    model.save(tmp_path / "model")
+    rows, of_loaded = (one.agent.mdp.arrays for one in (model, FittedRMax.load(tmp_path / "model")))
+    for name in ("modelled", "length", "reward"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(of_loaded, name), err_msg=name)
+    used = np.arange(rows.weight.shape[2]) < rows.length[:, :, None]
+    np.testing.assert_array_equal(np.where(used, rows.weight, 0.0), np.where(used, of_loaded.weight, 0.0))
+
+
 def test_a_kernel_average_passes_on_after_loading_what_it_had_not_yet(tmp_path):
     """With a large tolerance and a narrow kernel most changes wait: what waits is saved."""
     given = dict(degree=0, model_breadth=0.03, min_fraction=0.02, resolution=6, planning_tolerance=0.1, gamma=0.9)

@@ -1,10 +1,12 @@
 """What learners and recorders of source tasks refuse: environments that return nonsense, numbers that are no counts."""
 
+import dataclasses
 import re
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers.walk import walk_source
 
 from sb3_combrel import COMBREL, SourceInstances
 from sb3_combrel.sources.q_learning import QLearning
@@ -128,3 +130,18 @@ def test_a_folder_is_no_file_of_instances(folder, tmp_path, monkeypatch):
     assert len(SourceInstances.load("inner")) == 20
     with pytest.raises(ValueError, match="path must be that of a file"):
         made.save(".")
+
+
+@pytest.mark.parametrize("names", [None, iter(["left", "right"]), 7])
+def test_names_that_are_no_sequence_are_refused_by_name(names):
+    with pytest.raises(ValueError, match="action_names must be a sequence of names"):
+        dataclasses.replace(walk_source(), action_names=names)
+
+
+def test_masked_states_are_refused():
+    given = walk_source()
+    masked = np.ma.masked_array(given.states, np.zeros(given.states.shape, dtype=np.bool_))
+    dataclasses.replace(given, states=masked)
+    masked[3, 0] = np.ma.masked
+    with pytest.raises(ValueError, match="states must be numbers"):
+        dataclasses.replace(given, states=masked)

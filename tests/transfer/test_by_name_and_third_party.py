@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import sb3_combrel
 from sb3_combrel import COMBREL, TIMBREL, FactoredMapping, FittedRMax, InterTaskMapping, SourceInstances
-from sb3_combrel.common.transferred import TransferredInstances, check_transferred
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances, check_prior, check_transferred
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer
 
@@ -225,6 +225,40 @@ def test_whatever_keeps_the_contract_is_taken():
     check_transferred(one_row(weight=np.array([[0.75, np.nan]])), Mine(), np.full(1, 0.25), 3, 1.0)
     check_transferred(one_row(length=np.zeros(1, dtype=np.int64), weight=np.zeros((1, 2))), Mine(), np.zeros(1), 3, 1.0)
     check_transferred(TransferredInstances.empty(5, 3), Mine(), np.zeros(2), 3, 1.0)
+
+
+def predicted(effect=(0.1, 0.0), weight=(1.0, 0.0), n=2):
+    return PriorPredictions(*(np.tile(row, (n, 1)) for row in (effect, weight)))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (None, "Mine.prior must return PriorPredictions, got None"),
+        (predicted(effect=(0.0, 0.0, 0.0)), r"effect of shape \(2, 3\); it must be \(2, 2\)"),
+        (predicted(n=1), r"effect of shape \(1, 2\); it must be \(2, 2\)"),
+        (predicted(effect=(np.nan, 0.0)), r"effect \[nan  0.\] for row 0; it must be finite"),
+        (predicted(weight=(np.inf, 1.0)), r"weight \[inf  1.\] for row 0; it must be finite, and at least 0"),
+        (predicted(weight=(1.0, -1.0)), r"weight \[ 1. -1.\] for row 0; it must be finite, and at least 0"),
+    ],
+)
+def test_a_prior_that_breaks_the_contract_is_refused(given, message):
+    check_prior(predicted(), Mine(), 2, 2)
+    with pytest.raises(ValueError, match=message):
+        check_prior(given, Mine(), 2, 2)
+
+
+class Foreteller(Mine):
+    use = "prior"
+
+    def prior(self, states, actions):
+        return PriorPredictions(np.full(states.shape, np.nan), np.ones(states.shape))
+
+
+@pytest.mark.parametrize("bounds", [None, ([-1.0, 0.0], [1.0, 2.0])], ids=["other units", "the same units"])
+def test_a_wrong_prior_is_refused_before_anything_is_learned(bounds):
+    with pytest.raises(ValueError, match=r"Foreteller.prior returned effect .* must be finite"):
+        FittedRMax(Walk(), transfer=Foreteller(), bounds=bounds, seed=0).learn(60)
 
 
 def steady_timbrel():

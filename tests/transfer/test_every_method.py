@@ -1,5 +1,7 @@
 """What holds of every transfer method: its seed decides, it is saved and restored, it learns, bad arguments are refused."""
 
+import copy
+
 import numpy as np
 import pytest
 from helpers import naive_transfer as naive
@@ -110,6 +112,16 @@ def test_what_is_restored_goes_on_as_if_nothing_had_happened(name, n):
         assert_same(live(method, n, last), live(again, n, last))
         assert_same(method.get_state().values(), again.get_state().values())
         np.testing.assert_equal(without_seconds(method), without_seconds(again))
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_deep_copy_goes_on_as_the_method_does(name):
+    method = bound(VARIANTS[name](), TASK)
+    live(method, 0, 25)
+    copied = copy.deepcopy(method)
+    assert_same(live(method, 25, 50), live(copied, 25, 50))
+    assert_same(method.get_state().values(), copied.get_state().values())
+    np.testing.assert_equal(without_seconds(method), without_seconds(copied))
 
 
 @pytest.mark.parametrize("name", VARIANTS)

@@ -155,6 +155,9 @@ def test_values_are_bounded_from_the_side_where_the_target_ends_and_so_after_loa
     [at] = model.transfer.task.sample_states.T
     order = np.argsort(at)
     assert bound is not None and (bound[order[-1]] > bound[order[0]]) == upwards
+    of_bound, report = prior.candidates.describe_choice(prior.bounding), model.transfer.report()
+    assert report.bounded_through == ("" if prior.bounding.same(prior.choice) else of_bound)
+    assert not report.bounded_through or f"source's value there, seen through {of_bound}" in str(report)
     # All but the first episodes take the shortest way.
     assert max(env.get_episode_lengths()[3:]) <= 12
     model.save(tmp_path / "model")

@@ -233,5 +233,15 @@ def test_it_says_why_the_sources_values_bound_nothing():
     assert "do not bound that of what is unknown: its rewards are not the target's." in str(wrong)
 
 
+def test_a_source_that_is_taken_for_nothing_is_said_to_be():
+    source = SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0)
+    noise = np.random.default_rng(0).uniform(source.low, source.high, source.states.shape)
+    unrelated = dataclasses.replace(source, next_states=noise, terminated=np.zeros(150, dtype=np.bool_))
+    report = small(NamedWalk(), transfer=COMBREL(unrelated), degree=1).learn(150).transfer.report()
+    assert [each.mapping for each in report.mappings] == ["nothing", "nothing"]
+    assert report.why_unbounded == "no mapping explains the target better than that nothing changes"
+    assert report.sentence in str(report) and report.sentence.startswith("The source is taken for nothing")
+
+
 def test_a_mapping_that_was_left_to_chance_is_shown():
     assert repr(TIMBREL(walk_source(), "random", use="prior")).endswith("mapping='random', use='prior')")

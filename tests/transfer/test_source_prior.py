@@ -303,11 +303,27 @@ def test_a_source_that_an_episode_has_contradicted_weighs_less_at_its_end_and_no
         ([0.0, 1.0, 0.0], [0.1, 0.9, 0.1], True),
     ],
 )
-def test_rewards_that_are_another_function_are_noticed(rewards, expected, explained):
-    evidence, effect = PriorEvidence(1, 1), np.array([0.1])
-    for pair in zip(rewards, expected, strict=True):
-        evidence.note(0, effect, effect, None, pair, 100.0)
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+def test_rewards_that_are_another_function_are_noticed(rewards, expected, explained, unit):
+    evidence, effect = PriorEvidence(1, 1, unit), np.array([0.1])
+    for reward, foretold in zip(rewards, expected, strict=True):
+        evidence.note(0, effect, effect, None, (unit * reward, unit * foretold), 100.0)
     assert evidence.explains_rewards() == explained
+
+
+@pytest.mark.parametrize("size", [1.0, 12345.678])
+def test_rewards_that_differ_by_rounding_are_the_same(size):
+    evidence, effect = PriorEvidence(1, 1, size), np.array([0.1])
+    for _ in range(100):
+        evidence.note(0, effect, effect, None, (float(np.float32(-size)), -size), 100.0)
+    assert evidence.explains_rewards()
+
+
+def test_the_strength_of_an_action_is_that_on_the_variables_of_which_the_source_speaks():
+    evidence = PriorEvidence(3, 2)
+    evidence.strength[:] = [[4.0, 0.01], [1.0, 4.0], [1.0, 1.0]]
+    found = evidence.strength_of_actions(np.array([[True, False], [True, True], [False, False]]))
+    np.testing.assert_allclose(found, [4.0, 2.0, np.nan])
 
 
 def strength_after(n, predicted, own_error, **wall):

@@ -69,13 +69,17 @@ class ComplianceSelector(Selector):
         self._apart = np.empty(n_points)
         self._near = np.full((n_actions, n_points, n_neighbors), -1, dtype=np.int64)
         self._distance = np.full((n_actions, n_points, n_neighbors), limit)
-        self._near_of_pair = self._near.reshape(-1, n_neighbors)
         self._choice = np.full(n_actions * n_points, -1, dtype=np.int64)
         self._due = np.zeros((n_actions, n_points), dtype=np.bool_)
         self._renewal_due = 0.0
         # Nothing is asked before the first transition. To draw here would change what a loaded model draws.
         self._draws_at = np.zeros(n_actions) if options.drawn else NO_DRAWS
         self._make_room_at(n_actions)
+
+    @property
+    def _near_of_pair(self) -> np.ndarray:
+        """Of each pair, the same array: a copy of the selector has its own."""
+        return self._near.reshape(-1, self.options.n_neighbors)
 
     def _set_cache(self, cache: ComplianceCache) -> None:
         self._cache, self._plain_cache = cache, tuple(cache)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# Errors of a step that are smaller than this part of a variable's range tell nothing.
+# Errors of a step that are smaller than this part of a variable's range, or of the largest reward, tell nothing.
 SMALLEST_ERROR = 1e-4
 # As how many own instances a source may count; 0: the learner without the source, beforehand as probable as all others.
 STRENGTHS = np.array([0.0, *4.0 ** np.arange(-4, 2)])
@@ -28,9 +28,10 @@ class PriorEvidence:
 
     :param n_actions: target actions
     :param n_variables: target variables
+    :param reward_size: of the source's largest reward, raw
     """
 
-    def __init__(self, n_actions: int, n_variables: int):
+    def __init__(self, n_actions: int, n_variables: int, reward_size: float = 1.0):
         #: As how many own instances the source counts, as last renewed; shape (n_actions, n_variables).
         self.strength = np.full((n_actions, n_variables), STRENGTHS @ PROBABILITIES)
         shape = self.strength.shape
@@ -42,7 +43,7 @@ class PriorEvidence:
         self._likeliest = np.zeros(shape)
         #: Sums of the errors of rewards: of the source's, and of the mean of those before.
         self.reward_errors = np.zeros(2)
-        self._rewards = np.zeros(2)
+        self._rewards, self._reward_size = np.zeros(2), reward_size
 
     def note(
         self,
@@ -75,10 +76,14 @@ class PriorEvidence:
             self.reward_errors += part * abs(reward - expected), part * abs(reward - total / n)
         self._rewards += 1.0, reward
 
-    def strength_of_actions(self) -> np.ndarray:
-        """The geometric mean of :attr:`strength` over variables, shape (n_actions,)."""
-        with np.errstate(divide="ignore"):  # a source that is surely wrong may count as nothing at all
-            return np.asarray(np.exp(np.log(self.strength).mean(axis=1)))
+    def strength_of_actions(self, of: np.ndarray) -> np.ndarray:
+        """The geometric mean of :attr:`strength` over variables, shape (n_actions,); NaN without any.
+
+        :param of: the variables of which the source says something, bool, shape (n_actions, n_variables)
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):  # one that is surely wrong may count as nothing at all
+            total = np.where(of, np.log(self.strength), 0.0).sum(axis=1)
+            return np.asarray(np.exp(total / of.sum(axis=1)))
 
     def renew(self) -> None:
         """Renew :attr:`strength`."""
@@ -102,7 +107,7 @@ class PriorEvidence:
     def explains_rewards(self) -> bool:
         """Whether the source predicts rewards no worse than their mean so far does."""
         source, mean = self.reward_errors.tolist()
-        return bool(source <= mean + SMALLEST_ERROR * self._rewards[0])
+        return bool(source <= mean + SMALLEST_ERROR * self._reward_size * self._rewards[0])
 
     def _parts(self) -> tuple[np.ndarray, ...]:
         errors = self._own_errors, self._n_own, self.reward_errors, self._rewards

@@ -16,7 +16,7 @@ N_FIRST = 4
 
 
 class PriorHistory:
-    """Rows of steps, error, excess, whether values are bounded, and by target action the strength and the candidate.
+    """Rows of steps, error, excess, whether values are bounded, and by target action strength, 0 for none, and candidate.
 
     Renewals come ever more rarely, so the rows stay few.
 
@@ -42,7 +42,7 @@ class PriorHistory:
     def _row(self, prior: SourcePrior) -> np.ndarray:
         error = prior.error()
         first = prior.n_observed, -1.0 if np.isnan(error) else error, prior.excess, prior.value_bound() is not None
-        return np.concatenate([first, prior.evidence.strength_of_actions(), prior.choices_by_action()], dtype=np.float64)
+        return np.concatenate([first, np.nan_to_num(prior.strengths()), prior.choices_by_action()], dtype=np.float64)
 
     def _point(self, prior: SourcePrior, row: np.ndarray) -> EvidencePoint:
         step, error, exceeded, bounded = row[:N_FIRST].tolist()

@@ -67,10 +67,17 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         next_best_error=next_best[1],
         bounds_values=prior.value_bound() is not None,
         why_unbounded=prior.why_unbounded(),
+        bounded_through=_bounded_through(prior),
         statistics=statistics,
         history=prior.history.points(prior),
         **prior.errors.report_fields(),
     )
+
+
+def _bounded_through(prior: SourcePrior) -> str:
+    """Name what bounds values, where it is not the mapping in use."""
+    of_mapping, of_bound = (prior.candidates.describe_choice(choice) for choice in (prior.choice, prior.bounding))
+    return of_bound if of_bound != of_mapping else ""
 
 
 def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, others: Sequence[Choice]) -> MappingReport:

@@ -70,7 +70,8 @@ class SourcePrior:
         self.version = 0
         self.transfer_terminals = transfer_terminals
         #: How far the mapping in use is borne out.
-        self.evidence = PriorEvidence(task.n_actions, task.n_variables)
+        largest = max(float(np.abs(source.rewards).max()) for source in copies.sources)
+        self.evidence = PriorEvidence(task.n_actions, task.n_variables, largest)
         #: Errors of the mapping in use, where the source has data.
         self.errors = RegionErrors(task)
         #: The evidence over time.
@@ -186,6 +187,8 @@ class SourcePrior:
         """Say why the source's values bound nothing; "" if they do."""
         if self.choice is None:
             return "no mapping has been chosen"
+        if self.says_nothing:
+            return "no mapping explains the target better than that nothing changes"
         if not self.transfer_terminals:
             return "transfer_terminals=False"
         if not self.evidence.explains_rewards():
@@ -195,6 +198,11 @@ class SourcePrior:
         if self._bound() is None:
             return "the mapping has no whole source for all target actions, or its copies do not cost the same at every step"
         return ""
+
+    @property
+    def says_nothing(self) -> bool:
+        """Whether every target action is taken for nothing: "no source" is likelier than every mapping."""
+        return self.choice is not None and not self._in_copies().any()
 
     def _explains(self) -> bool:
         """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
@@ -298,7 +306,7 @@ class SourcePrior:
 
     def strengths(self) -> np.ndarray:
         """As how many of the target's own instances the source counts, by target action; NaN where it is taken for nothing."""
-        return np.where(self._in_copies().any(axis=1), self.evidence.strength_of_actions(), np.nan)
+        return self.evidence.strength_of_actions(self._in_copies())
 
     def statistics(self) -> dict[str, float]:
         strengths = self.strengths()
