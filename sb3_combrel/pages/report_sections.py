@@ -9,14 +9,20 @@ import numpy as np
 
 from sb3_combrel.pages.page import Cell, PageTable, Section
 from sb3_combrel.pages.palette import mapping_colours
-from sb3_combrel.transfer.report import NOWHERE, Contradiction, MappingReport, TransferReport
+from sb3_combrel.transfer.report import NO_MAPPING, NOWHERE, Contradiction, MappingReport, TransferReport
 
 NONE, ANOTHER = "—", "another in each run"
-FIGURES = ("compliance", "no change", "error", "strength")
+FIGURES = {
+    "compliance": "compliance",
+    "no change": "no_change_compliance",
+    "error": "error",
+    "strength": "strength",
+    "no source": "no_source",
+}
 EXPLANATION = (
     'Compliance: how well the mapping predicts the target\'s own transitions, 1 is exact, beside that of "no change". Error: '
     'squared, over that of "no change"; below 1 is better. Strength: as how many of the target\'s own instances the source '
-    "counts where it has data."
+    "counts where it has data. No source: how probable it is that these alone predict better."
 )
 
 
@@ -53,9 +59,7 @@ def _row(
     found = [each for each in of_runs if each.mapping == mapping]
     if n == 1 < len(of_runs):
         mapping, found = ANOTHER, list(of_runs)
-    figures = [
-        _mean([getattr(each, name) for each in found]) for name in ("compliance", "no_change_compliance", "error", "strength")
-    ]
+    figures = [_mean([getattr(each, name) for each in found]) for name in FIGURES.values()]
     names = [*((Cell(method),) if method is not None else ()), Cell(action), Cell(mapping, colour_of(mapping, colours))]
     runs = [] if n_runs is None else [Cell(NONE if mapping == ANOTHER else f"{n} of {n_runs}")]
     return [*names, *runs, *map(Cell, figures)]
@@ -84,6 +88,8 @@ def _mean(values: Sequence[float]) -> str:
 
 def contradictions_text(report: TransferReport) -> str:
     """Say how often a source was contradicted."""
+    if report.says_nothing:
+        return NO_MAPPING
     if not report.n_compared:
         return "No prediction of the source has been compared with what happened."
     share = f"{report.n_worse:,} ({100 * report.n_worse / report.n_compared:.0f} %)"

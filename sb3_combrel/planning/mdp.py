@@ -17,7 +17,9 @@ NEVER_LEAVES = 1e-9
 class MDPArrays(NamedTuple):
     """The finite MDP for compiled code: rows of fixed width, those of a grid point beside each other, as sweeps read them."""
 
-    to: np.ndarray  # int32, (n_points, n_actions, width): the *other* grid points that a pair leads to
+    # (n_points, n_actions, width): the *other* grid points that a pair leads to; uint16 where that will do, as sweeps wait
+    # for memory, else int32.
+    to: np.ndarray
     weight: np.ndarray  # float64, the same: with which discounted probability (see finish_row)
     length: np.ndarray  # int32, (n_points, n_actions): how many they are
     reward: np.ndarray  # float64, (n_points, n_actions): reward of the pair until its state is left
@@ -56,7 +58,7 @@ class FiniteMDP:
         self.gamma = float(gamma)
         #: The MDP for compiled code; ``plain``: the same as a plain tuple (see ``common.compiled``).
         self.arrays = MDPArrays(
-            to=np.zeros((n_points, n_actions, width), dtype=np.int32),
+            to=np.zeros((n_points, n_actions, width), dtype=np.uint16 if n_points <= 2**16 else np.int32),
             weight=np.zeros((n_points, n_actions, width)),
             length=np.zeros((n_points, n_actions), dtype=np.int32),
             reward=np.zeros((n_points, n_actions)),

@@ -49,6 +49,7 @@ class MappingReport:
     next_best_error: float = np.nan
     n_compared: int = 0  #: transitions that ``error`` is of
     strength: float = np.nan  #: with ``use="prior"``, as how many of the target's own instances the source counts
+    no_source: float = np.nan  #: the same: the posterior probability that the target's own instances alone predict better
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,7 @@ class TransferReport:
     rewards: tuple[int, int] = (0, 0)  #: transitions whose reward the source predicts rightly, and wrongly
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
     why_unbounded: str = ""  #: with ``use="prior"``: why not
+    bound: tuple[float, ...] = ()  #: the least, the median and the largest of these bounds over the sample of states
     #: What bounds values: a mirror image of the mapping in use that foretells ends better; "" for the mapping itself.
     bounded_through: str = ""
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
@@ -117,7 +119,7 @@ class TransferReport:
         """How well the source explained the target, in one sentence."""
         if self.use == "none":
             return "The model has no transfer method: what it knows is its own."
-        if self._says_nothing:
+        if self.says_nothing:
             return NO_MAPPING
         if not self.n_compared or np.isnan(self.error):
             return "Nothing can be said of the source: none of its predictions has been compared with what happened."
@@ -128,7 +130,7 @@ class TransferReport:
         return f"The source explains the target {well}: {judged} {self.n_compared:,} steps{more}."
 
     @property
-    def _says_nothing(self) -> bool:
+    def says_nothing(self) -> bool:
         """Whether a source was compared with the target, and is taken for nothing."""
         nothing = self.use == "prior" and bool(self.mappings) and all(np.isnan(each.strength) for each in self.mappings)
         return nothing and bool(self.n_steps)
@@ -153,7 +155,8 @@ class TransferReport:
             more = self.statistics.get("transfer/bound_exceeded", 0.0)
             raised = f", and {more:.3g} more, by which returns exceeded it" if more > 0.0 else ""
             through = f", seen through {self.bounded_through}" if self.bounded_through else ""
-            lines.append(f"The value of what is unknown is bounded by the source's value there{through}{raised}.")
+            how = f"; from {self.bound[0]:.3g} to {self.bound[-1]:.3g}, median {self.bound[1]:.3g}" if self.bound else ""
+            lines.append(f"The value of what is unknown is bounded by the source's value there{through}{raised}{how}.")
         elif self.why_unbounded:
             lines.append(f"The source's values do not bound that of what is unknown: {self.why_unbounded}.")
         return "\n".join(lines)
@@ -166,7 +169,9 @@ class TransferReport:
         for each in self.mappings:
             shares = (_text(each.share), f"{each.n_mappings}") if shared else ()
             compliances = (each.compliance, each.next_best_compliance, each.no_change_compliance)
-            figures = tuple(_text(value) for value in (*compliances, each.error, each.next_best_error, each.strength))
+            figures = tuple(
+                _text(value) for value in (*compliances, each.error, each.next_best_error, each.strength, each.no_source)
+            )
             rows.append((each.target_action, each.mapping, *shares, *figures))
         kept = [column for column in zip(*rows, strict=True) if any(cell != "-" for cell in column[1:])]
         shown = [column[0] for column in kept]
@@ -180,7 +185,7 @@ class TransferReport:
         return "\n".join(lines)
 
     def _contradictions(self) -> str:
-        if self._says_nothing:
+        if self.says_nothing:
             return NO_MAPPING
         if not self.n_compared:
             return "No prediction of the source has been compared with what happened." if self.mappings else ""
@@ -211,12 +216,13 @@ def describe_sources(sources: Sequence[SourceInstances]) -> tuple[str, ...]:
 
 
 NO_MAPPING = "The source is taken for nothing: no mapping explains the target better than that nothing changes."
-_FIGURES = ("compliance", "next best", "no change", "error", "next best's", "strength")
+_FIGURES = ("compliance", "next best", "no change", "error", "next best's", "strength", "no source")
 _EXPLANATIONS = {
     "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and "
     'of "no change".',
     "error": 'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.',
-    "strength": "Strength: as how many of the target's own instances the source counts where it has data.",
+    "strength": "Strength: as how many of the target's own instances the source counts where it has data. No source: how "
+    "probable it is that these alone predict better.",
 }
 
 

@@ -99,6 +99,15 @@ def test_staying_is_summed_in_closed_form_and_probability_missing_to_one_ends_th
     assert mdp.arrays.modelled[2], "a pair that always ends the episode has a model"
 
 
+@pytest.mark.parametrize("resolution", [15, 16, 17])
+def test_rows_lead_to_the_last_points_of_a_large_grid(resolution):
+    """Points are numbered by as few bits as will do."""
+    mdp, last = FiniteMDP(StateGrid(1, resolution), N_ACTIONS, 1.0), 2**resolution
+    write(mdp, [last - 2], [[1.0]], [[[1.5 / 2**resolution]]], [0.0])
+    to, weight = (array[last - 2, 0, : mdp.arrays.length[last - 2, 0]] for array in mdp.arrays[:2])
+    assert dict(zip(to.tolist(), weight.tolist(), strict=True)) == pytest.approx({last - 1: 0.5, last: 0.5})
+
+
 @pytest.mark.parametrize(("reward", "expected"), [(-1.0, -np.inf), (2.0, np.inf), (0.0, 0.0)])
 def test_a_pair_that_never_leaves_has_an_infinite_reward_of_its_sign(reward, expected):
     mdp, _ = make_mdp()

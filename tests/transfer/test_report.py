@@ -227,7 +227,9 @@ def test_it_says_why_the_sources_values_bound_nothing():
         return small(env, transfer=COMBREL(source), degree=1).learn(150).transfer.report()
 
     source = SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0)
-    assert report_of(source).why_unbounded == ""
+    own = report_of(source)
+    assert own.why_unbounded == "" and own.bound[0] <= own.bound[1] <= own.bound[2] <= 0.0
+    assert all(0.0 <= each.no_source <= 1.0 for each in own.mappings) and "; from " in str(own)
     wrong = report_of(dataclasses.replace(source, rewards=-source.rewards))
     assert not wrong.bounds_values and wrong.why_unbounded == "its rewards are not the target's"
     assert "do not bound that of what is unknown: its rewards are not the target's." in str(wrong)

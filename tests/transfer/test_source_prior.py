@@ -268,6 +268,9 @@ def test_strength_is_the_mean_of_the_posterior_of_as_how_many_own_instances_it_c
                 density += stats.t.logpdf((effects[i, v] - mean) / scale, df=1)
             posterior = PROBABILITIES * np.exp(density - density.max())
             np.testing.assert_allclose(evidence.strength[a, v], posterior @ STRENGTHS / posterior.sum(), rtol=1e-6)
+            alone = evidence.no_source(np.arange(d) == np.full((2, 1), v))[a]
+            np.testing.assert_allclose(alone, posterior[0] / posterior.sum(), rtol=1e-6, atol=1e-12)
+    assert np.isnan(evidence.no_source(np.zeros((2, d), dtype=np.bool_))).all()
     found = evidence.weights(weights, actions)
     np.testing.assert_allclose(found, (weights / (1.0 + weights))[:, None] * evidence.strength[actions])
     restored = PriorEvidence(2, d)

@@ -85,6 +85,13 @@ class PriorEvidence:
             total = np.where(of, np.log(self.strength), 0.0).sum(axis=1)
             return np.asarray(np.exp(total / of.sum(axis=1)))
 
+    def no_source(self, of: np.ndarray) -> np.ndarray:
+        """The probability of "no source", mean over the variables ``of``, as there: shape (n_actions,)."""
+        posterior = self._posterior()
+        found = np.where(of, posterior[:, :, 0] / posterior.sum(axis=2), 0.0).sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(found / of.sum(axis=1))
+
     def renew(self) -> None:
         """Renew :attr:`strength`."""
         posterior = self._posterior()

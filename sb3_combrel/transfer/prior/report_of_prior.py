@@ -49,7 +49,7 @@ def compliance_of_prior(prior: SourcePrior) -> np.ndarray:
 
 def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, float]) -> TransferReport:
     """Report what a source was taken for; ``method``: with its arguments, as text; ``statistics``: its figures of the log."""
-    choice, sample = prior.choice, _Sample(prior)
+    choice, sample, bound = prior.choice, _Sample(prior), prior.value_bound()
     mappings: tuple[MappingReport, ...] = ()
     next_best = "", np.nan
     if choice is not None:
@@ -65,7 +65,8 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         error=prior.error(),
         next_best=next_best[0],
         next_best_error=next_best[1],
-        bounds_values=prior.value_bound() is not None,
+        bounds_values=bound is not None,
+        bound=() if bound is None else tuple(np.quantile(bound, (0.0, 0.5, 1.0)).tolist()),
         why_unbounded=prior.why_unbounded(),
         bounded_through=_bounded_through(prior),
         statistics=statistics,
@@ -108,6 +109,7 @@ def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, o
         next_best_error=next_best[2],
         n_compared=n_compared,
         strength=float(prior.strengths()[action]),
+        no_source=float(prior.no_source()[action]),
     )
 
 

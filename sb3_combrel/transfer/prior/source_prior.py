@@ -174,9 +174,9 @@ class SourcePrior:
             self.errors.note(state, action, effect, predicted)
 
     def value_bound(self) -> np.ndarray | None:
-        """The source's values and :attr:`excess`, while effects and rewards of all target actions are explained, or None."""
+        """The source's values and :attr:`excess`, at most ``max_value``; None unless effects and rewards are explained."""
         bound = self._bound()
-        return None if bound is None else bound + self.excess
+        return None if bound is None else np.minimum(bound + self.excess, self._value_bound.max_value)
 
     def _bound(self) -> np.ndarray | None:
         if self.bounding is None or not self.transfer_terminals or not self.explains:
@@ -307,6 +307,10 @@ class SourcePrior:
     def strengths(self) -> np.ndarray:
         """As how many of the target's own instances the source counts, by target action; NaN where it is taken for nothing."""
         return self.evidence.strength_of_actions(self._in_copies())
+
+    def no_source(self) -> np.ndarray:
+        """How probable it is that the learner alone predicts better, by target action; NaN where it is taken for nothing."""
+        return self.evidence.no_source(self._in_copies())
 
     def statistics(self) -> dict[str, float]:
         strengths = self.strengths()

@@ -42,7 +42,7 @@ class ValueBound:
 
     def change_optimism(self, gamma: float, max_value: float) -> None:
         """Plan in the sources anew, with another discount factor and another value of what is unknown there."""
-        self._gamma, self._max_value = gamma, max_value
+        self._gamma, self.max_value = gamma, max_value
         #: By number of the source: a planner that has its values.
         self._planners: dict[int, Planner] = {}
         self._of_copy: dict[int, np.ndarray] = {}
@@ -110,7 +110,7 @@ class ValueBound:
         source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
         model = SourceModel(stacked_instances([source]), breadth)
         mdp = source_mdp(source, model, self._gamma, breadth, LEAST_WEIGHT)
-        highest = self._max_value
+        highest = self.max_value
         # Lower than so many sweeps can get.
         lowest = min(0.0, highest) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
         planner = Planner(mdp, max_value=highest, min_value=lowest, tolerance=planning_tolerance(source))
