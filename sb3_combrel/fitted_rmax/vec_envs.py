@@ -73,8 +73,10 @@ def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[An
 def refuse_normalized_observations(env: VecEnv) -> None:
     """:raises ValueError: if a ``VecNormalize``, or a ``NormalizeObservation``, normalizes observations by running means"""
     normalizer = unwrap_vec_normalize(env)
-    of_each = env.env_is_wrapped(gym.wrappers.NormalizeObservation)
-    if (normalizer is not None and normalizer.norm_obs) or (any(of_each) and any(env.get_attr("update_running_mean"))):
+    # Rewards are normalized by means of this name as well.
+    run = env.has_attr("update_running_mean") and any(env.get_attr("update_running_mean"))
+    of_observations = run and any(env.env_is_wrapped(gym.wrappers.NormalizeObservation))
+    if (normalizer is not None and normalizer.norm_obs) or of_observations:
         raise ValueError(
             "FittedRMax needs VecNormalize(norm_obs=False), and no NormalizeObservation whose update_running_mean is True: "
             "it scales observations itself, and means that run would move them under a model that has learned"
