@@ -1,6 +1,6 @@
 """How the inner loops are compiled: on first use, cached on disk, with a message while it lasts.
 
-Compiled functions take arrays and NamedTuples of arrays. Those that Python calls are each an :class:`EntryPoint`. Numba
+Compiled functions take arrays and NamedTuples of arrays. Those that Python calls are each an :func:`entry_point`. Numba
 finds the types of arrays and plain tuples in C, of each NamedTuple in Python: functions that are called at every environment
 step take plain tuples, and make NamedTuples of them.
 
@@ -73,7 +73,7 @@ inner_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 
 class EntryPoint:
-    """A compiled function for callers from Python, as a decorator: ``function(...)``; ``function.call(...)`` is quicker.
+    """A compiled function for callers from Python: ``function.call(...)``.
 
     Its first call may have to compile; it then prints a message, and garbage collection waits.
     """
@@ -83,15 +83,17 @@ class EntryPoint:
         #: Calls the function; the function itself from the second call on, which is the quickest way to call it.
         self.call = self._first_call
 
-    def __call__(self, *arguments: Any) -> Any:
-        return self.call(*arguments)
-
     def _first_call(self, *arguments: Any) -> Any:
         _remove_outdated_once()
         with _compilation():
             result = self.function(*arguments)
         self.call = self.function
         return result
+
+
+def entry_point(function: Any) -> EntryPoint:
+    """Compile a function that only Python calls; as a decorator."""
+    return EntryPoint(compiled(function))
 
 
 class _Announcement(event.Listener):

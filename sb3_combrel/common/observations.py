@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.common.compiled import entry_point
 from sb3_combrel.common.periodic import flag_array
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.user_warnings import warn_user
@@ -32,8 +32,7 @@ def with_own_arrays(env: Any) -> Any:
     return gym.wrappers.TransformObservation(env, np.array, env.observation_space)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def scale_into_box(states, low, ranges, periodic, fixed, observed, n_outside, units):
     """``StateScaling.to_unit``; what is outside fixed bounds is moved to the boundary, and periodic variables are wrapped.
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.common.compiled import entry_point
 
 ROUNDING = 1e-9
 
@@ -132,8 +132,7 @@ def _check_arrays(given: TransferredInstances, name: str, n: int, n_variables: i
 _NO_PROBLEM, _LENGTH, _WEIGHT, _VALUE, _THRESHOLD = range(5)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def first_problem(given, own_weight, threshold):
     """What is wrong with the first row that breaks the contract, and its number."""
     for row in range(len(own_weight)):

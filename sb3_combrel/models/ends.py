@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import entry_point, inlined, inner
 from sb3_combrel.common.instances import BLOCK, Instances, put_instance
 from sb3_combrel.common.kernels import any_periodic, measure_block, measure_blocks, squared_distance
 
@@ -54,8 +54,7 @@ def put_arrival(instances, arrivals, action, slot):
         arrivals.block_high[action, k, block] = max(arrivals.block_high[action, k, block], at)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def put_arrivals(instances, arrivals):
     """Write where all instances lead."""
     for action in range(len(instances.size)):
@@ -63,8 +62,7 @@ def put_arrivals(instances, arrivals):
             put_arrival(instances, arrivals, action, slot)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def put_transition(instances, arrivals, transition, effect):
     """Write an instance to its slot, and where it leads; plain tuples.
 

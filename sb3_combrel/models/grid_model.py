@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import entry_point, inlined, inner
 from sb3_combrel.common.constants import LEAST_SIZE, ON_GRID
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
@@ -46,8 +46,7 @@ def add_to_row(reward, n_touched, transferred, row, total, scratch, grid):
     return reward, n_touched
 
 
-@EntryPoint
-@compiled
+@entry_point
 def join_transferred(transferred, threshold, prediction):
     """Let transferred instances join the prediction of actions of less weight than ``threshold``; plain tuples."""
     transferred, prediction = TransferredInstances(*transferred), Prediction(*prediction)

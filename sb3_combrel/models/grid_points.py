@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.constants import MAX_SURPRISE, SHARE_OF_LIST
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.regression import PER_BREADTH
@@ -117,8 +117,7 @@ def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predi
     return pairs.surprise[pair] > MAX_SURPRISE or pairs.n_new[pair] * 2 >= pairs.length[pair]
 
 
-@EntryPoint
-@compiled
+@entry_point
 def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch):
     """Note an instance at all pairs of an action that it concerns; how many are to be fitted, in ``scratch.pair``.
 

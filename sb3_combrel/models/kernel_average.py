@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import entry_point, inlined, inner
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, reach_of, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
@@ -49,8 +49,7 @@ def weight_ever(instances, action, state, kernel, threshold, total):
     return threshold if everything >= threshold else total
 
 
-@EntryPoint
-@compiled
+@entry_point
 def predict_own(instances, state, kernel, threshold, near, prediction):
     """Predict every action at ``state`` from the instances that the kernel keeps there; the least weight that one has.
 
@@ -78,8 +77,7 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
     return least
 
 
-@EntryPoint
-@compiled
+@entry_point
 def weigh(instances, pairs, grid, kernel, threshold, which, near, found):
     """Write the weight of the instances of some pairs, ``which``, to ``found``; plain tuples."""
     instances, pairs, grid, near = Instances(*instances), PairArrays(*pairs), GridArrays(*grid), NearList(*near)
@@ -112,8 +110,7 @@ def entry_distance(near, length, total, kernel, threshold, known):
     return -np.log(least) * breadth * breadth * (1 + 1e-12)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, near):
     """Write rows of pairs from the instances that the kernel keeps, and from transferred ones; how many are done.
 

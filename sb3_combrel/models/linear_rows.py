@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import entry_point, inlined, inner
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, nearest_instances, squared_distance
@@ -69,8 +69,7 @@ def outcome_of(to, moved, around, experience, kernel, end):
         end_at(to, (moved + near) ** 2, kernel.outcome_breadth, arrivals, ends, end)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratch, prediction):
     """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
 
@@ -115,8 +114,7 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
     return least
 
 
-@EntryPoint
-@compiled
+@entry_point
 def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     """Write to ``effect`` what the instances alone predict of an action, without a prior; plain tuples.
 
@@ -133,8 +131,7 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     return leverage_of(fit, length, kernel)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def weigh(instances, pairs, grid, kernel, which, fit, at, found):
     """Write the weight of the instances of some pairs, ``which``, to ``found``; ``at``: work space; plain tuples."""
     instances, pairs, grid = Instances(*instances), PairArrays(*pairs), GridArrays(*grid)
@@ -229,8 +226,7 @@ def recall_own_fit(pair, at, action, instances, pairs, fit):
     fit.distance[0] = squared_distance(at, instances.state[action, fit.item[0]], instances.periodic, wraps)
 
 
-@EntryPoint
-@compiled
+@entry_point
 def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, fit, scratch):
     """Fit pairs anew, and write their rows, with transferred instances for what is not known; how many are done.
 
@@ -298,8 +294,7 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
     return done
 
 
-@EntryPoint
-@compiled
+@entry_point
 def interpolate_prior(prior, grid, states, actions, corners, found):
     """Write what a prior says of states and actions, multilinear between the grid points, to ``found``.
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.compiled import inlined, inner
 from sb3_combrel.common.periodic import flag_array
 from sb3_combrel.common.user_warnings import warn_user
 
@@ -164,12 +164,6 @@ def interpolate(values, position, grid, corner_index, corner_weight):
     return value
 
 
-@compiled
-def interpolate_once(values, position, grid, corner_index, corner_weight):
-    """:func:`interpolate` for callers from Python."""
-    return interpolate(values, position, grid, corner_index, corner_weight)
-
-
 class StateGrid:
     """A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
 
@@ -216,7 +210,7 @@ class StateGrid:
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
         """Multilinear interpolation of values at the grid points at a state; outside the grid its nearest point counts."""
         position = state * self.arrays.cells + self.arrays.margin
-        return interpolate_once(values, position, self.arrays, self._corner_index, self._corner_weight)
+        return interpolate(values, position, self.arrays, self._corner_index, self._corner_weight)
 
     def cells_around(self, states: np.ndarray) -> np.ndarray:
         """The numbers of the corners of the cells that states are in, or of the nearest ones, shape (n, 2 ** n_variables)."""

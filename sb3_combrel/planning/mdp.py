@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import entry_point, inlined, inner
 from sb3_combrel.planning.grid import StateGrid, corners_of, n_corners
 
 NEVER_LEAVES = 1e-9
@@ -183,8 +183,7 @@ def set_modelled(mdp, pair, modelled):
         mdp.n_optimistic[point] += -1 if modelled else 1
 
 
-@EntryPoint
-@compiled
+@entry_point
 def write_rows(mdp, grid, gamma, predictions, done, scratch):
     """Write rows from predictions, from number ``done`` on; how many are done, fewer than all if there is no room."""
     pairs, modelled, probability, effect, expected_reward = predictions

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.compiled import EntryPoint, entry_point, inlined
 from sb3_combrel.planning.grid import GridArrays, next_row
 from sb3_combrel.planning.mdp import FiniteMDP
 
@@ -36,8 +36,7 @@ def backed_up(values, mdp, upper, worth, lowest, searching, point):
     return best
 
 
-@EntryPoint
-@compiled
+@entry_point
 def sweep(values, mdp, upper, worth, lowest, searching, downwards):
     """Back up all grid points; the largest change. Parameters: see :func:`backed_up`.
 
@@ -76,8 +75,7 @@ def mark_around(point, span, grid, marks, scratch):
             return n_marked
 
 
-@EntryPoint
-@compiled
+@entry_point
 def sweep_changes(values, mdp, upper, worth, lowest, searching, downwards, tolerance, told, changed, span, grid, scratch):
     """Back up the grid points on which changes of rows and values bear; the largest change. See :func:`backed_up`.
 

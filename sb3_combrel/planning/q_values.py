@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, interpolate
 from sb3_combrel.planning.mdp import NEVER_LEAVES, infinite_reward
@@ -70,8 +70,7 @@ def optimistic_value(state, function, grid, scratch):
     return value
 
 
-@EntryPoint
-@compiled
+@entry_point
 def evaluate_actions(prediction, state, function, q, scratch):
     """Q of every action at ``state``, into ``q``, shape (n_actions,); the best action, -1 if several are; plain tuples.
 

@@ -30,12 +30,11 @@ MESSAGE = "sb3_combrel: compiling"
 def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
     states = np.array([[0.5, 3.0], [-2.0, 1.0]])
     scales = np.array([0.0, 1.0]), np.array([2.0, 4.0]), np.array([False, True]), True, np.empty((0, 2)), np.zeros(3)
-    scale = EntryPoint(scale_into_box)
+    scale = EntryPoint(scale_into_box.function)
     for again in (scale, scale, copy.deepcopy(scale), pickle.loads(pickle.dumps(scale))):
-        for call in (again, again.call):
-            units, expected = np.empty_like(states), np.empty_like(states)
-            assert call(states, *scales, units) == scale_into_box(states, *scales, expected)
-            np.testing.assert_array_equal(units, expected)
+        units, expected = np.empty_like(states), np.empty_like(states)
+        assert again.call(states, *scales, units) == scale_into_box.function(states, *scales, expected)
+        np.testing.assert_array_equal(units, expected)
 
 
 def test_scale_into_box_is_to_unit_moved_into_the_box_if_that_is_fixed_and_notes_what_is_observed():
@@ -43,20 +42,20 @@ def test_scale_into_box_is_to_unit_moved_into_the_box_if_that_is_fixed_and_notes
     states = np.random.default_rng(0).uniform([-2.0, -1.0, 9.5], [2.0, 6.0, 11.5], (100, 3))
     units, nothing, n_outside = np.empty_like(states), np.empty((0, 3)), np.zeros(4)
     scales = scaling.low.copy(), scaling.high - scaling.low, np.zeros(3, dtype=bool)
-    assert scale_into_box(states, *scales, True, nothing, n_outside, units)
+    assert scale_into_box.call(states, *scales, True, nothing, n_outside, units)
     np.testing.assert_array_equal(units, np.clip(scaling.to_unit(states), 0.0, 1.0))
     observed = np.array([[0.0, np.inf, 9.0], [0.0, -np.inf, 9.0]])
-    assert scale_into_box(states, *scales, False, observed, n_outside, units)
+    assert scale_into_box.call(states, *scales, False, observed, n_outside, units)
     np.testing.assert_array_equal(units, scaling.to_unit(states))
     least, most = np.minimum(states.min(axis=0), [0.0, np.inf, 9.0]), np.maximum(states.max(axis=0), [0.0, -np.inf, 9.0])
     np.testing.assert_array_equal(observed, [least, most])
     outside = (scaling.to_unit(states) != np.clip(scaling.to_unit(states), 0.0, 1.0)).sum(axis=0)
     np.testing.assert_array_equal(n_outside, [*outside, 100])
     rounded = np.float32([[1.0, 5.0, 11.0]]) * (1.0 + 1e-7)
-    assert scale_into_box(rounded.astype(np.float64), *scales, True, observed, n_outside, units[:1])
+    assert scale_into_box.call(rounded.astype(np.float64), *scales, True, observed, n_outside, units[:1])
     np.testing.assert_array_equal(n_outside, [*outside, 101])
-    assert not scale_into_box(scaling.to_raw(np.full((1, 3), 0.5)), *scales, True, nothing, n_outside, units[:1])
-    assert scale_into_box(np.full((1, 3), np.nan), *scales, True, nothing, n_outside, units[:1])
+    assert not scale_into_box.call(scaling.to_raw(np.full((1, 3), 0.5)), *scales, True, nothing, n_outside, units[:1])
+    assert scale_into_box.call(np.full((1, 3), np.nan), *scales, True, nothing, n_outside, units[:1])
 
 
 @pytest.fixture(params=[True, False])
@@ -69,7 +68,7 @@ def collecting(request):
 
 def test_garbage_collection_waits_during_the_first_call_of_an_entry_point_only(collecting):
     entry = EntryPoint(gc.isenabled)
-    assert entry.call() is False and gc.isenabled() == collecting and entry.call() == entry() == collecting
+    assert entry.call() is False and gc.isenabled() == collecting and entry.call() == collecting
 
 
 def fail(x):

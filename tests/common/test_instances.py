@@ -31,7 +31,7 @@ def test_instances_given_at_once_are_as_those_given_one_by_one():
     one_by_one = Instances.empty(n_actions, 2)
     for i, a in enumerate(action.tolist()):
         slot, ended = int(one_by_one.size[a]), bool(terminated[i])
-        put_instance_at(one_by_one, (a, slot, state[i], state[i] + effect[i], float(reward[i]), ended))
+        put_instance_at.call(one_by_one, (a, slot, state[i], state[i] + effect[i], float(reward[i]), ended))
     at_once = Instances.of_rows(n_actions, action, state, effect, reward, terminated)
     np.testing.assert_allclose(at_once.rows(), one_by_one.rows(), atol=1e-15)
     for name in ("size", "block_low", "block_high"):
