@@ -21,24 +21,14 @@ ROUNDING = 1e-7
 class Ends(NamedTuple):
     """The arrivals that ended an episode."""
 
-    state: np.ndarray  # float64, (capacity, n_variables)
-    n: np.ndarray  # int64, (1,): how many there are
+    state: np.ndarray  # float64, (n_ends, n_variables)
     hint: np.ndarray  # int64 scratch, (2,): action and slot of an arrival near the last state that was asked for
-
-    @classmethod
-    def empty(cls, n_variables: int, capacity: int = 64) -> "Ends":
-        """Make room for so many."""
-        return cls(np.empty((capacity, n_variables)), np.zeros(1, dtype=np.int64), np.zeros(2, dtype=np.int64))
 
     @classmethod
     def of(cls, arrivals: Instances) -> "Ends":
         """Those among some arrivals."""
         ended = [arrivals.state[action, :n][arrivals.terminated[action, :n]] for action, n in enumerate(arrivals.size)]
-        states = np.concatenate(ended)
-        made = cls.empty(states.shape[1], max(64, 2 * len(states)))
-        made.state[: len(states)] = states
-        made.n[0] = len(states)
-        return made
+        return cls(np.concatenate(ended), np.zeros(2, dtype=np.int64))
 
 
 @inlined
@@ -82,7 +72,7 @@ def squared_distance_of_end(state, ends, periodic):
     """The squared distance of the nearest arrival that ended an episode; infinite without any."""
     nearest = np.inf
     wraps = any_periodic(periodic)
-    for e in range(ends.n[0]):
+    for e in range(len(ends.state)):
         nearest = min(nearest, squared_distance(state, ends.state[e], periodic, wraps))
     return nearest
 
@@ -129,7 +119,7 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
     :param outcome_breadth: squared
     """
     found[0], found[1] = 0.0, 0.0
-    if ends.n[0] == 0:
+    if len(ends.state) == 0:
         return
     of_end = squared_distance_of_end(state, ends, arrivals.periodic)
     if of_end > reach_of(near, outcome_breadth):
