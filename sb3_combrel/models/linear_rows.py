@@ -40,12 +40,6 @@ class LinearScratch(NamedTuple):
     end: np.ndarray  # (2,): probability of an end there, and what it pays
 
 
-@inlined
-def find_nearest(at, action, farthest, instances, fit):
-    """Find the instances that a fit around ``at`` is made to, none farther away than squared ``farthest``; how many."""
-    return nearest_instances(instances, action, at, farthest, fit.item, fit.distance)
-
-
 @inner
 def distances_around(at, action, length, experience, fit):
     """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
@@ -88,7 +82,7 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
     for action in range(len(linear.radius)):
         # A full list around the last state lies within its radius, and as far again as that state is.
         farthest = min(kernel.reach, (linear.radius[action] + apart) ** 2 * (1.0 + ROUNDING))
-        length = find_nearest(state, action, farthest, instances, fit)
+        length = nearest_instances(instances, action, state, farthest, fit.item, fit.distance)
         linear.radius[action] = np.sqrt(fit.distance[length - 1]) if length == kernel.n_neighbors else np.inf
         weight = known_weight(fit, length, kernel)
         if length > 0:
@@ -121,7 +115,7 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     :return: the fit's leverage, by which the variance of one instance is multiplied; 0 without any instance near the state
     """
     instances, kernel, fit, scratch = Instances(*instances), Kernel(*kernel), LocalFit(*fit), LinearScratch(*scratch)
-    length = find_nearest(state, action, kernel.reach, instances, fit)
+    length = nearest_instances(instances, action, state, kernel.reach, fit.item, fit.distance)
     if length == 0:
         return 0.0
     fit_around(state, action, length, instances, kernel, fit)
@@ -139,7 +133,7 @@ def weigh(instances, pairs, grid, kernel, which, fit, at, found):
     n_points = grid.shape[0] * grid.strides[0]
     for k in range(len(which)):
         unit_coordinates_of(which[k] % n_points, grid, at)
-        length = find_nearest(at, which[k] // n_points, pairs.reach[which[k]], instances, fit)
+        length = nearest_instances(instances, which[k] // n_points, at, pairs.reach[which[k]], fit.item, fit.distance)
         found[k] = known_weight(fit, length, kernel)
 
 
@@ -258,7 +252,7 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         kept = has_prior and pairs.known[pair] and pairs.n_new[pair] == 0 and length > 0
         if not kept:
             # Instances only come nearer, but for those that are removed (see grid_points.look_at).
-            length = find_nearest(scratch.at, action, pairs.reach[pair], instances, fit)
+            length = nearest_instances(instances, action, scratch.at, pairs.reach[pair], fit.item, fit.distance)
             weight = known_weight(fit, length, kernel)
             pairs.reach[pair] = fit.distance[length - 1] if length == kernel.n_neighbors else kernel.reach
         known = note_fit(pair, length, weight, threshold, transitions, pairs)
