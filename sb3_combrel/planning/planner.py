@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, entry_point, inlined
 from sb3_combrel.planning.grid import GridArrays, next_row
-from sb3_combrel.planning.mdp import FiniteMDP
+from sb3_combrel.planning.mdp import FiniteMDP, coordinates_of
 
 
 @inlined
@@ -56,11 +56,10 @@ def sweep(values, mdp, upper, worth, lowest, searching, downwards):
 def mark_around(point, span, grid, marks, scratch):
     """Mark the grid points from which a pair may lead to ``point``, those within ``span`` of it; how many they are."""
     first, last, at = scratch[0], scratch[1], scratch[2]
-    n_marked, inner, rest = 1, len(span) - 1, point
+    n_marked, inner = 1, len(span) - 1
+    coordinates_of(point, grid, at)
     for k in range(len(span)):
-        here = rest // grid.strides[k]
-        rest -= here * grid.strides[k]
-        first[k], last[k] = max(0, here - span[k]), min(grid.shape[k], here + span[k] + 1)
+        first[k], last[k] = max(0, at[k] - span[k]), min(grid.shape[k], at[k] + span[k] + 1)
         if grid.periodic[k] and last[k] - first[k] <= 2 * span[k]:
             # The way around.
             first[k], last[k] = 0, grid.shape[k]
