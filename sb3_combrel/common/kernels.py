@@ -157,19 +157,12 @@ def nearest_instances(instances, action, state, farthest, items, distances):
 
 
 @inlined
-def reach_of(kernel):
-    """The squared distance beyond which instances weigh less than ``min_weight``; see :func:`near_instances`."""
-    breadth, min_weight, _ = kernel
-    return -np.log(min_weight) * breadth * breadth
-
-
-@inlined
 def near_instances(instances, action, state, farthest, kernel, indices, weights):
     """The instances of ``action`` that the kernel keeps at ``state``, nearest first; how many, and the sum of their weights.
 
     One is kept while its weight is at least ``min_fraction`` of the sum of those before it.
 
-    :param farthest: squared distance beyond which none is kept, no more than the kernel's :func:`reach_of`
+    :param farthest: squared distance beyond which none is kept, no more than that at which one weighs ``min_weight``
     :param kernel: (breadth, min_weight, min_fraction)
     :param indices: int32, receives them, ``list_room(min_fraction)`` long; ``weights``: exp(-d^2 / breadth^2)
     """

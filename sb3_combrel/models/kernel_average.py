@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import entry_point, inlined, inner
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, reach_of, squared_distance
+from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel, add_to_row, total_weight
@@ -56,9 +56,10 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
     :param kernel: (breadth, min_weight, min_fraction); plain tuples for the rest
     """
     instances, near, prediction = Instances(*instances), NearList(*near), Prediction(*prediction)
+    breadth, min_weight, _ = kernel
+    farthest = -np.log(min_weight) * breadth * breadth
     least = np.inf
     for action in range(len(instances.size)):
-        farthest = reach_of(kernel)
         length, total = near_instances(instances, action, state, farthest, kernel, near.item, near.weight)
         reward = 0.0
         n = 0
