@@ -289,18 +289,18 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
 
 
 @entry_point
-def interpolate_prior(prior, grid, states, actions, corners, found):
-    """Write what a prior says of states and actions, multilinear between the grid points, to ``found``.
+def interpolate_prior(prior, grid, state, corners, found):
+    """Write what a prior says of all actions at ``state``, multilinear between the grid points, to ``found``.
 
     :param prior: as in ``LinearArrays``; ``corners``: work space: position, corner_index, corner_weight (see ``corners_of``)
+    :param found: float64, shape (n_actions, 2 * n_variables)
     """
     grid = GridArrays(*grid)
     position, corner, weight = corners
     n_points = grid.shape[0] * grid.strides[0]
-    for i in range(len(actions)):
-        grid_coordinates(states[i], grid, position)
-        found[i, :] = 0.0
-        first_pair = actions[i] * n_points
-        for c in range(corners_of(position, grid, corner, weight)):
+    grid_coordinates(state, grid, position)
+    found[:] = 0.0
+    for c in range(corners_of(position, grid, corner, weight)):
+        for action in range(len(found)):
             for k in range(found.shape[1]):
-                found[i, k] += weight[c] * prior[first_pair + corner[c], k]
+                found[action, k] += weight[c] * prior[action * n_points + corner[c], k]

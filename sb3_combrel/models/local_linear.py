@@ -56,8 +56,6 @@ class LocalLinear(GridModel):
         self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2))))
         self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
         self._prior_version = -1
-        self._no_prior = np.zeros((self.n_actions, 2 * d))
-        self._all_actions = np.arange(self.n_actions)
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
         slot, removed = super()._slot_for(state, action)
@@ -66,18 +64,13 @@ class LocalLinear(GridModel):
         return slot, removed
 
     def _prior_at(self, state: np.ndarray) -> np.ndarray:
-        """What the prior says of all actions at a state, as in ``LinearArrays``."""
-        if self._prior is None:
-            return self._no_prior
-        return self._interpolated_prior(np.repeat(state[None], self.n_actions, axis=0), self._all_actions)
-
-    def _interpolated_prior(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """The prior's effects and weights, multilinear between the grid points: shape (n, 2 * n_variables).
+        """What the prior says of all actions at a state, between the grid points multilinear: as in ``LinearArrays``.
 
         Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through it.
         """
-        found = np.empty((len(actions), 2 * self.grid.n_variables))
-        interpolate_prior.call(self.linear.prior, self.grid.plain, states, actions, self._corners, found)
+        found = np.zeros((self.n_actions, 2 * self.grid.n_variables))
+        if self._prior is not None:
+            interpolate_prior.call(self.linear.prior, self.grid.plain, state, self._corners, found)
         return found
 
     def renew_prior(self) -> np.ndarray:
