@@ -22,7 +22,7 @@ from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.fitted_rmax.correspondence import Correspondence, NoTransfer
+from sb3_combrel.fitted_rmax.correspondence import Correspondence, NoTransfer, OfLearner
 from sb3_combrel.fitted_rmax.optimism import RewardRange, worth_after_visits
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
@@ -123,7 +123,7 @@ class FittedRMaxAgent:
         """Make model and planner, without any instances; ``width``: room for successors that rows have had before."""
         max_value, tolerance = self.rewards.max_value, self.settings.planning_tolerance
         self.mdp = FiniteMDP(self.grid, self.task.n_actions, self.rewards.gamma, width)
-        self._asked = self.correspondence.of_learner(self._method) if self._method.informs_model else None
+        self._asked = OfLearner(self._method, self.correspondence) if self._method.informs_model else None
         self.model = self.model_class(self.mdp, self.model_settings, self._asked)
         bounds = {"max_value": max_value, "min_value": min(0.0, max_value) - 1.0}
         self.planner = Planner(self.mdp, **bounds, tolerance=tolerance, follows_changes=self.model.follows_changes)

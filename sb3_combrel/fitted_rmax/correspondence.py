@@ -34,15 +34,11 @@ class Correspondence:
 
     def effects_of_learner(self, effects: np.ndarray) -> np.ndarray:
         """The other way around."""
-        return np.asarray(effects / self._factor)
-
-    def of_learner(self, transfer: Transfer) -> Transfer | OfLearner:
-        """What the learner's model asks in place of a transfer method."""
-        return transfer if self.same else OfLearner(transfer, self)
+        return effects if self.same else np.asarray(effects / self._factor)
 
 
 class OfLearner:
-    """What is transferred, in the unit coordinates of the learner; see ``models.base.InstanceTransfer``."""
+    """What is transferred, checked, in the unit coordinates of the learner: see ``models.base.InstanceTransfer``."""
 
     def __init__(self, transfer: Transfer, correspondence: Correspondence):
         self._transfer, self._correspondence = transfer, correspondence

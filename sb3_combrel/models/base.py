@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from sb3_combrel.common.instances import Instances, put_instance_at
-from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances, check_transferred
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
 
@@ -40,7 +40,7 @@ class Predictions(NamedTuple):
 
 
 class InstanceTransfer(Protocol):
-    """What a model knows of a transfer method (see ``sb3_combrel.transfer.base.Transfer``)."""
+    """What a model knows of a transfer method (see ``sb3_combrel.transfer.base.Transfer``); what it gives has been checked."""
 
     #: "instances" or "prior": which of the methods below are called.
     use: str
@@ -140,7 +140,6 @@ class Model(ABC):
         modelled = self.known[pairs].copy()
         if self.transfer is not None and not modelled.all():
             given = self.transfer.transferred_to_sample(points, actions, predictions.weight)
-            self._check(given, predictions.weight)
             predictions, modelled = join(predictions, given, modelled)
         self.mdp.write_rows(pairs, modelled, predictions.probability, predictions.effect, predictions.reward)
 
@@ -157,7 +156,6 @@ class Model(ABC):
         weight = predictions.weight
         if self.transfer is not None and not modelled.all():
             given = self.transfer.transferred(states, actions, weight)
-            self._check(given, weight)
             predictions, modelled = join(predictions, given, modelled)
         length = np.full(self.n_actions, predictions.probability.shape[1], dtype=np.int64)
         arrays = map(np.ascontiguousarray, (predictions.probability, predictions.effect))
@@ -199,10 +197,6 @@ class Model(ABC):
     def update_all_rows(self) -> None:
         """Bring all rows of the finite MDP up to date."""
         self.update_all(np.arange(len(self.known)))
-
-    def _check(self, given: TransferredInstances, own_weight: np.ndarray) -> None:
-        threshold = self.settings.exploration_threshold
-        check_transferred(given, self.transfer, own_weight, self.grid.n_variables, threshold)
 
 
 def join(own: Predictions, given: TransferredInstances, known: np.ndarray) -> tuple[Predictions, np.ndarray]:

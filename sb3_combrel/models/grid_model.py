@@ -248,16 +248,13 @@ class GridModel(Model):
         full, unsure = self.settings.exploration_threshold, np.flatnonzero(~self.known[pairs])
         own_weight, found = np.full(len(pairs), full), self._weigh(pairs[unsure])
         own_weight[unsure] = np.where(found >= self._rules[1], np.maximum(full, found), found)
-        given = self._giver.transferred_to_sample(points, actions, own_weight)
-        self._check(given, own_weight)
-        return given
+        return self._giver.transferred_to_sample(points, actions, own_weight)
 
     def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
         if self._predict_own(state) >= self.exploration_threshold or self._giver is None:
             return self._prediction, None
         states = np.repeat(state[None], self.n_actions, axis=0)
         given = self._giver.transferred(states, np.arange(self.n_actions), self._prediction.weight)
-        self._check(given, self._prediction.weight)
         room = self._own_room + given.weight.shape[1]
         if room > self._prediction.probability.shape[1]:
             self._make_prediction(room)

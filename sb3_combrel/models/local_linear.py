@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.regression import LocalFit
-from sb3_combrel.common.transferred import check_prior
 from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel
 from sb3_combrel.models.linear_rows import (
@@ -81,9 +80,7 @@ class LocalLinear(GridModel):
         changed = np.zeros((self.n_actions, 1), dtype=np.bool_)
         for action in range(self.n_actions):
             pairs = slice(action * n_points, (action + 1) * n_points)
-            predicted = self._prior.prior(points, np.full(n_points, action))
-            check_prior(predicted, self._prior, *points.shape)
-            given = np.column_stack(predicted)
+            given = np.column_stack(self._prior.prior(points, np.full(n_points, action)))
             changed[action] = not np.array_equal(given, self.linear.prior[pairs])
             self.linear.prior[pairs] = given
         return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)

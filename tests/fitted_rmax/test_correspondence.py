@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.fitted_rmax.correspondence import Correspondence
+from sb3_combrel.fitted_rmax.correspondence import Correspondence, OfLearner
 from sb3_combrel.fitted_rmax.scales import FoundScales
 
 numbers = st.floats(-100.0, 100.0)
@@ -35,7 +35,8 @@ def test_states_and_effects_are_those_of_the_bounds(low, used, bound, width, sta
 def test_nothing_is_computed_where_the_coordinates_are_the_same():
     same, state = StateScaling([0.0], [3.0]), np.array([0.1])
     correspondence = Correspondence(same, StateScaling([0.0], [3.0]))
-    assert correspondence.states(state) is state and correspondence.effects(state) is state
+    for computed in (correspondence.states, correspondence.effects, correspondence.effects_of_learner):
+        assert computed(state) is state
 
 
 class WideWalk(Walk):
@@ -95,7 +96,7 @@ def instances():
     """What transfers instances to a learner that has them, and the same for one with narrower scales."""
     model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
     correspondence = Correspondence(NARROW, model.agent.task.shared_scaling)
-    return model.transfer, correspondence.of_learner(model.transfer)
+    return model.transfer, OfLearner(model.transfer, correspondence)
 
 
 def test_once_instances_are_transferred_variables_take_all_of_their_bounds(tmp_path):
@@ -147,10 +148,15 @@ def test_what_a_method_hears_of_its_use_is_what_it_gave(instances, monkeypatch):
     np.testing.assert_array_equal(used[0].weight, given.weight)
 
 
-def test_what_does_not_fit_is_said_of_the_method(instances, monkeypatch):
-    monkeypatch.setattr(TIMBREL, "transferred", lambda self, *asked: None)
-    with pytest.raises(ValueError, match="TIMBREL"):
-        instances[1].transferred(np.zeros((1, 2)), np.zeros(1, dtype=np.int64), np.zeros(1))
+@pytest.mark.parametrize("same", [False, True], ids=["other units", "the same units"])
+@pytest.mark.parametrize("ask", ["transferred", "transferred_to_sample"])
+def test_what_breaks_the_contract_is_refused_and_the_method_named(instances, monkeypatch, ask, same):
+    method, bounds = instances[0], instances[0].task.scaling
+    of_learner = OfLearner(method, Correspondence(bounds if same else NARROW, bounds))
+    monkeypatch.setattr(TIMBREL, ask, lambda self, *asked: TransferredInstances.empty(1, 2)._replace(length=np.array([5])))
+    asked = np.zeros((1, 2) if ask == "transferred" else 1, dtype=np.int64)
+    with pytest.raises(ValueError, match="TIMBREL returned length=5 for row 0"):
+        getattr(of_learner, ask)(asked, np.zeros(1, dtype=np.int64), np.zeros(1))
 
 
 @pytest.mark.parametrize(

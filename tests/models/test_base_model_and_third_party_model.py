@@ -167,25 +167,6 @@ def as_set(prediction, action):
     return rows[np.lexsort(np.round(rows.T, 9))]
 
 
-class TooLong(SomeInstances):
-    """Returns lengths beyond the room for instances."""
-
-    def transferred(self, states, actions, own_weight):
-        given = super().transferred(states, actions, own_weight)
-        given.length[:] = self.max_instances + 1
-        return given
-
-
-@pytest.mark.parametrize("model_class", [KernelAverage, NaiveKernelAverage])
-def test_a_model_refuses_transferred_instances_that_break_the_contract(model_class):
-    model = kernel_models.make_model(kernel_models.GRIDS[1], kernel_models.KERNELS[0], model_class=model_class)
-    model.transfer = TooLong(model.grid.points(), 1.0)
-    with pytest.raises(ValueError, match="TooLong returned length=5 for row 0"):
-        model.update_rows(np.arange(3))
-    with pytest.raises(ValueError, match="TooLong returned length=5 for row 0"):
-        model.predict_at(np.array([0.3]))
-
-
 # A model of somebody else's, of a few lines of NumPy, does all that the kernel average does.
 class NearestNeighbour(Model):
     """Predicts what the nearest instance of the action did; its weight is 1 within the kernel breadth, 0 beyond."""
