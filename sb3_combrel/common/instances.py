@@ -100,13 +100,11 @@ class Instances(NamedTuple):
         """Instances of one action for which there is room."""
         return self.state.shape[1]
 
-    def with_room(self, action: int) -> "Instances":
-        """Itself, or the same with twice the room if one more instance of ``action`` would not fit."""
-        return self if self.size[action] < self.capacity else self.enlarged(2 * self.capacity)
-
     def enlarged(self, capacity: int) -> "Instances":
-        """The same with room for at least so many instances of each action."""
+        """The same, or itself, with room for at least so many instances of each action."""
         n_actions, room, n_variables = self.state.shape
+        if room >= capacity:
+            return self
         while room < capacity:
             room *= 2
         larger = Instances.empty(n_actions, n_variables, room)

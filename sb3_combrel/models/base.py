@@ -112,7 +112,7 @@ class Model(ABC):
             slot = int(self._oldest[action])
             self._oldest[action] = (slot + 1) % self.settings.max_instances
         else:
-            self.instances = self.instances.with_room(action)
+            self.instances = self.instances.enlarged(slot + 1)
         put_instance_at.call(self.instances, (action, slot, state, next_state, reward, terminated))
         return np.arange(action * self.grid.n_points, (action + 1) * self.grid.n_points)
 

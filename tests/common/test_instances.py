@@ -18,8 +18,8 @@ def test_instances_store_periodic_coordinates_within_one_period_and_effects_the_
         np.testing.assert_array_equal(getattr(again, name)[..., :1], getattr(instances, name)[..., :1], err_msg=name)
     for _ in range(BLOCK - 2):
         put_instance_at.call(instances, (0, int(instances.size[0]), np.zeros(2), np.ones(2), 0.0, False))
-    larger = instances.with_room(0)
-    assert larger.capacity == 2 * BLOCK and larger.with_room(0) is larger
+    larger = instances.enlarged(BLOCK + 1)
+    assert larger.capacity == 2 * BLOCK and larger.enlarged(2 * BLOCK) is larger
     np.testing.assert_array_equal(larger.rows(), instances.rows())
     np.testing.assert_array_equal(larger.periodic, [True, False])
 
