@@ -29,16 +29,6 @@ class ProgressWatch:
         self._last_return: float | None = None
         self._warned: set[str] = set()
 
-    @property
-    def max_value(self) -> float:
-        """The value of what is unknown."""
-        return self.rewards.max_value
-
-    @property
-    def gamma(self) -> float:
-        """The discount factor."""
-        return self.rewards.gamma
-
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
         """Look at an episode.
 
@@ -54,28 +44,30 @@ class ProgressWatch:
         self._note_return(rewards, terminated, explored)
 
     def _note_best_return(self, rewards: Sequence[float]) -> None:
+        gamma, max_value = self.rewards.gamma, self.rewards.max_value
         best, value = -float("inf"), 0.0
         for reward in reversed(rewards):
-            value = reward + self.gamma * value
+            value = reward + gamma * value
             best = max(best, value)
-        if best > self.max_value + 1e-6 * max(1.0, abs(self.max_value)):
+        if best > max_value + 1e-6 * max(1.0, abs(max_value)):
             advice = "pass a larger max_value"
-            if self.rewards.finds_max_value and self.gamma == 1.0:
+            if self.rewards.finds_max_value and gamma == 1.0:
                 advice = "with gamma=1 and rewards above 0 none is found: leave gamma out, pass one below 1, or pass max_value"
             self._warn(
                 "exceeded",
-                f"max_value={self.max_value:g} must be an upper bound on the return (discounted with gamma={self.gamma:g}), "
+                f"max_value={max_value:g} must be an upper bound on the return (discounted with gamma={gamma:g}), "
                 f"but a return of {best:g} was observed; {advice}, or the agent will stop exploring too soon",
             )
 
     def _note_cost(self, rewards: Sequence[float], terminated: bool) -> None:
-        keeps_value = self.gamma == 1.0 or abs(self.max_value) <= self.tolerance
+        gamma, max_value = self.rewards.gamma, self.rewards.max_value
+        keeps_value = gamma == 1.0 or abs(max_value) <= self.tolerance
         idle = keeps_value and not terminated and sum(map(abs, rewards)) <= self.tolerance
         self._n_idle = self._n_idle + 1 if idle else 0
         if self._n_idle == IDLE_EPISODES:
             self._warn(
                 "idle",
-                f"max_value={self.max_value:g} with gamma={self.gamma:g}: {IDLE_EPISODES} episodes in a row had no reward but "
+                f"max_value={max_value:g} with gamma={gamma:g}: {IDLE_EPISODES} episodes in a row had no reward but "
                 "0, and steps that cost nothing keep the value of what is known at max_value, so that nothing draws the agent "
                 "to what is unknown. Pass the largest return that the task can give as max_value, such as the reward of its "
                 "goal, above 0, and a gamma below 1, such as gamma=0.99",
@@ -83,7 +75,7 @@ class ProgressWatch:
 
     def _note_endless(self) -> None:
         seen = self.rewards
-        if self.gamma == 1.0 and seen.n_ended == 0 and seen.n_truncated >= EQUAL_RETURNS:
+        if seen.gamma == 1.0 and seen.n_ended == 0 and seen.n_truncated >= EQUAL_RETURNS:
             self._warn(
                 "endless",
                 f"gamma=1, and all {seen.n_truncated} episodes have ended by their time limit: if the task has no end, "
@@ -91,7 +83,7 @@ class ProgressWatch:
             )
 
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:
-        total = sum(rewards)
+        total, gamma, max_value = sum(rewards), self.rewards.gamma, self.rewards.max_value
         # Where rewards are collected until the time limit it is a success to reach it.
         searches = explored or not self.rewards.differ
         stuck = searches and not terminated and min(rewards) <= 0.0
@@ -101,7 +93,7 @@ class ProgressWatch:
             self._warn(
                 "equal",
                 f"the last {EQUAL_RETURNS} returns are all {total:g}, though the agent explores, with "
-                f"max_value={self.max_value:g} and gamma={self.gamma:g}: nothing that it has reached makes a difference. A "
+                f"max_value={max_value:g} and gamma={gamma:g}: nothing that it has reached makes a difference. A "
                 "max_value must be above the return of a good policy, but not by far; with a larger model_breadth, or a "
                 "longer time limit, exploration gets farther",
             )
