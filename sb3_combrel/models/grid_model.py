@@ -303,12 +303,9 @@ class GridModel(Model):
 
     def _put_in_order(self, rows: np.ndarray) -> None:
         """Put instances where they were: sums over all of them depend on their order, in the last bit."""
-        capacity = self.instances.capacity
-        instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
-        self.instances = instances.enlarged(max(capacity, instances.capacity))
+        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
         by_action = np.argsort(rows[:, 0], kind="stable")
         numbers = np.split(rows[by_action, -1].astype(np.int64), np.cumsum(self.instances.size)[:-1])
-        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         for action, own in enumerate(numbers):
             self._number[action, : len(own)] = own
         self._renew_arrivals()
