@@ -72,7 +72,8 @@ class Model(ABC):
 
     #: Whether what a transfer method predicts may join the fits to the target's own instances (``use="prior"``).
     takes_prior: ClassVar[bool] = False
-    #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.optimism``).
+    #: Whether places are worth less with each visit as long as nothing has been found (see ``fitted_rmax.optimism``); grid
+    #: points are known with less weight from then on (see ``constants.ON_GRID``).
     searches: ClassVar[bool] = False
     #: Whether the planner leaves points out on which no change bears that is larger than its tolerance.
     follows_changes: ClassVar[bool] = False

@@ -76,8 +76,6 @@ class GridModel(Model):
     _own_room = 1
     #: Numbers that are fitted at each pair.
     _n_fitted = 0
-    #: Whether grid points need less weight than exact states.
-    _known_by_less = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
@@ -95,7 +93,7 @@ class GridModel(Model):
         few = 0 if self._giver is None else 1
         self._rules = self.kernel.scale, self.exploration_threshold, few
         # Whether an outcome has told states apart.
-        self._informed, self._first_reward, self._informed_at = not self._known_by_less, np.nan, 0
+        self._informed, self._first_reward, self._informed_at = not self.searches, np.nan, 0
         # Sums of the sizes of effects and rewards, by action.
         self._sizes = np.zeros((self.n_actions, self.grid.n_variables + 1))
         self._cell = float((self.grid.arrays.cells**-2.0).sum()) ** 0.5

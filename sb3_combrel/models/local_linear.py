@@ -42,7 +42,6 @@ class LocalLinear(GridModel):
     """
 
     takes_prior = searches = True
-    _known_by_less = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._n_fitted = mdp.grid.n_variables + 1
