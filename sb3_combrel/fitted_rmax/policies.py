@@ -12,7 +12,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.observations import ObservationScaler
-from sb3_combrel.common.periodic import flag_array, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.common.user_warnings import warn_user
@@ -59,9 +58,7 @@ class FittedRMaxPolicy(BasePolicy):
         if model_class is not None and not (isinstance(model_class, type) and issubclass(model_class, Model)):
             raise ValueError(f"model_class must be a subclass of Model or None, got {model_class!r}")
         given = FittedRMaxSettings(**settings)
-        n_variables = len(StateScaling.limits_of(observation_space, given.bounds)[0])
-        periodic = flag_array(periodic_flags(given.periodic, n_variables), n_variables)
-        self.scales = FoundScales(observation_space, given.bounds, periodic)
+        self.scales = FoundScales(observation_space, given.bounds, given.periodic)
         states, actions = (() if names is None else names for names in (state_names, action_names))
         task = Task(self.scales.scaling, int(action_space.n), states, actions, self.scales.bounds)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_combrel.common.constants import BEYOND, TOO_WIDE
-from sb3_combrel.common.periodic import check_periods
+from sb3_combrel.common.periodic import check_periods, periodic_flags
 from sb3_combrel.common.scaling import LARGEST_BOUND, Bounds, StateScaling, around_zero, without_bounds
 
 
@@ -23,17 +24,18 @@ class FoundScales:
 
     :param space: observation space
     :param bounds: of the user; None: to be found
-    :param periodic: one bool for each state variable
-    :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, the bounds do not fit it, or a
-        periodic variable has none
+    :param periodic: one bool for each state variable; None: none is periodic
+    :raises ValueError: if the space is not a one-dimensional Box of floating-point numbers, the bounds or ``periodic`` do not
+        fit it, or a periodic variable has no bounds
     """
 
-    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: np.ndarray):
+    def __init__(self, space: spaces.Space[Any], bounds: Bounds | None, periodic: Sequence[bool] | None):
         self.fixed = bounds is not None
         low, high = StateScaling.limits_of(space, bounds)
-        self._found = ~periodic & (bounds is None)
+        flags = np.array(periodic_flags(periodic, len(low)))
+        self._found = ~flags & (bounds is None)
         unbounded = without_bounds(low, high)
-        check_periods(periodic & unbounded)
+        check_periods(flags & unbounded)
         #: What the space allows, raw units.
         self.low = np.where((low > -LARGEST_BOUND) & (low < high), low, -np.inf)
         self.high = np.where((high < LARGEST_BOUND) & (low < high), high, np.inf)
