@@ -208,7 +208,7 @@ class PastData(SavedAlgorithm):
     def _check_units(self, states: np.ndarray, columns: np.ndarray) -> None:
         """Refuse states that lie farther beyond the observation space than it is wide: they are in other units, or damaged."""
         task, periodic = self.policy.agent.task, self.policy.agent.periodic
-        low, high = (np.asarray(side, dtype=np.float64) for side in StateScaling.limits_of(self.observation_space, None))
+        low, high = StateScaling.limits_of(self.observation_space)
         for k, name in enumerate(task.state_names):
             least, most, width = states[:, columns[k]].min(), states[:, columns[k]].max(), high[k] - low[k]
             if not periodic[k] and (least < low[k] - width or most > high[k] + width):
