@@ -188,16 +188,12 @@ class Model(ABC):
         """Take over what :meth:`get_state` returned, and update all rows of the finite MDP; for a new model."""
         self.instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
         self._oldest[:] = 0
-        self.update_all_rows()
+        self.update_all(np.arange(len(self.known)))
 
     def update_all(self, pairs: np.ndarray) -> None:
         """:meth:`update_rows` of any number of pairs."""
         for first in range(0, len(pairs), MAX_PAIRS_AT_ONCE):
             self.update_rows(pairs[first : first + MAX_PAIRS_AT_ONCE])
-
-    def update_all_rows(self) -> None:
-        """Bring all rows of the finite MDP up to date."""
-        self.update_all(np.arange(len(self.known)))
 
 
 def join(own: Predictions, given: TransferredInstances, known: np.ndarray) -> tuple[Predictions, np.ndarray]:

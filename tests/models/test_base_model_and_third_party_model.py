@@ -103,7 +103,7 @@ def both(problem):
         if transfers:
             model.transfer = SomeInstances(model.grid.points(), 1.0)
         kernel_models.learn(model, kernel_models.random_transitions(seed, len(grid[0]), n))
-        model.update_all_rows()
+        model.update_all(np.arange(len(model.known)))
         made.append(model)
     return made
 
@@ -147,7 +147,7 @@ def test_transferred_instances_join_those_of_a_local_linear_model_as_the_base_cl
     for one in (model, plain):
         one.transfer = SomeInstances(model.grid.points(), 2.0)
         kernel_models.learn(one, linear_models.small_steps(seed, len(grid[0]), n))
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     unknown = np.flatnonzero(~model.known & (model.own_weight < model.exploration_threshold))
     Model.update_rows(plain, unknown)
     np.testing.assert_array_equal(plain.mdp.arrays.modelled[unknown], model.mdp.arrays.modelled[unknown])

@@ -85,13 +85,13 @@ def test_an_end_that_one_action_has_found_counts_for_those_that_lead_to_the_same
     # Never tried there, action 1 would lead to where action 0 has ended episodes.
     prediction = model.predict_at(np.array([0.85]))[0]
     assert prediction.modelled[1] and prediction.length[1] == 0 and prediction.reward[1] == pytest.approx(7.0)
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     assert linear_models.assert_same_rows(model, naive) > 0
 
 
 def test_what_an_end_pays_is_not_mixed_into_the_rewards_of_going_on():
     model, naive = line_model(reward=1000.0)
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     linear_models.assert_same_rows(model, naive)
     reward, at = model.mdp.arrays.reward[:, 0], model.grid.points()[:, 0]
     held_for_a_cell = -(1.0 - 0.9**1.25) / (1.0 - 0.9)
@@ -117,6 +117,6 @@ def test_rewards_far_from_all_instances_are_numbers_however_narrow_the_kernel_of
         (np.array([0.0]), a, r, np.array([0.05]), e) for a in range(N_ACTIONS) for r, e in ((-1.0, False), (3.0, True))
     ]
     linear_models.learn_linear(model, naive, transitions)
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     assert linear_models.assert_same_rows(model, naive) > 0 and np.isfinite(model.mdp.arrays.reward).all()
     linear_models.assert_same_prediction(model, naive, np.array([0.4]))

@@ -49,7 +49,7 @@ def test_what_is_known_and_rows_are_those_of_the_definition_after_every_transiti
     np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~model.known.reshape(len(naive.known), -1)).sum(axis=0))
     assert_same_rows(model, naive, kernel_models.pairs_of(naive))
     before, known = rows_of(model), model.known.copy()
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     assert_same_as_definition(model, naive, kernel_models.pairs_of(naive))
     after = rows_of(model)
     assert all(before[pair] == after[pair] for pair in np.flatnonzero(known)), "rows of other pairs have not changed"
@@ -75,7 +75,7 @@ def test_beyond_max_instances_the_nearest_instance_of_the_action_is_replaced_eve
         there[slot : slot + 1] = [Instance(state, action, reward, next_state, terminated, periodic)]
     assert model.instances.size.tolist() == [len(some) for some in naive.instances]
     assert_same_rows(model, naive, kernel_models.pairs_of(naive))
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     assert_same_as_definition(model, naive, kernel_models.pairs_of(naive))
 
 
@@ -117,7 +117,7 @@ def test_a_known_pair_is_left_alone_by_an_instance_that_enters_no_list_of_its():
     before = [array[point].copy() for array in model.mdp.arrays[:4]]
     due = model.add(away, 0, 5.0, here, False)
     assert point not in due and len(due) > 0
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     for one, other in zip(before, model.mdp.arrays[:4], strict=True):
         np.testing.assert_array_equal(one, other[point])
 
@@ -129,7 +129,7 @@ def test_rows_and_instances_are_complete_after_their_arrays_have_grown():
     transitions = kernel_models.random_transitions(3, 2, 500)
     for transition in transitions:
         model.add(*transition)
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     assert model.mdp.arrays.to.shape[-1] > width and model.instances.capacity > capacity
     kernel_models.add_instances(naive, transitions)
     chosen = np.random.default_rng(0).choice(len(model.known), 12, replace=False)

@@ -56,7 +56,7 @@ def test_each_row_is_that_of_the_transitions_up_to_which_it_was_fitted(problem, 
     assert (2 * model.pairs.n_new < model.pairs.length)[model.known].all(), "at once when half of the instances are new"
     modelled = model.mdp.arrays.modelled.reshape(N_ACTIONS, -1)
     np.testing.assert_array_equal(model.mdp.arrays.n_optimistic, (~modelled).sum(axis=0))
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     assert (model.pairs.fitted_at == n).all()
     linear_models.assert_same_rows(model, naive)
 
@@ -103,7 +103,7 @@ def test_instances_that_agree_with_the_fit_change_few_rows_and_one_that_does_not
 def test_what_an_end_means_is_known_at_once_to_all_actions_that_may_lead_there():
     model, naive = linear_models.linear_model_and_definition(((4,), 0), linear_models.LINEAR_KERNELS[1], gamma=0.9)
     linear_models.learn_linear(model, naive, linear_models.small_steps(1, 1, 40))
-    model.update_all_rows()
+    model.update_all(np.arange(len(model.known)))
     linear_models.learn_linear(model, naive, [(np.array([0.5]), 0, 5.0, np.array([0.52]), True)])
     around = np.abs(model.grid.points()[:, 0] - 0.52) <= 1.0 / 16.0 + 0.02
     of_both = np.tile(around, N_ACTIONS)

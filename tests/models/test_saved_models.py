@@ -52,7 +52,7 @@ def test_what_is_predicted_of_states_is_the_same_after_instances_were_replaced(s
     assert restored.n_added == 200
     for one in (model, restored):
         learn(one, transitions[200:])
-        one.update_all_rows()
+        one.update_all(np.arange(len(one.known)))
     for name in ("known", "length", "fitted_at"):
         np.testing.assert_array_equal(getattr(model.pairs, name), getattr(restored.pairs, name), err_msg=name)
     np.testing.assert_allclose(model.mdp.arrays.reward, restored.mdp.arrays.reward, rtol=1e-9)
@@ -67,7 +67,7 @@ def test_an_outcome_whose_instance_has_been_replaced_is_remembered_after_loading
     assert not model.instances.terminated[:, :5].any() and model.known.any()
     restored.set_state(model.get_state())
     for one in (model, restored):
-        one.update_all_rows()
+        one.update_all(np.arange(len(one.known)))
     np.testing.assert_array_equal(restored.known, model.known)
 
 
