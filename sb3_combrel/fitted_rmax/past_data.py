@@ -106,10 +106,9 @@ class PastData(SavedAlgorithm):
 
     def _read_instances(self, given: Any, n_instances: int) -> SourceInstances:
         task = self.policy.agent.task
-        named = not _are_numbered(task.state_names), not _are_numbered(task.action_names)
         names: dict[str, Any] = {
-            "state_names": tuple(task.state_names) if named[0] else None,
-            "action_names": tuple(task.action_names) if named[1] else (),
+            "state_names": None if _are_numbered(task.state_names) else tuple(task.state_names),
+            "action_names": () if _are_numbered(task.action_names) else tuple(task.action_names),
         }
         if isinstance(given, SourceInstances):
             return given
