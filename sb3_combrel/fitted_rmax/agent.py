@@ -394,7 +394,7 @@ class FittedRMaxAgent:
         learned = self._method.get_state() if bounds == self.task.shared_scaling else {}
         self.task = replace(self.task, scaling=scaling, bounds=bounds)
         self._bind()
-        self._build(self.mdp.width)
+        self._build(width=self.mdp.arrays.to.shape[2])
         if learned:
             self._method.set_state(learned)
         self._widen(min(0.0, lowest) / LONGEST_PLAN)

@@ -79,11 +79,6 @@ class FiniteMDP:
         )
         self.plain_scratch = tuple(self.scratch)
 
-    @property
-    def width(self) -> int:
-        """Room for successors in each row."""
-        return int(self.arrays.to.shape[2])
-
     def make_room(self) -> None:
         """Make rows twice as wide: a mean of many successors needs more room than one successor."""
         to, weight = (np.concatenate([array, np.zeros_like(array)], axis=2) for array in self.arrays[:2])
