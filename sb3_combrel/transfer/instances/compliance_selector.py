@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint
+from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose, select
-from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, SelectorParts, ranges_of
+from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, ranges_of
 
 # Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: to plan again
 # with every transition would cost more than all the rest.
@@ -46,10 +47,10 @@ class ComplianceSelector(Selector):
     makes_choices = True
     needs_transitions = True
 
-    def __init__(self, parts: SelectorParts, options: SelectionOptions):
-        super().__init__(parts)
-        self.options = options
-        candidates, n_actions, n_points = self.candidates, self.task.n_actions, len(self.task.sample_states)
+    def __init__(self, candidates: Candidates, options: SelectionOptions, rng: np.random.Generator):
+        super().__init__(candidates)
+        self.options, self.rng = options, rng
+        n_actions, n_points = self.task.n_actions, len(self.task.sample_states)
         n_neighbors = options.n_neighbors
         # An empty place counts as a neighbour at the limit: what is farther away does not enter.
         limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2

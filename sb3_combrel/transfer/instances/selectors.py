@@ -18,14 +18,6 @@ def ranges_of(chosen: np.ndarray) -> Ranges:
     return np.maximum(chosen, 0), chosen + 1
 
 
-class SelectorParts(NamedTuple):
-    """What every selector is made from: candidates of every target action, and the recorded target transitions."""
-
-    candidates: Candidates
-    transitions: RecordedTransitions
-    rng: np.random.Generator
-
-
 class Confidence(NamedTuple):
     """How sure choices are: mean compliances with the nearest transitions, averaged over states of the sample."""
 
@@ -44,10 +36,11 @@ class Selector(ABC):
     #: Whether a range is of one candidate at most.
     selects_one: ClassVar[bool] = True
 
-    def __init__(self, parts: SelectorParts):
-        self.candidates, self.transitions, self.rng = parts
-        self.task = self.candidates.task
-        self.first = self.candidates.arrays.first
+    def __init__(self, candidates: Candidates):
+        self.candidates = candidates
+        self.task = candidates.task
+        self.first = candidates.arrays.first
+        self.transitions = RecordedTransitions(self.task.n_variables)
 
     @abstractmethod
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
@@ -104,8 +97,8 @@ class FixedSelector(Selector):
 
     makes_choices = True
 
-    def __init__(self, parts: SelectorParts, fixed: np.ndarray):
-        super().__init__(parts)
+    def __init__(self, candidates: Candidates, fixed: np.ndarray):
+        super().__init__(candidates)
         self.fixed = fixed
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
@@ -118,8 +111,9 @@ class FixedSelector(Selector):
 class RandomSelector(Selector):
     """Selects at random: whenever a state of the sample is asked for; elsewhere one an action until the next transition."""
 
-    def __init__(self, parts: SelectorParts):
-        super().__init__(parts)
+    def __init__(self, candidates: Candidates, rng: np.random.Generator):
+        super().__init__(candidates)
+        self.rng = rng
         self.before_transition()
 
     def before_transition(self) -> None:

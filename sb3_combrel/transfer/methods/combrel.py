@@ -9,11 +9,10 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources
+from sb3_combrel.transfer.candidates import Candidates, MappingsLike, SourceLike, load_sources
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import DEFAULT_MIN_EVIDENCE
 from sb3_combrel.transfer.instances.compliance_selector import ComplianceSelector, SelectionOptions
-from sb3_combrel.transfer.instances.selectors import SelectorParts
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_either
 from sb3_combrel.transfer.prior.prior_sets import PRACTICAL_SETS, WITHOUT_COPIES, is_factored, practical_set
 from sb3_combrel.transfer.prior.report_of_prior import compliance_of_prior
@@ -135,12 +134,12 @@ class COMBREL(MappingTransfer):
     def _whole_mappings(self) -> bool:
         return self.neighbors == "state_action"
 
-    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> ComplianceSelector:
+    def _make_selector(self, candidates: Candidates, bandwidths: CandidateBandwidths) -> ComplianceSelector:
         names = ("n_neighbors", "neighbor_radius", "max_transitions", "min_evidence", "min_compliance")
         given = {name: getattr(self, name) for name in names}
         given |= {"all_actions": self._whole_mappings(), "drawn": self.choice == "drawn", "online": self.measured == "online"}
         options = SelectionOptions(bandwidths, **given)
-        self._compliance_selector = ComplianceSelector(parts, options)
+        self._compliance_selector = ComplianceSelector(candidates, options, self.rng)
         return self._compliance_selector
 
     def chosen_compliance(self, pairs: np.ndarray) -> np.ndarray:

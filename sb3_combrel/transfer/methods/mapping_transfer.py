@@ -25,13 +25,12 @@ from sb3_combrel.transfer.candidates import Candidate, Candidates, MappedVariabl
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
 from sb3_combrel.transfer.instances.relevance import renew_relevance
-from sb3_combrel.transfer.instances.selectors import Selector, SelectorParts
+from sb3_combrel.transfer.instances.selectors import Selector
 from sb3_combrel.transfer.instances.translation import Translator
 from sb3_combrel.transfer.outcome_evidence import RegionErrors
 from sb3_combrel.transfer.prior.prior_sets import is_factored, make_prior
 from sb3_combrel.transfer.prior.report_of_prior import report_of_prior
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
-from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
@@ -148,11 +147,10 @@ class MappingTransfer(Transfer):
     def _make_instances(self, task: TargetTask) -> InstanceTransfer:
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())
         bandwidths = candidate_bandwidths(self.candidates, self.bandwidths)
-        parts = SelectorParts(self.candidates, RecordedTransitions(task.n_variables), self.rng)
-        selector = self._make_selector(parts, bandwidths)
+        selector = self._make_selector(self.candidates, bandwidths)
         translator = self._make_translator(self.candidates, self.breadth)
         mu = None if self.relevance == NEAR else float(self.relevance_fraction)
-        measure = partial(renew_relevance, self.candidates, parts.transitions, bandwidths=bandwidths, mu=mu)
+        measure = partial(renew_relevance, self.candidates, selector.transitions, bandwidths=bandwidths, mu=mu)
         return InstanceTransfer(selector, translator, breadth_decay=self.breadth_decay, measure_relevance=measure)
 
     def _whole_mappings(self) -> bool:
@@ -165,7 +163,7 @@ class MappingTransfer(Transfer):
         return Translator(candidates, breadth=breadth, transfer_terminals=self.transfer_terminals, **order)
 
     @abstractmethod
-    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
+    def _make_selector(self, candidates: Candidates, bandwidths: CandidateBandwidths) -> Selector:
         """Make the selector for the target task that the method was just bound to."""
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:

@@ -16,7 +16,7 @@ from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
-from sb3_combrel.transfer.instances.selectors import FixedSelector, SelectorParts
+from sb3_combrel.transfer.instances.selectors import FixedSelector
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
@@ -81,10 +81,10 @@ class MASTER(MappingTransfer):
             self.use = "instances"
         super().__post_init__()
 
-    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> LeastErrorSelector:
-        check_action_mappings(parts.candidates.sets)
-        copies = copies_of(parts.candidates, float(self.source_breadth))
-        self._least_error = LeastErrorSelector(parts, copies, self.n_random_steps)
+    def _make_selector(self, candidates: Candidates, bandwidths: CandidateBandwidths) -> LeastErrorSelector:
+        check_action_mappings(candidates.sets)
+        copies = copies_of(candidates, float(self.source_breadth))
+        self._least_error = LeastErrorSelector(candidates, copies, self.n_random_steps)
         return self._least_error
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
@@ -166,9 +166,9 @@ class LeastErrorSelector(FixedSelector):
 
     needs_transitions = True
 
-    def __init__(self, parts: SelectorParts, copies: Copies, n_transitions: int):
-        task = parts.candidates.task
-        super().__init__(parts, fixed=np.full(task.n_actions, -1, dtype=np.int64))
+    def __init__(self, candidates: Candidates, copies: Copies, n_transitions: int):
+        task = candidates.task
+        super().__init__(candidates, fixed=np.full(task.n_actions, -1, dtype=np.int64))
         self.copies, self.n_transitions = copies, n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
         self.choice: Choice | None = None  #: the mapping that was chosen, None before

@@ -17,7 +17,7 @@ from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
-from sb3_combrel.transfer.instances.selectors import PooledSelector, SelectorParts
+from sb3_combrel.transfer.instances.selectors import PooledSelector
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
 from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
@@ -94,9 +94,9 @@ class SampleTransfer(MappingTransfer):
         self._seed = 0
         self._n_of_draw = self._n_of_first = self._n_draws = 0
 
-    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> TaskComplianceSelector:
-        check_action_mappings(parts.candidates.sets)
-        self._tasks = TaskComplianceSelector(parts, bandwidths, self.max_transitions)
+    def _make_selector(self, candidates: Candidates, bandwidths: CandidateBandwidths) -> TaskComplianceSelector:
+        check_action_mappings(candidates.sets)
+        self._tasks = TaskComplianceSelector(candidates, bandwidths, self.max_transitions)
         return self._tasks
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
@@ -177,10 +177,10 @@ class TaskComplianceSelector(PooledSelector):
 
     needs_transitions = True
 
-    def __init__(self, parts: SelectorParts, bandwidths: CandidateBandwidths, max_transitions: int):
-        super().__init__(parts)
+    def __init__(self, candidates: Candidates, bandwidths: CandidateBandwidths, max_transitions: int):
+        super().__init__(candidates)
         self.max_transitions = max_transitions
-        self._table = ComplianceTable(self.candidates, bandwidths)
+        self._table = ComplianceTable(candidates, bandwidths)
         n_rows, n_source_actions = self._table.values.shape
         #: Compliances of transitions added up, by state mapping, target action and source action, of all sources.
         self.sums = np.zeros((n_rows, self.task.n_actions, n_source_actions))

@@ -12,9 +12,9 @@ from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.named_sets import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import MappingsLike
+from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
-from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector, SelectorParts
+from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
 from sb3_combrel.transfer.prior.prior_sets import check_one_source
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
@@ -81,18 +81,18 @@ class TIMBREL(MappingTransfer):
             # With numbers in place of names.
             self.mapping = self.mappings  # type: ignore[assignment]
 
-    def _make_selector(self, parts: SelectorParts, bandwidths: CandidateBandwidths) -> Selector:
+    def _make_selector(self, candidates: Candidates, bandwidths: CandidateBandwidths) -> Selector:
         if isinstance(self.mapping, str):
-            return PooledSelector(parts) if self.mapping == "pool" else RandomSelector(parts)
-        check_one_source(parts.candidates.sources)
-        given, n_actions = parts.candidates.sets[0], self._bound_task.n_actions
+            return PooledSelector(candidates) if self.mapping == "pool" else RandomSelector(candidates, self.rng)
+        check_one_source(candidates.sources)
+        given, n_actions = candidates.sets[0], self._bound_task.n_actions
         if len(given) not in (1, n_actions):
             raise ValueError(
                 f"mapping must be one mapping or one for each of the {n_actions} target actions, got {len(given)}"
             )
         each = [given[a if len(given) > 1 else 0] for a in range(n_actions)]
-        fixed = [parts.candidates.find(a, x.state_index, x.state_sign, x.action[a]) for a, x in enumerate(each)]
-        return FixedSelector(parts, fixed=np.array(fixed, dtype=np.int64))
+        fixed = [candidates.find(a, x.state_index, x.state_sign, x.action[a]) for a, x in enumerate(each)]
+        return FixedSelector(candidates, fixed=np.array(fixed, dtype=np.int64))
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         is_given = not isinstance(self.mapping, str)
