@@ -43,32 +43,29 @@ class OutcomeEvidence:
 
     *Rewards.* Each transition confirms or contradicts the predicted reward, by whether it is off by more than half a standard
     deviation of the source's rewards plus a tenth of their mean size.
-
-    From the weight ``threshold`` on there are data.
     """
 
-    def __init__(self, rewards: np.ndarray, threshold: float):
+    def __init__(self, rewards: np.ndarray):
         self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
-        self.threshold = threshold
         # Unpredicted: ends; absent: visits to where an end is predicted that have left without one, or lasted for long.
         self.confirmed = self.unpredicted = self.absent = 0
         self.rewards_right = self.rewards_wrong = self.steps_of_visit = 0
         self.reward_range = (np.inf, -np.inf)
 
-    def note(self, weight: float, end: float, predicted_reward: float, reward: float, terminated: bool) -> None:
-        """Take in a transition; ``weight``: of the source's data there, ``end``: probability of termination it predicts."""
+    def note(self, predicted: tuple[float, float] | None, reward: float, terminated: bool) -> None:
+        """Take in a transition; ``predicted``: probability of termination, and reward; None where the source has no data."""
         self.reward_range = min(self.reward_range[0], reward), max(self.reward_range[1], reward)
-        has_data = weight >= self.threshold
-        if has_data:
+        end, predicted_reward = predicted or (0.0, 0.0)
+        if predicted is not None:
             wrong = bool(abs(reward - predicted_reward) > self.tolerance)
             self.rewards_wrong, self.rewards_right = self.rewards_wrong + wrong, self.rewards_right + (not wrong)
         if terminated:
             if end >= GOES_ON or self.steps_of_visit:
                 self.confirmed += 1
-            elif has_data:
+            elif predicted is not None:
                 self.unpredicted += 1
             self.steps_of_visit = 0
-        elif (has_data and end > ENDS) or (self.steps_of_visit and end >= GOES_ON):
+        elif end > ENDS or (self.steps_of_visit and end >= GOES_ON):
             self.steps_of_visit += 1
             self.absent += self.steps_of_visit % STEPS_OF_A_VISIT == 0
         else:

@@ -28,7 +28,7 @@ def steady_source(direction=1.0, n=200, ends=False):
 
 
 def check_of(source=None):
-    return InstancesCheck([steady_source() if source is None else source], 1.0)
+    return InstancesCheck([steady_source() if source is None else source])
 
 
 def given_to(rng, n_actions=3, room=4, d=2):

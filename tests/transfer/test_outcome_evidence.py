@@ -9,13 +9,13 @@ SURE, NONE = 0.9, 0.0
 
 
 def evidence():
-    return OutcomeEvidence(np.full(10, -1.0), threshold=1.0)
+    return OutcomeEvidence(np.full(10, -1.0))
 
 
-def note(made, ends, terminated=False, weight=5.0, reward=-1.0, predicted=-1.0):
+def note(made, ends, terminated=False, reward=-1.0, predicted=-1.0, has_data=True):
     """Note one transition for each predicted probability of an end; the last may end the episode."""
     for k, end in enumerate(ends):
-        made.note(weight, end, predicted, reward, terminated and k == len(ends) - 1)
+        made.note((end, predicted) if has_data else None, reward, terminated and k == len(ends) - 1)
 
 
 @pytest.mark.parametrize(
@@ -40,9 +40,9 @@ def test_visits_count_once(ends, terminated, confirmed, contradicted):
 
 def test_where_the_source_has_no_data_nothing_is_contradicted():
     made = evidence()
-    note(made, [SURE, SURE, NONE], weight=0.5)
-    note(made, [NONE], terminated=True, weight=0.5)
-    note(made, [NONE] * 30, weight=0.5, reward=1.0)
+    note(made, [NONE] * 3, has_data=False)
+    note(made, [NONE], terminated=True, has_data=False)
+    note(made, [NONE] * 30, has_data=False, reward=1.0)
     assert made.contradicted == made.rewards_wrong == 0
 
 
@@ -51,7 +51,7 @@ def test_rewards_of_the_wrong_sign_are_wrong_and_small_differences_are_not():
     note(made, [NONE] * 30, reward=-1.05)
     note(made, [NONE] * 9, reward=1.0)
     assert (made.rewards_right, made.rewards_wrong) == (30, 9)
-    spread = OutcomeEvidence(np.array([-5.0, 5.0]), 1.0)
+    spread = OutcomeEvidence(np.array([-5.0, 5.0]))
     note(spread, [NONE] * 30, reward=2.0)
     note(spread, [NONE] * 3, reward=5.0)
     assert (spread.rewards_right, spread.rewards_wrong) == (30, 3)

@@ -52,7 +52,7 @@ class InstanceTransfer:
         # Recorded transitions that relevance was last measured by.
         self._n_of_relevance = 0
         #: Compares what was transferred with what happened, wherever the agent acted on it.
-        self.check = InstancesCheck(self.sources, float(task.exploration_threshold))
+        self.check = InstancesCheck(self.sources)
         #: Errors of what was transferred.
         self.errors = RegionErrors(task)
         #: Whether what has been returned for any state of the sample may have changed. Nothing has where the selection depends

@@ -34,8 +34,8 @@ class InstancesCheck:
     Wrong rewards do not count: the target's own transitions correct them where the agent goes.
     """
 
-    def __init__(self, sources: Sequence[SourceInstances], threshold: float):
-        self.evidence = OutcomeEvidence(np.concatenate([source.rewards for source in sources]), threshold)
+    def __init__(self, sources: Sequence[SourceInstances]):
+        self.evidence = OutcomeEvidence(np.concatenate([source.rewards for source in sources]))
         self.n_compared = 0
         self._sources = sources
         # Squared errors, and squared effects.
@@ -61,7 +61,7 @@ class InstancesCheck:
         given = self._pending.pop(state.tobytes(), None)
         if given is None or given.length[action] == 0:
             # A visit to where an end was predicted may be over.
-            self.evidence.note(0.0, 0.0, 0.0, reward, terminated)
+            self.evidence.note(None, reward, terminated)
             return None
         n = given.length[action]
         weight = given.weight[action, :n] / given.weight[action, :n].sum()
@@ -71,7 +71,7 @@ class InstancesCheck:
         self._sums += error @ error, effect @ effect
         self.n_compared += 1
         end, predicted_reward = float(weight @ given.terminated[action, :n]), float(weight @ given.reward[action, :n])
-        self.evidence.note(self.evidence.threshold, end, predicted_reward, reward, terminated)
+        self.evidence.note((end, predicted_reward), reward, terminated)
         return predicted
 
     def end_episode(self, truncated: bool) -> bool:
