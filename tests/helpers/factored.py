@@ -108,7 +108,7 @@ def measured(n_copies, n, noise=0.0, order=None, seed=0):
     states, actions, effects = walk(mapping, n, seed)
     effects = effects + noise * np.random.default_rng(seed).normal(size=effects.shape)
     rows = copies_of_source(2, 2 * n_copies)
-    copies = Copies([oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, np.ones_like(rows), 0.2, 1.0)
+    copies = Copies([oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, np.ones_like(rows), 0.2)
     sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         copies.measure(state, action, effect, sums)

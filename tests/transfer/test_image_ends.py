@@ -59,7 +59,7 @@ def chosen_for(transitions, source):
     d = transitions.states.shape[1]
     state = np.where(np.repeat(np.eye(d), 2, axis=0) > 0, 0, -1)
     sign = np.where((np.arange(2 * d) % 2 == 1)[:, None] & (state >= 0), -1.0, 1.0)
-    copies = Copies([source], np.zeros(2 * d, dtype=np.int64), state, sign, 0.2, 1.0)
+    copies = Copies([source], np.zeros(2 * d, dtype=np.int64), state, sign, 0.2)
     sums = CopySums.zero(2 * d, 2, 2**d, d)
     for i in range(transitions.n):
         copies.measure(transitions.states[i], int(transitions.actions[i]), transitions.effects[i], sums)
@@ -116,9 +116,7 @@ def test_a_copy_that_effects_tell_from_its_image_stays():
         # In unit coordinates of the source.
         effect = (0.02 + 0.1 * (1.2 * x) ** 2) / 1.2
         transitions.add(np.array([x]), 0, -1.0, np.array([effect]), False)
-    copies = Copies(
-        [source], np.zeros(2, dtype=np.int64), np.zeros((2, 1), dtype=np.int64), np.array([[1.0], [-1.0]]), 0.2, 1.0
-    )
+    copies = Copies([source], np.zeros(2, dtype=np.int64), np.zeros((2, 1), dtype=np.int64), np.array([[1.0], [-1.0]]), 0.2)
     sums = CopySums.zero(2, 1, 1, 1)
     for i in range(100):
         copies.measure(transitions.states[i], 0, transitions.effects[i], sums)

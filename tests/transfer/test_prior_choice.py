@@ -72,7 +72,7 @@ def test_variables_are_mirrored_where_that_explains_far_more(own_image, mirrored
     effects = effects_of(states, actions) + 0.005 * rng.normal(size=states.shape)
     rows, sign = with_mirrored(copies_of_source(2, 2))
     source = f.oscillator_source(200, seed, effects=effects_of)
-    copies = Copies([source], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2, 1.0)
+    copies = Copies([source], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2)
     sums = CopySums.zero(len(copies), 3, 3, 2)
     for state, action, effect in zip(np.where(mirrored, 1.0 - states, states), actions.tolist(), effects, strict=True):
         copies.measure(state, action, np.where(mirrored, -effect, effect), sums)
@@ -117,7 +117,7 @@ def test_a_mirrored_copy_is_chosen_rather_than_its_parts(monkeypatch):
     _, copies, *_ = f.measured(1, 30)
     state, sign = np.array([[0, 1], [0, 1], [0, -1], [0, -1], [-1, 1]]), np.ones((5, 2))
     sign[1], sign[3, 0] = -1.0, -1.0
-    five = Copies(copies.sources, np.zeros(5, dtype=np.int64), state, sign, 0.2, 1.0)
+    five = Copies(copies.sources, np.zeros(5, dtype=np.int64), state, sign, 0.2)
     scores = np.array([100.0, 150.0, 10.0, 90.0, 40.0])
     monkeypatch.setattr(prior_choice, "scores_of", lambda copies, sums: scores)
     fresh = CopySums.zero(5, 3, 3, 2)
@@ -131,7 +131,7 @@ def test_a_mirrored_copy_is_chosen_rather_than_its_parts(monkeypatch):
 def test_images_are_the_same_but_for_signs_and_have_more_than_half_the_evidence(n_copies):
     mapping, (states, actions, effects) = f.copies_mapping(n_copies), f.walk(f.copies_mapping(n_copies), 60)
     rows, sign = with_mirrored(copies_of_source(2, 2 * n_copies))
-    copies = Copies([f.oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2, 1.0)
+    copies = Copies([f.oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2)
     sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         copies.measure(state, action, effect, sums)
@@ -163,7 +163,7 @@ def test_an_action_that_the_sources_instances_lack_moves_nothing():
     rows = np.flatnonzero(source.actions > 0)
     arrays = ("states", "actions", "rewards", "next_states", "terminated")
     lacking = replace(source, **{name: getattr(source, name)[rows] for name in arrays})
-    without = Copies([lacking], copies.source, copies.state, copies.sign, copies.breadth, copies.threshold)
+    without = Copies([lacking], copies.source, copies.state, copies.sign, copies.breadth)
     sums = CopySums.zero(len(copies), 3, 5, 4)
     for state, action, effect in zip(states, actions.tolist(), -3.0 * effects, strict=True):
         without.measure(state, action, effect, sums)

@@ -104,7 +104,7 @@ def test_what_is_said_of_the_mapping_in_use_is_of_that_mapping_alone():
     prior, errors = transfer.source_prior, RegionErrors(transfer.task)
     for state, action, effect in zip(*(np.concatenate(parts) for parts in zip(wrong, right, strict=True)), strict=True):
         predicted, _, weight = prior.copies.predict(prior._used, state[None], np.array([action]))
-        if weight[0] >= prior.copies.threshold:
+        if weight[0] >= prior.task.exploration_threshold:
             errors.note(state, int(action), effect, predicted[0])
     np.testing.assert_allclose(prior.errors.sums, errors.sums, rtol=1e-6, atol=1e-12)
 

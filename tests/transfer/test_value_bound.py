@@ -44,7 +44,7 @@ def value_bound(sources, target, state, sign=None, source=None):
     state = np.array(state)
     sign = np.ones_like(state) if sign is None else np.array(sign)
     source = np.zeros(len(state), dtype=np.int64) if source is None else np.array(source)
-    return ValueBound(Copies(sources, source, state, sign, 0.1, 1.0), target)
+    return ValueBound(Copies(sources, source, state, sign, 0.1), target)
 
 
 def all_of(*copies, n_actions=2):

@@ -35,7 +35,7 @@ class KnownCopies(TIMBREL):
         state, sign = (np.array([getattr(copy, name) for copy in copies]) for name in ("state_index", "state_sign"))
         actions = np.array([copy.action for copy in copies], dtype=np.int64).T.copy()
         choice = Choice(np.tile(np.arange(len(copies)), (task.n_actions, 1)), actions)
-        made = Copies(sources, numbers, state, sign, float(self.source_breadth), task.exploration_threshold)
+        made = Copies(sources, numbers, state, sign, float(self.source_breadth))
         return SourcePrior(
             made, task, choice, whole=False, max_transitions=0, transfer_terminals=bool(self.transfer_terminals)
         )

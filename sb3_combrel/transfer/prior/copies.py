@@ -36,19 +36,11 @@ class Copies:
     :param state: source variable of each target variable, int64, shape (n_copies, n_target_variables), -1: not in the copy
     :param sign: -1 where a target variable is mirrored, same shape
     :param breadth: kernel breadth of the sources' models, in unit coordinates of the sources
-    :param threshold: weight from which on a source has data
     """
 
     def __init__(
-        self,
-        sources: Sequence[SourceInstances],
-        source: np.ndarray,
-        state: np.ndarray,
-        sign: np.ndarray,
-        breadth: float,
-        threshold: float,
+        self, sources: Sequence[SourceInstances], source: np.ndarray, state: np.ndarray, sign: np.ndarray, breadth: float
     ):
-        self.threshold = float(threshold)
         self.breadth = float(breadth)
         self.sources = sources
         self.source = source

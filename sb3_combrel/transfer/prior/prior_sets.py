@@ -127,7 +127,7 @@ def _named_copies(name: str, sources: Sequence[SourceInstances], task: TargetTas
     signed = [with_mirrored(state) if name.startswith("signed_") else (state, np.ones_like(state)) for state in states]
     number = np.repeat(np.arange(len(signed)), [len(state) for state, _ in signed])
     state, sign = map(np.concatenate, zip(*signed, strict=True))
-    return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
+    return Copies(sources, number, state, sign, breadth)
 
 
 def check_one_source(sources: Sequence[SourceInstances]) -> None:
@@ -151,7 +151,7 @@ def _given_factored(
     mapping.check(**sizes(sources[0], task))
     actions = np.array([copy.action for copy in mapping.copies], dtype=np.int64).T
     numbers = np.tile(np.arange(len(mapping.copies)), (task.n_actions, 1))
-    return _of_mappings(mapping.copies, sources, task, breadth), Choice(numbers, actions.copy())
+    return _of_mappings(mapping.copies, sources, breadth), Choice(numbers, actions.copy())
 
 
 def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
@@ -166,24 +166,20 @@ def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, 
     used = list(dict.fromkeys(each))
     copies = np.array([[used.index(mapping)] for mapping in each], dtype=np.int64)
     actions = np.array([[mapping.action[a]] for a, mapping in enumerate(each)], dtype=np.int64)
-    return _of_mappings(used, sources, task, breadth), Choice(copies, actions)
+    return _of_mappings(used, sources, breadth), Choice(copies, actions)
 
 
-def _of_mappings(
-    mappings: Sequence[InterTaskMapping], sources: Sequence[SourceInstances], task: TargetTask, breadth: float
-) -> Copies:
+def _of_mappings(mappings: Sequence[InterTaskMapping], sources: Sequence[SourceInstances], breadth: float) -> Copies:
     """The state mappings of some mappings to a source."""
     state = np.array([mapping.state_index for mapping in mappings])
     sign = np.array([mapping.state_sign for mapping in mappings])
-    number = np.zeros(len(state), dtype=np.int64)
-    return Copies(sources, number, state, sign, breadth, task.exploration_threshold)
+    return Copies(sources, np.zeros(len(state), dtype=np.int64), state, sign, breadth)
 
 
 def copies_of(candidates: Candidates, breadth: float) -> Copies:
     """Return all state mappings of a set, for each source, in the order of the candidates' mapping table."""
     number = np.repeat(np.arange(len(candidates.sets)), [each.n_state_mappings for each in candidates.sets])
-    table, threshold = candidates.table, candidates.task.exploration_threshold
-    return Copies(candidates.sources, number, table.variable, table.sign, breadth, threshold)
+    return Copies(candidates.sources, number, *candidates.table, breadth)
 
 
 def _allowed(candidates: Candidates, copies: Copies) -> np.ndarray:

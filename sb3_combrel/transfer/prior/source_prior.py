@@ -170,7 +170,7 @@ class SourcePrior:
             self.copies.measure_used(self._used, action, effect, predicted, self.sums)
 
     def _compare(self, state: np.ndarray, action: int, effect: np.ndarray, predicted: np.ndarray, weight: float) -> None:
-        if weight >= self.copies.threshold:
+        if weight >= self.task.exploration_threshold:
             self.errors.note(state, action, effect, predicted)
 
     def value_bound(self) -> np.ndarray | None:
