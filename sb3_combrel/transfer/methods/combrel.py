@@ -127,9 +127,7 @@ class COMBREL(MappingTransfer):
         super().bind(task, rng)
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
-        assert self.mappings is not None
-        given = is_factored(self.mappings) and not isinstance(self.mappings, str)
-        return self._prior_of_set(task, given=given, drawn=None, max_transitions=self.max_transitions)
+        return self._prior_of_set(task, max_transitions=self.max_transitions)
 
     def _whole_mappings(self) -> bool:
         return self.neighbors == "state_action"

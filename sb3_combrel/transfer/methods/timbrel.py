@@ -16,7 +16,7 @@ from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.selectors import FixedSelector, PooledSelector, RandomSelector, Selector
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
-from sb3_combrel.transfer.prior.prior_sets import check_one_source
+from sb3_combrel.transfer.prior.prior_sets import check_one_source, mapping_of_each_action
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 
 
@@ -85,15 +85,10 @@ class TIMBREL(MappingTransfer):
         if isinstance(self.mapping, str):
             return PooledSelector(candidates) if self.mapping == "pool" else RandomSelector(candidates, self.rng)
         check_one_source(candidates.sources)
-        given, n_actions = candidates.sets[0], self._bound_task.n_actions
-        if len(given) not in (1, n_actions):
-            raise ValueError(
-                f"mapping must be one mapping or one for each of the {n_actions} target actions, got {len(given)}"
-            )
-        each = [given[a if len(given) > 1 else 0] for a in range(n_actions)]
+        each = mapping_of_each_action(candidates.sets[0], candidates.task.n_actions)
         fixed = [candidates.find(a, x.state_index, x.state_sign, x.action[a]) for a, x in enumerate(each)]
         return FixedSelector(candidates, fixed=np.array(fixed, dtype=np.int64))
 
     def _make_prior(self, task: TargetTask) -> SourcePrior:
         is_given = not isinstance(self.mapping, str)
-        return self._prior_of_set(task, given=is_given, drawn=None if is_given else self.rng, max_transitions=0)
+        return self._prior_of_set(task, given=is_given, drawn=None if is_given else self.rng)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
-from sb3_combrel.mappings.mapping_set import FACTORED_SETS
+from sb3_combrel.mappings.mapping_set import FACTORED_SETS, MappingSet
 from sb3_combrel.mappings.named_sets import InterTaskMapping, resolve
 from sb3_combrel.mappings.state_mappings import copies_of_source, count_copies, with_mirrored
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -46,16 +46,16 @@ def make_prior(
     task: TargetTask,
     *,
     breadth: float,
-    given: bool,
-    drawn: np.random.Generator | None,
-    max_transitions: int,
     transfer_terminals: bool,
+    given: bool = False,
+    drawn: np.random.Generator | None = None,
+    max_transitions: int = 0,
 ) -> SourcePrior:
     """Make the prior of a target task.
 
     :param breadth: kernel breadth of the source's model, in unit coordinates of the source
     :param given: ``mappings`` is one mapping, or one for each target action, and is used as it is
-    :param drawn: one of ``mappings`` is drawn with this generator; None: it is chosen by compliance
+    :param drawn: one of ``mappings`` is drawn with this generator; None: it is chosen by evidence, from ``max_transitions``
     :raises ValueError: if source or mappings do not fit the target
     """
     sources = load_sources(source)
@@ -144,8 +144,6 @@ def _given_factored(
 ) -> tuple[Copies, Choice]:
     """The copies of a factored mapping."""
     if not isinstance(mapping, FactoredMapping):
-        if set(mapping) != {"copies"}:
-            raise ValueError(f"a factored mapping must be a FactoredMapping or a dict of copies, got {mapping!r}")
         mapping = FactoredMapping(**mapping)
     check_one_source(sources)
     mapping.check(**sizes(sources[0], task))
@@ -157,16 +155,18 @@ def _given_factored(
 def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
     """One mapping, or one for each target action."""
     check_one_source(sources)
-    given = resolve(mappings, **sizes(sources[0], task))
-    if len(given) not in (1, task.n_actions):
-        raise ValueError(
-            f"mapping must be one mapping or one for each of the {task.n_actions} target actions, got {len(given)}"
-        )
-    each = [given[a if len(given) > 1 else 0] for a in range(task.n_actions)]
+    each = mapping_of_each_action(resolve(mappings, **sizes(sources[0], task)), task.n_actions)
     used = list(dict.fromkeys(each))
     copies = np.array([[used.index(mapping)] for mapping in each], dtype=np.int64)
     actions = np.array([[mapping.action[a]] for a, mapping in enumerate(each)], dtype=np.int64)
     return _of_mappings(used, sources, breadth), Choice(copies, actions)
+
+
+def mapping_of_each_action(given: MappingSet, n_actions: int) -> list[InterTaskMapping]:
+    """Return the mapping of each target action: the one that is given, or its own; a ValueError if there are others."""
+    if len(given) not in (1, n_actions):
+        raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {len(given)}")
+    return [given[a if len(given) > 1 else 0] for a in range(n_actions)]
 
 
 def _of_mappings(mappings: Sequence[InterTaskMapping], sources: Sequence[SourceInstances], breadth: float) -> Copies:
