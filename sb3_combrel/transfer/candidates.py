@@ -12,7 +12,8 @@ import numpy as np
 from sb3_combrel.common.instances import Instances, along_curve
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
-from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve
+from sb3_combrel.mappings.inter_task_mapping import MappingNames
+from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve, with_numbers
 from sb3_combrel.sources.recipes import check_source, find_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
@@ -184,6 +185,13 @@ def load_sources(source: SourceLike) -> list[SourceInstances]:
     if isinstance(source, Sequence) and not isinstance(source, str):
         return [instances for one in source for instances in load_sources(one)]
     return [find_source(source)]
+
+
+def loaded(source: SourceLike, mappings: MappingsLike, task: TargetTask) -> tuple[SourceLike, MappingsLike]:
+    """Return a method's arguments as instances, as a saved model must not depend on other files, and numbers for names."""
+    sources = load_sources(source)
+    names = [MappingNames(each.state_names, task.state_names, each.action_names, task.action_names) for each in sources]
+    return sources if len(sources) > 1 else sources[0], with_numbers(mappings, names)
 
 
 def resolved_sets(sources: Sequence[SourceInstances], mappings: MappingsLike, task: TargetTask) -> list[MappingSet]:

@@ -9,10 +9,9 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping, MappingNames
-from sb3_combrel.mappings.named_sets import with_numbers
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources, resolved_sets
+from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources, loaded, resolved_sets
 from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 from sb3_combrel.transfer.source_policy import SourcePolicy
@@ -105,13 +104,8 @@ class MappingExperts(Transfer):
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
         super().bind(task, rng)
+        self.source, self.mappings = loaded(self.source, self.mappings, task)
         self.sources = load_sources(self.source)
-        # As of ``MappingTransfer``: a saved model must not depend on other files.
-        self.source = self.sources if len(self.sources) > 1 else self.sources[0]
-        names = [
-            MappingNames(each.state_names, task.state_names, each.action_names, task.action_names) for each in self.sources
-        ]
-        self.mappings = with_numbers(self.mappings, names)
         self._sets = resolved_sets(self.sources, self.mappings, task)
         self.n_mappings = sum(mappings.n_mappings for mappings in self._sets)
         if self.n_mappings > MAX_MAPPINGS:

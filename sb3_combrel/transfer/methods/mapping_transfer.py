@@ -15,13 +15,12 @@ from sb3_combrel.common.checks import check_boolean, check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.mappings.action_mappings import AllActionMappings
-from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.mapping_set import MappingSet
-from sb3_combrel.mappings.named_sets import check_mappings, with_numbers
+from sb3_combrel.mappings.named_sets import check_mappings
 from sb3_combrel.sources.recipes import check_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
-from sb3_combrel.transfer.candidates import Candidate, Candidates, MappedVariables, MappingsLike, SourceLike, load_sources
+from sb3_combrel.transfer.candidates import Candidate, Candidates, MappedVariables, MappingsLike, SourceLike, loaded
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths, candidate_bandwidths
 from sb3_combrel.transfer.instances.instance_transfer import InstanceTransfer
 from sb3_combrel.transfer.instances.relevance import renew_relevance
@@ -135,12 +134,7 @@ class MappingTransfer(Transfer):
         super().bind(task, rng)
         if self._left_open:
             self.use, self._left_open = "prior" if task.takes_prior else "instances", {}
-        sources = load_sources(self.source)
-        # Once read, the instances themselves: the file of a saved model must not depend on other files.
-        self.source = sources if len(sources) > 1 else sources[0]
-        states, actions = tuple(task.state_names), tuple(task.action_names)
-        names = [MappingNames(each.state_names, states, each.action_names, actions) for each in sources]
-        self.mappings = with_numbers(self.mappings, names)
+        self.source, self.mappings = loaded(self.source, self.mappings, task)
         self._periodic = np.array(task.periodic)
         self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
