@@ -14,10 +14,12 @@ def check_positive(name: str, value: object, *, max: float = float("inf")) -> No
         raise ValueError(f"{name} must be a number above 0{limit}, got {value!r}")
 
 
-def check_finite(name: str, value: object) -> None:
-    """:raises ValueError: unless ``value`` is a finite number"""
+def check_finite(name: str, value: object, *, min: float = -math.inf) -> None:
+    """:raises ValueError: unless ``value`` is a finite number, of at least ``min``"""
     if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
+    if value < min:
+        raise ValueError(f"{name} must be at least {min:g}, got {value!r}")
 
 
 def check_boolean(name: str, value: object) -> None:

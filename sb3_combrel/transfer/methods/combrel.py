@@ -94,9 +94,7 @@ class COMBREL(MappingTransfer):
         if self.neighbor_radius is not None:
             check_positive("neighbor_radius", self.neighbor_radius)
         for name in ("min_compliance", "min_evidence"):
-            check_finite(name, getattr(self, name))
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)!r}")
+            check_finite(name, getattr(self, name), min=0.0)
         check_either("neighbors", self.neighbors, "action", "state_action")
         check_either("choice", self.choice, "best", "drawn")
         check_either("measured", self.measured, "online", "first_episode")

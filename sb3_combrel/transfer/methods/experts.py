@@ -90,9 +90,7 @@ class MappingExperts(Transfer):
 
     def __post_init__(self) -> None:
         check_count("max_experts", self.max_experts)
-        check_finite("exploration", self.exploration)
-        if self.exploration < 0.0:
-            raise ValueError(f"exploration must be at least 0, got {self.exploration!r}")
+        check_finite("exploration", self.exploration, min=0.0)
         if self.patience is not None:
             check_positive("patience", self.patience)
         check_positive("gamma", self.gamma, max=1.0)
