@@ -11,7 +11,7 @@ from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.transfer.candidates import Candidates
+from sb3_combrel.transfer.candidates import CandidateArrays, Candidates, MappingTable
 from sb3_combrel.transfer.instances.selectors import Ranges
 
 # Instances of a state and action by distance, at most; by relevance room is made for as many as it takes.
@@ -20,15 +20,6 @@ MAX_TRANSFERRED = 32
 # Columns of the scratch arrays of the selected instances.
 _INSTANCE, _CANDIDATE = 0, 1
 _RANK, _WEIGHT = 0, 1
-
-
-class CandidateMappings(NamedTuple):
-    """What each candidate is: ``row`` and ``action`` of ``CandidateArrays``, ``variable`` and ``sign`` of ``MappingTable``."""
-
-    row: np.ndarray
-    action: np.ndarray
-    variable: np.ndarray
-    sign: np.ndarray
 
 
 class TranslationRules(NamedTuple):
@@ -59,7 +50,8 @@ class TranslationArrays(NamedTuple):
     """All that the translator's loops read, and their work space."""
 
     source: Instances
-    mappings: CandidateMappings
+    candidates: CandidateArrays
+    mappings: MappingTable
     rules: TranslationRules
     relevance: np.ndarray  # float64, shape (n_candidates, most instances of an action); or (1, 0) if not used
     scratch: TranslationScratch
@@ -67,15 +59,16 @@ class TranslationArrays(NamedTuple):
 
     def plain(self) -> tuple[Any, ...]:
         """The same as plain tuples (see ``common.compiled``)."""
-        structs = tuple(self.source), tuple(self.mappings), tuple(self.rules)
+        structs = tuple(self.source), tuple(self.candidates), tuple(self.mappings), tuple(self.rules)
         return *structs, self.relevance, tuple(self.scratch), self.periodic
 
 
 @inlined
 def as_arrays(plain):
     """:class:`TranslationArrays` from plain tuples."""
-    source, mappings, rules = Instances(*plain[0]), CandidateMappings(*plain[1]), TranslationRules(*plain[2])
-    return TranslationArrays(source, mappings, rules, plain[3], TranslationScratch(*plain[4]), plain[5])
+    source, candidates, mappings = Instances(*plain[0]), CandidateArrays(*plain[1]), MappingTable(*plain[2])
+    rules, scratch = TranslationRules(*plain[3]), TranslationScratch(*plain[5])
+    return TranslationArrays(source, candidates, mappings, rules, plain[4], scratch, plain[6])
 
 
 @inlined
@@ -119,8 +112,8 @@ def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
 def add_near_instances(state, own, candidate, arrays, kept):
     """Add a candidate's instances that weigh at least ``min_weight`` at ``state`` to the ``kept`` selected; how many now."""
     source, rules, scratch = arrays.source, arrays.rules, arrays.scratch
-    row = arrays.mappings.row[candidate]
-    action = arrays.mappings.action[candidate]
+    row = arrays.candidates.row[candidate]
+    action = arrays.candidates.action[candidate]
     variable = arrays.mappings.variable[row]
     sign = arrays.mappings.sign[row]
     scale = -1.0 / (rules.breadth * rules.breadth)
@@ -203,8 +196,8 @@ def write_row(s, own, kept, arrays, transferred):
     transferred.length[s] = kept
     for n in range(kept):
         j = number[n, _INSTANCE]
-        row = mappings.row[number[n, _CANDIDATE]]
-        action = mappings.action[number[n, _CANDIDATE]]
+        row = arrays.candidates.row[number[n, _CANDIDATE]]
+        action = arrays.candidates.action[number[n, _CANDIDATE]]
         transferred.weight[s, n] = value[n, _WEIGHT]
         transferred.reward[s, n] = source.reward[action, j]
         transferred.terminated[s, n] = rules.transfer_terminals and source.terminated[action, j]
@@ -245,13 +238,7 @@ class Translator:
     """
 
     def __init__(
-        self,
-        candidates: Candidates,
-        *,
-        breadth: float,
-        transfer_terminals: bool,
-        by_relevance: bool,
-        times_weight: bool,
+        self, candidates: Candidates, *, breadth: float, transfer_terminals: bool, by_relevance: bool, times_weight: bool
     ):
         task, largest = candidates.task, int(candidates.instances.size.max())
         self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
@@ -259,7 +246,8 @@ class Translator:
         self._set_arrays(
             TranslationArrays(
                 source=candidates.instances,
-                mappings=CandidateMappings(candidates.arrays.row, candidates.arrays.action, *candidates.table),
+                candidates=candidates.arrays,
+                mappings=candidates.table,
                 rules=TranslationRules(
                     threshold=float(task.exploration_threshold),
                     breadth=float(breadth),
