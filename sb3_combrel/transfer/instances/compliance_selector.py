@@ -49,7 +49,7 @@ class ComplianceSelector(Selector):
 
     def __init__(self, candidates: Candidates, options: SelectionOptions, rng: np.random.Generator):
         super().__init__(candidates)
-        self.options, self.rng = options, rng
+        self.options, self.rng, self.max_transitions = options, rng, options.max_transitions
         n_actions, n_points = self.task.n_actions, len(self.task.sample_states)
         n_neighbors = options.n_neighbors
         # An empty place counts as a neighbour at the limit: what is farther away does not enter.
@@ -96,7 +96,7 @@ class ComplianceSelector(Selector):
         self._draws_at = self._draws(self.task.n_actions)
 
     def takes_transitions(self) -> bool:
-        return self.transitions.n < self.options.max_transitions and (self.first_episode or self.options.online)
+        return super().takes_transitions() and (self.first_episode or self.options.online)
 
     def add_transition(self, i: int) -> None:
         if self.options.online:

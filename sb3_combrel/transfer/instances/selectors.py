@@ -35,6 +35,8 @@ class Selector(ABC):
     needs_transitions: ClassVar[bool] = False
     #: Whether a range is of one candidate at most.
     selects_one: ClassVar[bool] = True
+    #: So many transitions are recorded, at most.
+    max_transitions: float = np.inf
 
     def __init__(self, candidates: Candidates):
         self.candidates = candidates
@@ -55,7 +57,7 @@ class Selector(ABC):
 
     def takes_transitions(self) -> bool:
         """Return whether another transition is to be recorded."""
-        return True
+        return self.transitions.n < self.max_transitions
 
     def add_transition(self, i: int) -> None:  # noqa: B027 - most ignore it
         """Take in that transition ``i`` was recorded."""
@@ -84,8 +86,10 @@ class Selector(ABC):
         """Return what is to be saved besides the transitions."""
         return {}
 
-    def set_state(self, state: dict[str, np.ndarray]) -> None:  # noqa: B027 - most have none
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Restore what :meth:`get_state` returned; called after the transitions have been recorded again."""
+        for i in range(self.transitions.n):
+            self.add_transition(i)
 
     def statistics(self) -> dict[str, float]:
         """Return figures for the logger, by name."""

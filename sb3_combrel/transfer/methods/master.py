@@ -169,18 +169,15 @@ class LeastErrorSelector(FixedSelector):
     def __init__(self, candidates: Candidates, copies: Copies, n_transitions: int):
         task = candidates.task
         super().__init__(candidates, fixed=np.full(task.n_actions, -1, dtype=np.int64))
-        self.copies, self.n_transitions = copies, n_transitions
+        self.copies, self.max_transitions = copies, n_transitions
         self.sums = CopySums.zero(len(copies), copies.most_actions, task.n_actions, task.n_variables)
         self.choice: Choice | None = None  #: the mapping that was chosen, None before
         self._just_chosen = False
 
-    def takes_transitions(self) -> bool:
-        return self.transitions.n < self.n_transitions
-
     def add_transition(self, i: int) -> None:
         seen = self.transitions
         self.copies.measure(seen.states[i], int(seen.actions[i]), seen.effects[i], self.sums)
-        if i + 1 == self.n_transitions:
+        if i + 1 == self.max_transitions:
             self.choice = choose_least_error(self.copies, self.candidates.sets, self.sums)
             for action, (row, source_action) in enumerate(np.hstack(self.choice).tolist()):
                 self.fixed[action] = self._find(action, row, source_action)
@@ -198,6 +195,5 @@ class LeastErrorSelector(FixedSelector):
         return just_chosen
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
-        for i in range(min(self.transitions.n, self.n_transitions)):
-            self.add_transition(i)
+        super().set_state(state)
         self._just_chosen = False

@@ -185,16 +185,9 @@ class TaskComplianceSelector(PooledSelector):
         #: Compliances of transitions added up, by state mapping, target action and source action, of all sources.
         self.sums = np.zeros((n_rows, self.task.n_actions, n_source_actions))
 
-    def takes_transitions(self) -> bool:
-        return self.transitions.n < self.max_transitions
-
     def add_transition(self, i: int) -> None:
         self._table.measure(self.transitions, i)
         self.sums[:, int(self.transitions.actions[i])] += self._table.values
-
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
-        for i in range(self.transitions.n):
-            self.add_transition(i)
 
 
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
