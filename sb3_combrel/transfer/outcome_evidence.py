@@ -147,21 +147,10 @@ class RegionErrors:
         low, high = self.task.scaling.low, self.task.scaling.high
         return {name: np.linspace(low[k], high[k], N_PARTS + 1) for k, name in enumerate(self.task.state_names)}
 
-    def report_fields(self, evidence: OutcomeEvidence | None = None) -> dict[str, Any]:
-        """Return the fields of a report that say how the target's transitions compare with what was predicted of them.
-
-        :param evidence: for the ends and rewards of transferred instances; None for a prior, which has none
-        """
+    def report_fields(self) -> dict[str, Any]:
+        """Return the fields of a report that say how the target's effects compare with what was predicted of them."""
         totals = self.of_actions.sum(axis=0)
-        found: dict[str, Any] = {
-            "n_compared": int(totals[_N]),
-            "n_worse": int(totals[_WORSE]),
-            "contradictions": self.contradictions(),
-        }
-        if evidence is not None:
-            found["ends"] = evidence.confirmed, evidence.contradicted
-            found["rewards"] = evidence.rewards_right, evidence.rewards_wrong
-        return found
+        return {"n_compared": int(totals[_N]), "n_worse": int(totals[_WORSE]), "contradictions": self.contradictions()}
 
     def _contradiction(self, action: int, variable: int, part: int) -> Contradiction:
         n, error = int(self.sums[action, variable, part, _N]), float(self.by_part()[action, variable, part])

@@ -144,6 +144,7 @@ class InstanceTransfer:
 
     def report(self, method: str, statistics: Mapping[str, float]) -> TransferReport:
         """Report what was transferred; ``method``: with its arguments, ``statistics``: its figures of the log."""
+        evidence = self.check.evidence
         return TransferReport(
             method=method,
             use="instances",
@@ -152,9 +153,11 @@ class InstanceTransfer:
             n_rested=self.check.n_compared,
             mappings=tuple(map(self._mapping_report, range(self.task.n_actions))),
             error=self.errors.error(),
+            ends=(evidence.confirmed, evidence.contradicted),
+            rewards=(evidence.rewards_right, evidence.rewards_wrong),
             statistics=statistics,
             source_actions=tuple(self.candidates.source_action_names()),
-            **self.errors.report_fields(self.check.evidence),
+            **self.errors.report_fields(),
         )
 
     def _mapping_report(self, action: int) -> MappingReport:
