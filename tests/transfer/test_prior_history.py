@@ -20,7 +20,7 @@ class Believed(BaseCallback):
             self.ended.add(self.num_timesteps)
         prior = self.model.transfer.source_prior
         strengths = np.exp(np.log(prior.evidence.strength).mean(axis=1))
-        numbers = [prior.candidates.describe_action(prior.choice, a) if prior.choice else "nothing" for a in range(2)]
+        numbers = [prior.candidates.describe_moves(prior.choice.moves(a)) if prior.choice else "nothing" for a in range(2)]
         self.seen[self.num_timesteps] = strengths.tolist(), numbers, prior.excess
         return True
 

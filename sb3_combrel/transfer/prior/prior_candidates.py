@@ -40,7 +40,8 @@ class PriorCandidates:
         self._uses.setdefault(key, 0)
         return key
 
-    def _made_of(self, candidate: int) -> tuple[int, Moves]:
+    def made_of(self, candidate: int) -> tuple[int, Moves]:
+        """Return a candidate's target action, and what it is made of."""
         action, *rest = list(self._uses)[candidate]
         return action, list(zip(rest[::2], rest[1::2], strict=True))
 
@@ -50,13 +51,13 @@ class PriorCandidates:
 
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""
-        action, moves = self._made_of(candidate)
+        action, moves = self.made_of(candidate)
         names = " + ".join(self._action_name(copy, used) for copy, used in moves) or "nothing"
         return Candidate(action, names, " + ".join(describe_copy(self.mapping(copy)) for copy, _ in moves))
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""
-        action, moves = self._made_of(candidate)
+        action, moves = self.made_of(candidate)
         found = MappedVariables.none(action, self.task.n_variables)
         for copy, used in moves:
             found.map(self.copies.source[copy], self.copies.state[copy], self.copies.sign[copy], used)
@@ -75,25 +76,17 @@ class PriorCandidates:
         """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
         names = self.task.action_names
         moves = [[] if choice is None else choice.moves(a) for a in range(self.task.n_actions)]
-        return "; ".join(
-            f"{name}: {self._describe_moves(of, describe_both_sides)}" for name, of in zip(names, moves, strict=True)
-        )
+        words = (self.describe_moves(of, describe_both_sides) for of in moves)
+        return "; ".join(f"{name}: {of}" for name, of in zip(names, words, strict=True))
 
-    def describe_action(self, choice: Choice, action: int) -> str:
-        """Say what a target action is made of with a choice: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
-        return self._describe_moves(choice.moves(action), describe_copy)
-
-    def _describe_moves(self, moves: Moves, variables_of: Callable[[InterTaskMapping], str]) -> str:
+    def describe_moves(self, moves: Moves, variables_of: Callable[[InterTaskMapping], str] = describe_copy) -> str:
+        """Say what a target action is made of: "Right on (x, vx), Neutral on (y, vy)", or "nothing"."""
         words = (f"{self._action_name(copy, used)} on {variables_of(self.mapping(copy))}" for copy, used in moves)
         return ", ".join(words) if moves else "nothing"
 
-    def describe_moves(self, candidate: int) -> str:
-        """Say what the target action of a candidate is made of, as :meth:`describe_action` does."""
-        return self._describe_moves(self._made_of(candidate)[1], describe_copy)
-
     def names(self) -> list[str]:
         """Return what :meth:`describe_moves` says of all candidates, each once, in the order in which they came up."""
-        return list(dict.fromkeys(self.describe_moves(number) for number in range(len(self._uses))))
+        return list(dict.fromkeys(self.describe_moves(self.made_of(number)[1]) for number in range(len(self._uses))))
 
     def describe_copies(self, choice: Choice) -> str:
         """Name the copies of a choice: "(x, vx) and (y, vy)", or "no copy at all"."""

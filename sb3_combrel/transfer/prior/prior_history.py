@@ -47,14 +47,14 @@ class PriorHistory:
     def _point(self, prior: SourcePrior, row: np.ndarray) -> EvidencePoint:
         step, error, exceeded, bounded = row[:N_FIRST].tolist()
         strengths, candidates = row[N_FIRST:].reshape(2, self._n_actions)
-        describe = prior.candidates.describe_moves
+        of = prior.candidates
         return EvidencePoint(
             step=int(step),
             error=np.nan if error < 0.0 else error,
             exceeded=exceeded,
             bounds_values=bool(bounded),
             strengths=tuple(strengths.tolist()),
-            mappings=tuple("nothing" if number < 0 else describe(int(number)) for number in candidates),
+            mappings=tuple(of.describe_moves(of.made_of(int(number))[1] if number >= 0 else []) for number in candidates),
         )
 
     def get_state(self) -> np.ndarray:

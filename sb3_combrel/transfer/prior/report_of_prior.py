@@ -85,7 +85,7 @@ def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, o
     """Report what one target action is taken for."""
     candidates, in_use = prior.candidates, int(prior.choices_by_action()[action])
     of_action = {each: n for each, n in prior.uses().items() if candidates.parts(each).target_action == action}
-    mapping = candidates.describe_action(choice, action)
+    mapping = candidates.describe_moves(choice.moves(action))
     compliance, error = sample.judge(choice, action)
     n_compared = int((sample.actions == action).sum())
     if not n_compared:
@@ -93,7 +93,7 @@ def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, o
         error, n_compared = float(prior.errors.errors()[action]), int(prior.errors.of_actions[action, 0])
     next_best = "", np.nan, np.nan
     for other in others:
-        words, judged = candidates.describe_action(other, action), sample.judge(other, action)
+        words, judged = candidates.describe_moves(other.moves(action)), sample.judge(other, action)
         if words != mapping and not np.isnan(judged[0]) and not judged[0] <= next_best[1]:
             next_best = words, *judged
     return MappingReport(
