@@ -100,7 +100,6 @@ class SoftHomomorphism(Transfer):
         self._periodic = np.array(task.periodic)
         self._transitions = RecordedTransitions(d)
         self._evidence = PriorEvidence(task.n_actions, d, float(np.abs(source.rewards).max()))
-        self._all = np.ones((task.n_actions, d), dtype=np.bool_)
         self._own: OwnPrediction | None = None
         self._squares = np.zeros(2)  # squared errors of predictions, and squared effects, of transitions as they came
         self._n_observed = self._n_fits = self._version = self._last_changed = 0
@@ -215,9 +214,10 @@ class SoftHomomorphism(Transfer):
     def statistics(self) -> dict[str, float]:
         wrong, baseline = self._squares.tolist()
         of_mapping = soft.probabilities(self._logits, self._readings)[0] if self._logits else np.full((1, 1), np.nan)
+        everything = np.ones(self._evidence.strength.shape, dtype=np.bool_)
         return {
             "transfer/prediction_error": wrong / baseline if baseline > 0.0 else np.nan,
-            "transfer/prior_strength": float(self._evidence.strength_of_actions(self._all).mean()),
+            "transfer/prior_strength": float(self._evidence.strength_of_actions(everything).mean()),
             "transfer/mapping_probability": float(of_mapping.max(axis=1).mean()),
             "transfer/mapping_last_changed": self._last_changed,
             "transfer/fits": self._n_fits,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_combrel.transfer.prior.copies import distinct_rows
+from sb3_combrel.transfer.prior.copies import Predicted, distinct_rows
 from sb3_combrel.transfer.source_model import SourceModel, SourcePredictions
 
 LOGIT_DEVIATION = 3.0  # logits have a normal prior of this standard deviation: a few transitions do not make anything certain
@@ -17,8 +17,6 @@ N_STEPS, STEP_SIZE = 200, 0.1
 NOTHING = -1
 MAX_STORED = 128  # predictions of the sample are stored for so many mappings with a source action
 BATCH = 4096  # pairs that are predicted at once
-
-Predicted = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Readings(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -60,9 +60,8 @@ class ThreeWayRBM(LearnedTranslation):
 
     def learn_translation(self, source: np.ndarray, target: np.ndarray, instances: np.ndarray) -> np.ndarray:
         of_source, of_target = Standard.of(source), Standard.of(target)
-        sizes: dict[str, Any] = {"n_hidden": self.n_hidden, "n_factors": self.n_factors, "n_updates": self.n_updates}
-        seed = int(self.rng.integers(2**63))
-        machine = train(of_source.to(source), of_target.to(target), seed=seed, **sizes)
+        rows, seed = (of_source.to(source), of_target.to(target)), int(self.rng.integers(2**63))
+        machine = train(*rows, n_hidden=self.n_hidden, n_factors=self.n_factors, n_updates=self.n_updates, seed=seed)
         return of_target.back(reconstruct(machine, of_source.to(instances)))
 
 

@@ -18,7 +18,10 @@ Moves = Sequence[tuple[int, int]]
 
 
 class PriorCandidates:
-    """The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up."""
+    """The candidates of a prior: each a target action and what it was made of at some time, numbered as they come up.
+
+    Methods of the same name mean what they do of ``Candidates``.
+    """
 
     def __init__(self, copies: Copies, task: TargetTask):
         self.copies = copies
@@ -50,13 +53,11 @@ class PriorCandidates:
         return {number: n for number, n in enumerate(self._uses.values()) if n}
 
     def parts(self, candidate: int) -> Candidate:
-        """Return a candidate's parts, by name."""
         action, moves = self.made_of(candidate)
         names = " + ".join(self._action_name(copy, used) for copy, used in moves) or "nothing"
         return Candidate(action, names, " + ".join(describe_copy(self.mapping(copy)) for copy, _ in moves))
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
-        """Return what a candidate makes of each target variable, in numbers."""
         action, moves = self.made_of(candidate)
         found = MappedVariables.none(action, self.task.n_variables)
         for copy, used in moves:
@@ -64,7 +65,6 @@ class PriorCandidates:
         return found
 
     def describe(self, candidate: int) -> str:
-        """Return a candidate as text."""
         parts = self.parts(candidate)
         return f"{self.task.action_names[parts.target_action]}<-{parts.source_action} with {parts.state_mapping}"
 
