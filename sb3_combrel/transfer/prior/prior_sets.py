@@ -87,19 +87,14 @@ def make_prior(
 def practical_set(sources: Sequence[SourceInstances], task: TargetTask) -> str:
     """The name of the largest set that COMBREL looks through by default, with a warning where it is not the usual one."""
     usual = PRACTICAL_SETS[0]
-    for name in PRACTICAL_SETS:
-        if task.n_variables <= MAX_FACTORED_VARIABLES and _count_copies(name, sources, task) <= MAX_COPIES:
-            break
-    else:
-        name = WITHOUT_COPIES
+    factored = PRACTICAL_SETS if task.n_variables <= MAX_FACTORED_VARIABLES else ()
+    name = next((each for each in factored if _count_copies(each, sources, task) <= MAX_COPIES), WITHOUT_COPIES)
     if name != usual:
-        without = "variables are not mirrored" + (
-            ", and one source action moves all of them" if name == WITHOUT_COPIES else ""
-        )
+        whole = ", and one source action moves all of them" if name == WITHOUT_COPIES else ""
         warn_user(
             f'mappings="{usual}", the default, has {_count_copies(usual, sources, task):,} copies from these source tasks to '
             f'{task.n_variables} state variables, more than the {MAX_COPIES:,} that are practical: "{name}" is taken instead, '
-            f"in which {without}. Fewer variables, or mappings of your own, avoid that",
+            f"in which variables are not mirrored{whole}. Fewer variables, or mappings of your own, avoid that",
         )
     return name
 

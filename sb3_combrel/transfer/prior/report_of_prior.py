@@ -52,6 +52,7 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
     choice, sample, bound = prior.choice, _Sample(prior), prior.value_bound()
     mappings: tuple[MappingReport, ...] = ()
     next_best = "", np.nan
+    in_use, bounding = (prior.candidates.describe_choice(each) for each in (choice, prior.bounding))
     if choice is not None:
         others = _alternatives(prior, choice)
         mappings = tuple(_mapping(prior, choice, a, sample, others) for a in range(prior.task.n_actions))
@@ -68,17 +69,11 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         bounds_values=bound is not None,
         bound=() if bound is None else tuple(np.quantile(bound, (0.0, 0.5, 1.0)).tolist()),
         why_unbounded=prior.why_unbounded(),
-        bounded_through=_bounded_through(prior),
+        bounded_through=bounding if bounding != in_use else "",
         statistics=statistics,
         history=prior.history.points(prior),
         **prior.errors.report_fields(),
     )
-
-
-def _bounded_through(prior: SourcePrior) -> str:
-    """Name what bounds values, where it is not the mapping in use."""
-    of_mapping, of_bound = (prior.candidates.describe_choice(choice) for choice in (prior.choice, prior.bounding))
-    return of_bound if of_bound != of_mapping else ""
 
 
 def _mapping(prior: SourcePrior, choice: Choice, action: int, sample: _Sample, others: Sequence[Choice]) -> MappingReport:

@@ -187,7 +187,7 @@ class SourcePrior:
         """Say why the source's values bound nothing; "" if they do."""
         if self.choice is None:
             return "no mapping has been chosen"
-        if self.says_nothing:
+        if not self._in_copies().any():
             return "no mapping explains the target better than that nothing changes"
         if not self.transfer_terminals:
             return "transfer_terminals=False"
@@ -198,11 +198,6 @@ class SourcePrior:
         if self._bound() is None:
             return "the mapping has no whole source for all target actions, or its copies do not cost the same at every step"
         return ""
-
-    @property
-    def says_nothing(self) -> bool:
-        """Whether every target action is taken for nothing: "no source" is likelier than every mapping."""
-        return self.choice is not None and not self._in_copies().any()
 
     def _explains(self) -> bool:
         """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
