@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,6 +93,9 @@ class Candidates:
         self.sets = resolved_sets(self.sources, mappings, task)
         self.instances = stacked_instances(self.sources)
         self.table = stacked_table(self.sets)
+        #: Of each source, the number of its first state mapping in the table, and of its first action among all.
+        self.first_row = [0, *accumulate(mappings.n_state_mappings for mappings in self.sets)]
+        self.first_action = [0, *accumulate(source.n_actions for source in self.sources)]
         self.origins: list[Origin] = []
         self._action_mappings = self._whole_mappings() if whole else []
         self.arrays = self._numbered()
@@ -116,17 +120,14 @@ class Candidates:
     def _numbered(self) -> CandidateArrays:
         rows, actions, first = [], [], [0]
         for a in range(self.task.n_actions):
-            row_offset = action_offset = 0
-            for number, (source, mappings) in enumerate(zip(self.sources, self.sets, strict=True)):
+            for number, mappings in enumerate(self.sets):
                 if self.whole:
                     state_index, source_action = self._action_mappings[number][0], self._action_mappings[number][1][:, a]
                 else:
                     state_index, source_action = mappings.candidates(a)
-                rows.append(state_index + row_offset)
-                actions.append(source_action + action_offset)
+                rows.append(state_index + self.first_row[number])
+                actions.append(source_action + self.first_action[number])
                 self.origins += [Origin(number, a, int(s), int(u)) for s, u in zip(state_index, source_action, strict=True)]
-                row_offset += mappings.n_state_mappings
-                action_offset += source.n_actions
             first.append(len(self.origins))
         row, action = (np.concatenate(columns).astype(np.int64) for columns in (rows, actions))
         return CandidateArrays(np.array(first, dtype=np.int64), row, action)

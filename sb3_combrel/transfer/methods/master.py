@@ -186,8 +186,7 @@ class LeastErrorSelector(FixedSelector):
     def _find(self, action: int, row: int, source_action: int) -> int:
         """The candidate of a target action with a state mapping, or an equal one, and a source action of its source."""
         table = self.candidates.table
-        # Actions are numbered on from source to source.
-        number = source_action + sum(source.n_actions for source in self.candidates.sources[: self.copies.source[row]])
+        number = source_action + self.candidates.first_action[self.copies.source[row]]
         return self.candidates.find(action, table.variable[row], table.sign[row], number)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:

@@ -134,14 +134,13 @@ class SampleTransfer(MappingTransfer):
         :return: 0 before the first transition
         :raises ValueError: if the set has no such state mapping
         """
-        sets, sources = self.candidates.sets, self.candidates.sources
-        mappings = sets[source]
+        mappings = self.candidates.sets[source]
         same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
         rows = np.flatnonzero(same.all(axis=1))
         if len(rows) == 0:
             raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
-        row = int(rows[0]) + sum(each.n_state_mappings for each in sets[:source])
-        actions = np.array(mapping.action) + sum(each.n_actions for each in sources[:source])
+        row = int(rows[0]) + self.candidates.first_row[source]
+        actions = np.array(mapping.action) + self.candidates.first_action[source]
         sums = self._tasks.sums[row, np.arange(len(actions)), actions]
         return float(sums.sum() / max(self._tasks.transitions.n, 1))
 
@@ -207,16 +206,15 @@ def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int)
 
 def candidate_compliances(candidates: Candidates, sums: np.ndarray, n_transitions: int) -> np.ndarray:
     """Return for each candidate the compliance of all tasks that have it, added up; ``sums``: of all sources, numbered on."""
-    found, row, action = np.zeros_like(sums), 0, 0
-    for source, mappings in zip(candidates.sources, candidates.sets, strict=True):
-        rows, actions = slice(row, row + mappings.n_state_mappings), slice(action, action + source.n_actions)
+    found = np.zeros_like(sums)
+    for k, mappings in enumerate(candidates.sets):
+        rows, actions = slice(*candidates.first_row[k : k + 2]), slice(*candidates.first_action[k : k + 2])
         each = mean_compliances(mappings, sums[rows, :, actions], n_transitions) / len(candidates.sources)
         # Of equal state mappings one is a candidate, which stands for all.
         same = np.unique(np.hstack([mappings.state_mappings, mappings.state_signs]), axis=0, return_inverse=True)[1].ravel()
         of_equal = np.zeros_like(each)
         np.add.at(of_equal, same, each)
         found[rows, :, actions] = of_equal[same]
-        row, action = rows.stop, actions.stop
     target_actions = [origin.target_action for origin in candidates.origins]
     of_candidates: np.ndarray = found[candidates.arrays.row, target_actions, candidates.arrays.action]
     return of_candidates
