@@ -226,7 +226,7 @@ def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
         periodic[: source.n_variables] &= source.periodic
         states = source.scaling.to_unit(source.states)
         effects = differences(source.scaling.to_unit(source.next_states), states, np.array(source.periodic))
-        states = np.where(source.periodic, states - np.floor(states), states) if any(source.periodic) else states
+        states = np.where(source.periodic, states - np.floor(states), states)
         order = np.argsort(along_curve(states), kind="stable")
         padding = ((0, 0), (0, n_variables - source.n_variables))
         rows = (source.actions + offset, np.pad(states, padding), np.pad(effects, padding), source.rewards, source.terminated)

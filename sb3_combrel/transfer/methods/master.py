@@ -179,15 +179,12 @@ class LeastErrorSelector(FixedSelector):
         self.copies.measure(seen.states[i], int(seen.actions[i]), seen.effects[i], self.sums)
         if i + 1 == self.max_transitions:
             self.choice = choose_least_error(self.copies, self.candidates.sets, self.sums)
+            table = self.candidates.table
             for action, (row, source_action) in enumerate(np.hstack(self.choice).tolist()):
-                self.fixed[action] = self._find(action, row, source_action)
+                # The candidate with this state mapping, or an equal one.
+                number = source_action + self.candidates.first_action[self.copies.source[row]]
+                self.fixed[action] = self.candidates.find(action, table.variable[row], table.sign[row], number)
             self._just_chosen = True
-
-    def _find(self, action: int, row: int, source_action: int) -> int:
-        """The candidate of a target action with a state mapping, or an equal one, and a source action of its source."""
-        table = self.candidates.table
-        number = source_action + self.candidates.first_action[self.copies.source[row]]
-        return self.candidates.find(action, table.variable[row], table.sign[row], number)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         just_chosen, self._just_chosen = self._just_chosen, False

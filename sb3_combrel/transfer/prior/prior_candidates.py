@@ -113,4 +113,4 @@ class PriorCandidates:
         """Take over what :meth:`get_state` returned."""
         self._uses = {}
         for n, *key in rows.astype(np.int64).tolist():
-            self._uses[tuple(key[: 1 + 2 * sum(number >= 0 for number in key[1::2])])] = n
+            self._uses[tuple(number for number in key if number >= 0)] = n
