@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,8 +93,8 @@ class Candidates:
         self.instances = stacked_instances(self.sources)
         self.table = stacked_table(self.sets)
         #: Of each source, the number of its first state mapping in the table, and of its first action among all.
-        self.first_row = [0, *accumulate(mappings.n_state_mappings for mappings in self.sets)]
-        self.first_action = [0, *accumulate(source.n_actions for source in self.sources)]
+        self.first_row = np.cumsum([0, *(mappings.n_state_mappings for mappings in self.sets)])
+        self.first_action = np.cumsum([0, *(source.n_actions for source in self.sources)])
         self.origins: list[Origin] = []
         self._action_mappings = self._whole_mappings() if whole else []
         self.arrays = self._numbered()
@@ -118,18 +117,17 @@ class Candidates:
         return found
 
     def _numbered(self) -> CandidateArrays:
-        rows, actions, first = [], [], [0]
+        first = [0]
         for a in range(self.task.n_actions):
             for number, mappings in enumerate(self.sets):
                 if self.whole:
                     state_index, source_action = self._action_mappings[number][0], self._action_mappings[number][1][:, a]
                 else:
                     state_index, source_action = mappings.candidates(a)
-                rows.append(state_index + self.first_row[number])
-                actions.append(source_action + self.first_action[number])
                 self.origins += [Origin(number, a, int(s), int(u)) for s, u in zip(state_index, source_action, strict=True)]
             first.append(len(self.origins))
-        row, action = (np.concatenate(columns).astype(np.int64) for columns in (rows, actions))
+        source, _, state_index, source_action = np.array(self.origins, dtype=np.int64).T
+        row, action = self.first_row[source] + state_index, self.first_action[source] + source_action
         return CandidateArrays(np.array(first, dtype=np.int64), row, action)
 
     def __len__(self) -> int:
