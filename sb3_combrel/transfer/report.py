@@ -103,7 +103,7 @@ class TransferReport:
     bounds_values: bool = False  #: whether what is unknown is worth no more than the source's state that it is taken for
     why_unbounded: str = ""  #: with ``use="prior"``: why not
     bound: tuple[float, ...] = ()  #: the least, the median and the largest of these bounds over the sample of states
-    #: What bounds values: a mirror image of the mapping in use that foretells ends better; "" for the mapping itself.
+    #: What bounds values, where that is not the mapping in use: whole copies in place of parts of a source, or mirror images.
     bounded_through: str = ""
     statistics: Mapping[str, float] = field(default_factory=dict)  #: the figures of the log, by name
     source_actions: tuple[str, ...] = ()  #: with ``use="instances"``, the names of the source actions of all sources

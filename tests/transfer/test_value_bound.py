@@ -2,17 +2,19 @@
 
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import factored as f
 from helpers.agents import make_agent
 from helpers.factored import bound, show
+from stable_baselines3.common.monitor import Monitor
 
-from sb3_combrel import COMBREL, TIMBREL, InterTaskMapping, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.prior.copies import Copies
-from sb3_combrel.transfer.prior.prior_choice import Choice
+from sb3_combrel.transfer.prior.prior_choice import Choice, whole_part
 from sb3_combrel.transfer.prior.value_bound import ValueBound
 
 # A line from 0 to 1: one action goes up, the other down; an episode ends above GOAL.
@@ -118,11 +120,13 @@ def test_nothing_bounds_a_target_whose_actions_are_those_of_different_copies():
 
 
 def test_a_copy_that_leaves_out_variables_of_its_source_bounds_nothing():
-    source, states = f.oscillator_source(), np.array([[0, 1, -1, -1], [-1, -1, 0, -1]])
+    source, states = f.oscillator_source(), np.array([[0, 1, -1, -1], [-1, -1, 0, -1], [-1, -1, -1, 1]])
+    copies = Copies([source], np.zeros(3, dtype=np.int64), states, np.ones((3, 4)), 0.2)
+    assert copies.whole.tolist() == [True, False, False]
+    kept, nothing = (whole_part(copies, all_of(*numbers, n_actions=5)) for numbers in ((1, 0, 2), (1, 2)))
+    assert kept.same(all_of(0, n_actions=5)) and nothing.copies.shape == nothing.actions.shape == (5, 0)
     target = replace(f.target_task(4, 5), sample_states=np.random.default_rng(0).random((50, 4)))
-    parts = value_bound([source], target, states)
-    assert parts.through(all_of(1, n_actions=5)) is None
-    np.testing.assert_array_equal(parts.through(all_of(0, 1, n_actions=5)), parts.through(all_of(0, n_actions=5)))
+    assert ValueBound(copies, target).through(nothing) is None
 
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
@@ -222,3 +226,46 @@ def test_found_optimism_reaches_the_source():
     again = make_agent(1, 2, TIMBREL(source, InterTaskMapping((0,), (0, 1)), use="prior"))
     again.set_state(agent.get_state())
     np.testing.assert_array_equal(again.planner.upper, agent.planner.upper)
+
+
+class Room(gym.Env):
+    """A square room, one step to each side, from one corner to the opposite one."""
+
+    observation_space, action_space = gym.spaces.Box(0.0, 1.0, (2,), np.float64), gym.spaces.Discrete(4)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = self.np_random.uniform(0.05, 0.15, 2)
+        return self.at.copy(), {}
+
+    def step(self, action):
+        self.at = after_step(self.at, np.array(action))
+        return self.at.copy(), -1.0, bool(in_corner(self.at)), False, {}
+
+
+def after_step(states, actions):
+    return np.clip(states + 0.08 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[actions], 0.0, 1.0)
+
+
+def in_corner(states):
+    return np.abs(states - 0.9).max(axis=-1) < 0.08
+
+
+def test_the_whole_task_bounds_values_where_its_parts_explain_a_little_more(tmp_path):
+    """The coordinates of a room move each on its own, which says nothing of where its corner is; they can be exchanged."""
+    rng = np.random.default_rng(0)
+    states, actions = rng.random((800, 2)), rng.integers(4, size=800)
+    after = after_step(states, actions)
+    source = SourceInstances(states, actions, -np.ones(800), after, in_corner(after), [0.0, 0.0], [1.0, 1.0], 4)
+    env = Monitor(gym.wrappers.TimeLimit(Room(), 100))
+    model = FittedRMax(env, transfer=COMBREL(source), seed=0, model_breadth=0.1, resolution=4).learn(300)
+    prior, report = model.transfer.source_prior, model.transfer.report()
+    assert not prior.copies.whole[prior.choice.same_copies()].any() and not whole_part(prior.copies, prior.choice).copies.size
+    assert prior.copies.state[prior.bounding.same_copies()].tolist() in ([[0, 1]], [[1, 0]]) and report.bounds_values
+    assert f"seen through {prior.candidates.describe_choice(prior.bounding)}" in str(report)
+    # Without a source the first end comes after hundreds of steps.
+    assert env.get_episode_lengths()[0] < 100
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model").transfer.source_prior
+    assert loaded.bounding.same(prior.bounding) and loaded.choice.same(prior.choice)
+    np.testing.assert_array_equal(loaded.value_bound(), prior.value_bound())

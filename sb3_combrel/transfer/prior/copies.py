@@ -63,6 +63,8 @@ class Copies:
         self._plain_table = tuple(self.table)
         #: Number of actions of the source that has most.
         self.most_actions = int(self.table.n_actions.max())
+        #: Whether each copy has all variables of its source, bool, shape (n_copies,).
+        self.whole = np.array([len(used) == sources[s].n_variables for s, used in parts])
         #: Actions that some instance of each copy's source has taken, bool, shape (n_copies, most_actions).
         self.taken = np.array([np.isin(np.arange(self.most_actions), each.actions) for each in sources])[source]
         at, predicted = np.empty(n_variables), np.empty(n_variables)
@@ -71,11 +73,6 @@ class Copies:
 
     def __len__(self) -> int:
         return len(self.source)
-
-    def is_whole(self, copy: int) -> bool:
-        """Whether a copy has all variables of its source."""
-        variables = self.state[copy]
-        return len(np.unique(variables[variables >= 0])) == self.sources[self.source[copy]].n_variables
 
     def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums) -> None:
         """Add a target transition to the sums."""

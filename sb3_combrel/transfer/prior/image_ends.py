@@ -18,25 +18,24 @@ def best_ending(copies: Copies, sums: CopySums, choice: Choice, transitions: Rec
 
     Effects that are their own mirror image do not tell a copy from its images (``images_of``), but ends do. A target of
     several copies ends when all of them have ended.
+
+    :param choice: of copies that have all variables of their source
     """
     used, scores = choice.same_copies(), scores_of(copies, sums)
-    options = [[copy, *images_of(copies, scores, copy)] if copies.is_whole(copy) else [copy] for copy in used]
+    options = [[copy, *images_of(copies, scores, copy)] for copy in used]
     if all(len(each) == 1 for each in options):
         return choice
     actions, _ = best_actions(copies, sums)
     foretold = {copy: _foretold(copies, copy, actions[copy], transitions) for copy in itertools.chain(*options)}
     ended = transitions.ended[: transitions.n] == transitions.TERMINATED
-    whole = [i for i, copy in enumerate(used) if copies.is_whole(copy)]
 
     def evidence(chosen: tuple[int, ...]) -> float:
-        return ends_evidence(ended, np.prod([foretold[chosen[i]] for i in whole], axis=0))
+        return ends_evidence(ended, np.prod([foretold[copy] for copy in chosen], axis=0))
 
     best = max(itertools.product(*options), key=evidence)
     if evidence(best) <= evidence(tuple(used)) + np.log(TELLS_APART):
         return choice
-    images = choice.copies.copy()
-    images[images >= 0] = np.tile(best, len(images))
-    return Choice(images, choice.actions)
+    return Choice(np.tile(best, (len(sums.n), 1)), actions[list(best)].T.copy())
 
 
 def _foretold(copies: Copies, copy: int, actions: np.ndarray, transitions: RecordedTransitions) -> np.ndarray:

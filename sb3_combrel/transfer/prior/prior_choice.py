@@ -12,8 +12,8 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 
 # Divisions are searched subset by subset of the target's variables.
 MAX_FACTORED_VARIABLES = 12
-# By so many times as much evidence a copy is told apart from its mirror images. Where a task's effects are their own mirror
-# image both explain about as much, and only one of them has the goal on the right side.
+# By so many times as much evidence a copy is told apart from its mirror images, and a division from whole copies. Where a
+# task's effects are their own mirror image both explain about as much, and only one of them has the goal on the right side.
 TELLS_APART = 2.0
 
 
@@ -65,13 +65,37 @@ def choose_mapping(copies: Copies, sums: CopySums, allowed: np.ndarray) -> Choic
 
 
 def choose_factored(copies: Copies, sums: CopySums) -> Choice:
-    """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``.
+    """Choose the division into copies and variables that stay with most evidence, ``equations.division_evidence``."""
+    return _division(copies, sums, scores_of(copies, sums))
+
+
+def choose_whole(copies: Copies, sums: CopySums, in_use: Choice) -> Choice:
+    """Choose the division into copies that have all variables of their source, and so can bound values.
+
+    The whole copies of the division in use, if that has :data:`TELLS_APART` times the evidence. Parts of a source explain
+    effects somewhat better than the whole does, as its data weigh more in fewer variables; that does not speak against the
+    whole.
+    """
+    scores = scores_of(copies, sums)
+    found = _division(copies, sums, np.where(copies.whole, scores, -np.inf))
+    told_apart = TELLS_APART * scores[found.same_copies()].sum() <= scores[in_use.same_copies()].sum()
+    return whole_part(copies, in_use) if told_apart else found
+
+
+def whole_part(copies: Copies, choice: Choice) -> Choice:
+    """Leave out of a choice the copies that do not have all variables of their source."""
+    kept = (choice.copies >= 0) & copies.whole[choice.copies]
+    used = kept.any(axis=0)
+    return Choice(np.where(kept, choice.copies, -1)[:, used], choice.actions[:, used])
+
+
+def _division(copies: Copies, sums: CopySums, scores: np.ndarray) -> Choice:
+    """The best division by the ``scores`` of all copies, each with its best actions.
 
     Of mirrored copies those alone may be chosen that have :data:`TELLS_APART` times the evidence of one that is not, or in
     whose place there would be parts of them, one of which is mirrored.
     """
     action, _ = best_actions(copies, sums)
-    scores = scores_of(copies, sums)
     members: np.ndarray = copies.state >= 0
     mirrored = np.asarray((copies.sign < 0.0).any(axis=1))
     barred = mirrored & ~explains_more(members, mirrored, scores)

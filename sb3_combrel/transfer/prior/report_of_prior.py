@@ -69,7 +69,7 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         bounds_values=bound is not None,
         bound=() if bound is None else tuple(np.quantile(bound, (0.0, 0.5, 1.0)).tolist()),
         why_unbounded=prior.why_unbounded(),
-        bounded_through=bounding if bounding != in_use else "",
+        bounded_through=bounding if bound is not None and bounding != in_use else "",
         statistics=statistics,
         history=prior.history.points(prior),
         **prior.errors.report_fields(),

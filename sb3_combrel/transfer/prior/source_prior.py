@@ -16,7 +16,7 @@ from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
 from sb3_combrel.transfer.prior.image_ends import best_ending
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
-from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
+from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, choose_whole, whole_part
 from sb3_combrel.transfer.prior.prior_history import PriorHistory
 from sb3_combrel.transfer.prior.value_bound import Episode, ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
@@ -81,9 +81,9 @@ class SourcePrior:
         self.environment = 0
         # By environment: states, rewards and effects of the present episode.
         self._episodes: defaultdict[int, Episode] = defaultdict(list)
-        #: Whether the mapping in use explains all target actions, as last renewed; a given one does until it is shown not to.
+        #: Whether :attr:`bounding` explains all target actions, as last renewed; a given one does until it is shown not to.
         self.explains = isinstance(choose, Choice)
-        #: The mapping in use; of copies that effects do not tell from their mirror images, those that foretell ends best.
+        #: The copies whose values bound the target's: see ``choose_whole`` and ``best_ending``.
         self.bounding: Choice | None = None
         #: By how much a return that was seen exceeds what the source bounds it by.
         self.excess = 0.0
@@ -196,21 +196,22 @@ class SourcePrior:
         if not self.explains:
             return "some target action is not explained"
         if self._bound() is None:
-            return "the mapping has no whole source for all target actions, or its copies do not cost the same at every step"
+            return "no whole source explains all target actions as well, or several do not cost the same at every step"
         return ""
 
     def _explains(self) -> bool:
-        """Whether the mapping in use explains each target action better than that nothing changes, and rewards.
+        """Whether :attr:`bounding` explains each target action better than that nothing changes, and rewards.
 
         What was chosen must be worth, in nats, what it was chosen from.
         """
-        assert self.choice is not None
+        assert self.bounding is not None
         found = np.zeros(self.task.n_actions)
-        for a, copy, used, _ in self._moves():
-            found[a] += self.sums.gain[copy, a, used].sum()
-            if self.choose is not None:
-                found[a] -= np.log(self.copies.table.n_actions[copy])
-        chosen = bool((self.choice.actions[self.choice.copies >= 0] >= 0).all())
+        for a in range(self.task.n_actions):
+            for copy, used in self.bounding.moves(a):
+                found[a] += self.sums.gain[copy, a, used].sum()
+                if self.choose is not None:
+                    found[a] -= np.log(self.copies.table.n_actions[copy])
+        chosen = bool((self.bounding.actions[self.bounding.copies >= 0] >= 0).all())
         return chosen and bool((found >= 0.0).all()) and self.evidence.explains_rewards()
 
     def end_episode(self, truncated: bool) -> None:
@@ -250,15 +251,18 @@ class SourcePrior:
             self.version += 1
 
     def _renew_bounding(self) -> None:
-        """Find anew which mirror images bound values; another bound has not been exceeded."""
+        """Find anew which copies bound values; another bound has not been exceeded."""
         if self.choice is None or self.choose is None or self.n_observed > self.max_transitions:
             return
-        bounding = best_ending(self.copies, self.sums, self.choice, self.transitions)
+        choice = self.choice
+        whole = whole_part(self.copies, choice) if self.whole else choose_whole(self.copies, self.sums, choice)
+        bounding = best_ending(self.copies, self.sums, whole, self.transitions)
         if not bounding.same(self.bounding):
             self.bounding, self.excess, self.version = bounding, 0.0, self.version + 1
+            self.explains = self._explains()
 
     def _set_choice(self, choice: Choice) -> None:
-        self.choice = self.bounding = choice
+        self.choice, self.bounding = choice, whole_part(self.copies, choice)
         self._used = self.copies.uses(*choice)
         self._stored.clear()
 
@@ -338,10 +342,10 @@ class SourcePrior:
         return self.candidates.uses()
 
     def get_state(self) -> dict[str, np.ndarray]:
-        chosen, n_slots = np.full((4, self.task.n_actions, self.task.n_variables), -1.0), 0
+        chosen, n_slots = np.full((5, self.task.n_actions, self.task.n_variables), -1.0), 0
         if self.choice is not None and self.bounding is not None:
             chosen[0], n_slots = 0.0, self.choice.copies.shape[1]
-            for row, array in zip(chosen[1:], (*self.choice, self.bounding.copies), strict=True):
+            for row, array in zip(chosen[1:], (*self.choice, *self.bounding), strict=True):
                 row[:, : array.shape[1]] = array
         figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, n_slots, self.explains
         return {
@@ -367,13 +371,11 @@ class SourcePrior:
         for name, array in self.sums._asdict().items():
             array.ravel()[:] = state[f"prior_sums_{name}"]
         observed, switches, version, due, warned, n_slots, explains = state["prior_figures"].tolist()
-        chosen = state["prior_choice"].reshape(4, n_actions, d)[:, :, : int(n_slots)].astype(np.int64)
-        if state["prior_choice"][0] >= 0.0:
-            copies = np.clip(chosen[1], -1, len(self.copies) - 1)
-            most = np.where(copies >= 0, self.copies.table.n_actions[copies] - 1, -1)
-            actions = np.minimum(chosen[2], most)
-            self._set_choice(Choice(copies, actions))
-            self.bounding = Choice(np.clip(chosen[3], -1, len(self.copies) - 1), actions)
+        chosen = state["prior_choice"].reshape(5, n_actions, d).astype(np.int64)
+        if chosen[0].min() >= 0:
+            choice, bounding = self._restored(chosen[1:3, :, : int(n_slots)]), self._restored(chosen[3:])
+            self._set_choice(choice)
+            self.bounding = whole_part(self.copies, bounding)
         self.n_observed, self.n_switches, self.version = int(observed), int(switches), int(version)
         self._renewal_due, self._warned, self.explains = due, warned > 0.5, explains > 0.5
         self.evidence.set_state(state["prior_evidence"][:-1])
@@ -384,3 +386,9 @@ class SourcePrior:
         self.errors.sums.ravel()[:] = state["prior_errors"]
         self.candidates.set_state(state["prior_uses"])
         self.history.set_state(state["prior_history"])
+
+    def _restored(self, numbers: np.ndarray) -> Choice:
+        """A choice of copies and actions that there are, whatever a file says; shape (2, n_target_actions, n)."""
+        copies = np.clip(numbers[0], -1, len(self.copies) - 1)
+        most = np.where(copies >= 0, self.copies.table.n_actions[copies] - 1, -1)
+        return Choice(copies, np.minimum(numbers[1], most))

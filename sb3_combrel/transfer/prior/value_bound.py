@@ -50,16 +50,16 @@ class ValueBound:
     def through(self, choice: Choice) -> np.ndarray | None:
         """Bound the values of all states of the target's sample, shape (n_points,).
 
-        None if nothing bounds them: if actions are taken for those of different copies or for some that the source's instances
-        lack, no copy has all variables of its source, or several copies do not cost the same at every step.
+        :param choice: of copies that have all variables of their source
+        :return: None if nothing bounds them: if actions are taken for those of different copies or for some that the source's
+            instances lack, there is no copy, or several do not cost the same at every step
         """
         used = choice.same_copies()
         if not self._copies.taken[choice.copies, choice.actions][(choice.copies >= 0) & (choice.actions >= 0)].all():
             return None
         if len(used) > 1 and not self._costs_are_alike(used):
             return None
-        bounds = [self._bound(copy) for copy in used if self._copies.is_whole(copy)]
-        return np.minimum.reduce(bounds) if bounds else None
+        return np.minimum.reduce([self._bound(copy) for copy in used]) if used else None
 
     def excess(self, choice: Choice, episode: Episode) -> float:
         """Return by how much the returns to go of an episode exceed what the source's values bound them by, at least 0.
@@ -72,8 +72,7 @@ class ValueBound:
         states, returns, to_go = np.array([state for state, *_ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
             returns[i] = to_go = episode[i][1] + self._gamma * to_go
-        whole = filter(self._copies.is_whole, choice.same_copies())
-        bounds = np.minimum.reduce([self._bound_in_cells(copy, states) for copy in whole])
+        bounds = np.minimum.reduce([self._bound_in_cells(copy, states) for copy in choice.same_copies()])
         return float((returns - bounds).max(initial=0.0))
 
     def _bound_in_cells(self, copy: int, states: np.ndarray) -> np.ndarray:
