@@ -4,7 +4,7 @@ Compiled functions take arrays and NamedTuples of arrays. Those that Python call
 finds the types of arrays and plain tuples in C, of each NamedTuple in Python: functions that are called at every environment
 step take plain tuples, and make NamedTuples of them.
 
-Sums are taken in a fixed order, but for those of :data:`inner_fast`: there results are the same to the last bit on one
+Sums are taken in a fixed order, but for those of :data:`compiled_fast`: there results are the same to the last bit on one
 machine only.
 """
 
@@ -58,15 +58,12 @@ _njit: Any = njit
 _options: dict[str, Any] = dict(cache=True, error_model="numpy", _nrt=False)
 compiled = _njit(**_options)
 
-# Functions that only compiled code calls, from several places.
-inner = _njit(**_options)
-
 # Small functions called in the innermost loops, where a call costs more than what they do, and functions with one caller: they
 # are compiled as a part of what calls them.
 inlined = _njit(**_options, inline="always")
 
-# ``inner``, for loops whose sums may be taken in any order, as vector registers do.
-inner_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
+# ``compiled``, for loops whose sums may be taken in any order, as vector registers do.
+compiled_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
 # A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).

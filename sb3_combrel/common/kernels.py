@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.instances import BLOCK
 from sb3_combrel.common.periodic import difference
 
@@ -47,7 +47,7 @@ def measure_gaps(state, low, high, periodic, n_blocks, gap):
             gap[block] += outside * outside
 
 
-@inner
+@compiled
 def measure_gaps_around(at, low, high, n_blocks, gap):
     """Add the squared distances along one periodic variable: a box is as far as its nearer end, on either way around."""
     for block in range(n_blocks):
@@ -60,7 +60,7 @@ def measure_gaps_around(at, low, high, n_blocks, gap):
         gap[block] += outside * outside
 
 
-@inner
+@compiled
 def measure_blocks(instances, action, at):
     """Measure how far the blocks of an action's instances are; how many blocks there are."""
     n_blocks = (instances.size[action] + BLOCK - 1) // BLOCK
@@ -92,7 +92,7 @@ def insert_by_distance(items, distances, length, item, distance):
     return length + 1
 
 
-@inner
+@compiled
 def measure_block(instances, action, block, state):
     """Measure the squared distances of the instances of a block, all at once: :attr:`Instances.apart`."""
     apart, first = instances.apart, block * BLOCK
@@ -135,7 +135,7 @@ def take_nearest_block(gap, n_blocks):
     return nearest
 
 
-@inner
+@compiled
 def nearest_instances(instances, action, state, farthest, items, distances):
     """The nearest instances of ``action``, nearest first, as many as ``items`` has room for; how many.
 

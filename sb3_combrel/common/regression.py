@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.constants import LAST_WEIGHT, RIDGE
 from sb3_combrel.common.periodic import difference
 
@@ -73,7 +73,7 @@ def kernel_scale(fit, length, kernel):
     return max(min(kernel.scale, narrowed), kernel.scale / (NARROWEST * NARROWEST))
 
 
-@inner
+@compiled
 def known_weight(fit, length, kernel):
     """The weight of a fit's instances under the broad kernel, which decides what is known."""
     total = 0.0
@@ -135,7 +135,7 @@ def write_ranges(length, fit):
         fit.low[p], fit.high[p] = low, high
 
 
-@inner
+@compiled
 def fit_around(at, action, length, instances, kernel, fit):
     """Fit the numbers of ``action`` around ``at`` to the instances in ``fit.item``, of which there is at least one.
 
@@ -175,7 +175,7 @@ def leverage_of(fit, length, kernel):
     return min(fit.solution[0, last] / nearest, np.exp(-fit.distance[0] * kernel.scale))
 
 
-@inner
+@compiled
 def join_prior(prior, kernel, length, fit):
     """Let a fit know what a prior says of each effect, as so many instances at its very state.
 
@@ -213,7 +213,7 @@ def mean_reward(action, length, instances, scale, fit):
     return reward / total
 
 
-@inner
+@compiled
 def solve(factor, solution):
     """Replace the lower triangle of a matrix by Cholesky's factor, and right-hand sides by what solves them."""
     n, columns = solution.shape

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import entry_point, inlined, inner
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.common.instances import BLOCK, Instances, put_instance
 from sb3_combrel.common.kernels import any_periodic, measure_block, measure_blocks, squared_distance
 
@@ -67,7 +67,7 @@ def put_transition(instances, arrivals, transition, effect):
     put_arrival(instances, arrivals, action, slot)
 
 
-@inner
+@compiled
 def squared_distance_of_end(state, ends, periodic):
     """The squared distance of the nearest arrival that ended an episode; infinite without any."""
     nearest = np.inf
@@ -90,7 +90,7 @@ def reach_of(nearest, outcome_breadth):
     return nearest + NEGLIGIBLE * min(outcome_breadth, nearest + ROUNDING)
 
 
-@inner
+@compiled
 def distance_of_nearest(state, nearest, of_end, outcome_breadth, arrivals, hint):
     """The squared distance of the nearest arrival, or of one that is so near that no end decides.
 
@@ -111,7 +111,7 @@ def distance_of_nearest(state, nearest, of_end, outcome_breadth, arrivals, hint)
     return nearest
 
 
-@inner
+@compiled
 def end_at(state, near, outcome_breadth, arrivals, ends, found):
     """Write to ``found`` the probability that arriving at ``state`` ends the episode, and what an end there pays.
 

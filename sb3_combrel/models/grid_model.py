@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.compiled import entry_point, inlined, inner
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.common.constants import LEAST_SIZE, ON_GRID
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
@@ -35,7 +35,7 @@ def total_weight(own, transferred, row):
     return own
 
 
-@inner
+@compiled
 def add_to_row(reward, n_touched, transferred, row, total, scratch, grid):
     """Add transferred instances to the row of a pair; its reward, and see ``planning.mdp.add_successor``."""
     for j in range(transferred.length[row]):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import entry_point, inlined, inner
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, list_room, near_instances, squared_distance
 from sb3_combrel.common.transferred import TransferredInstances
@@ -26,7 +26,7 @@ class NearList(NamedTuple):
     at: np.ndarray  # float64, (n_variables,)
 
 
-@inner
+@compiled
 def weight_ever(instances, action, state, kernel, threshold, total):
     """``total``, the weight of the kept instances at ``state``; ``threshold`` if it had reached that before nearer ones came.
 

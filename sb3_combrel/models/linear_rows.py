@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import entry_point, inlined, inner
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, nearest_instances, squared_distance
@@ -40,7 +40,7 @@ class LinearScratch(NamedTuple):
     end: np.ndarray  # (2,): probability of an end there, and what it pays
 
 
-@inner
+@compiled
 def distances_around(at, action, length, experience, fit):
     """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
     _, arrivals, ends = experience
@@ -50,7 +50,7 @@ def distances_around(at, action, length, experience, fit):
     return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), near
 
 
-@inner
+@compiled
 def outcome_of(to, moved, around, experience, kernel, end):
     """Write to ``end`` what arriving at ``to`` means.
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.periodic import flag_array
 from sb3_combrel.common.user_warnings import warn_user
 
@@ -89,7 +89,7 @@ def step_along(low, k, grid):
     return grid.strides[k] if low < grid.shape[k] - 1 else -(grid.shape[k] - 1) * grid.strides[k]
 
 
-@inner
+@compiled
 def corners_of(position, grid, corner_index, corner_weight):
     """Write the grid points around ``position`` and their weights; how many have a weight above 0.
 

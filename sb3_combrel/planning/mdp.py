@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import entry_point, inlined, inner
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.planning.grid import StateGrid, corners_of, n_corners
 
 NEVER_LEAVES = 1e-9
@@ -113,7 +113,7 @@ def coordinates_of(point, grid, at):
         rest -= at[k] * grid.strides[k]
 
 
-@inner
+@compiled
 def add_successor(p, effect, scratch, grid, n_touched):
     """Add a move by ``effect`` from the grid point at ``scratch.at``, of probability ``p``, to ``scratch.dense``.
 
@@ -138,7 +138,7 @@ def infinite_reward(reward):
     return 0.0 if reward == 0.0 else np.inf * reward
 
 
-@inner
+@compiled
 def finish_row(mdp, gamma, pair, point, reward, n_touched, scratch):
     """Turn the successors in ``scratch.dense`` into the row of a pair; False if there is no room, and nothing is written.
 

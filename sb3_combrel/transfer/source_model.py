@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner
+from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances
 from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
@@ -31,7 +31,7 @@ def source_arrays(plain):
     return Instances(*plain[0]), Kernel(*plain[1]), LocalFit(*plain[2]), plain[3]
 
 
-@inner
+@compiled
 def predict_effect(instances, kernel, fit, away, action, state, effect, farthest):
     """Write to ``effect`` what a state and action lead to; instances near it, listed in ``fit``, and the weight, 0 without.
 
@@ -47,7 +47,7 @@ def predict_effect(instances, kernel, fit, away, action, state, effect, farthest
     return length, known_weight(fit, length, kernel) / (1.0 + beyond_data(fit))
 
 
-@inner
+@compiled
 def predict_source(instances, kernel, fit, away, action, state, effect):
     """Predict a state and action: reward, probability of termination, weight, all 0 without instances; writes ``effect``."""
     length, founded = predict_effect(instances, kernel, fit, away, action, state, effect, np.inf)

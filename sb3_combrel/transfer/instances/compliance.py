@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined, inner_fast
+from sb3_combrel.common.compiled import EntryPoint, compiled, compiled_fast, inlined
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import difference, flag_array
 from sb3_combrel.transfer.candidates import Candidates, MappingTable
@@ -96,7 +96,7 @@ class ComplianceScratch(NamedTuple):
 FARTHEST = 40.0
 
 
-@inner_fast
+@compiled_fast
 def _exponentiate(row, n):
     """Replace the first ``n`` entries x >= 0 by exp(-min(x, FARTHEST)), to 12 digits.
 
@@ -126,7 +126,7 @@ def _exponentiate(row, n):
         row[j] = value * value
 
 
-@inner_fast
+@compiled_fast
 def _squares(at, of_source, bandwidth, periodic, row, n):
     """Write to ``row`` the squared distances of ``at`` from what the source instances have, over the bandwidth."""
     scale = 1.0 / bandwidth
@@ -140,7 +140,7 @@ def _squares(at, of_source, bandwidth, periodic, row, n):
             row[j] = apart * apart * scale
 
 
-@inner_fast
+@compiled_fast
 def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
     """Fill ``scratch.start``, ``outcome`` and ``reward`` for the source instances of ``action``."""
     n = source.size[action]
@@ -165,7 +165,7 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
     _exponentiate(scratch.reward, n)
 
 
-@inner_fast
+@compiled_fast
 def _mapping_compliance(m, n, scratch):
     """Return the compliance through state mapping ``m`` with ``n`` instances, but for the factor of unmapped variables."""
     for j in range(n):

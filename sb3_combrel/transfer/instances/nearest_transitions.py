@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined, inner
+from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.kernels import any_periodic, squared_distance
 from sb3_combrel.common.periodic import difference
 
@@ -63,7 +63,7 @@ def add_to_sample(i, state, sample, near, distance, due, apart):
             due[p] = True
 
 
-@inner
+@compiled
 def add_neighbor(i, apart, near, distance):
     """Add a transition to the nearest of one state, the nearest first; the last one leaves."""
     k = len(near) - 1
@@ -104,7 +104,7 @@ def find_nearest(query, recorded, limits, near, distance):
                 add_neighbor(i, apart, near[r], distance[r])
 
 
-@inner
+@compiled
 def choose_one(near, compliance, required, n_candidates, draw, total):
     """Choose a candidate by the mean compliance of ``near``; -1 if none exceeds what is required (lines 19-20).
 
@@ -140,7 +140,7 @@ def choose_one(near, compliance, required, n_candidates, draw, total):
     return best
 
 
-@inner
+@compiled
 def same_neighbors(near, others):
     """Return whether two states have the same nearest transitions, in the same order."""
     for k in range(len(near)):

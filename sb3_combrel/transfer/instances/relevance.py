@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inner
+from sb3_combrel.common.compiled import EntryPoint, compiled
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
@@ -75,7 +75,7 @@ def near_relevance(target, source, action, mapping, bandwidths, weight, evidence
         values[j] = (evidence[j] * values[j] + mean) / (evidence[j] + 1.0)
 
 
-@inner
+@compiled
 def _compliance(j, target, source, action, mapping, bandwidths, weight):
     """Return the evidence on instance ``j``, the sum of all transitions' weights, and its compliance; fill ``weight``."""
     states, effects, rewards = target
@@ -106,7 +106,7 @@ def _compliance(j, target, source, action, mapping, bandwidths, weight):
     return total, (transition / total) * (rewarded / total)
 
 
-@inner
+@compiled
 def _mean_distance(weight, total, mu, bandwidth):
     """Return d_j of Eq. 4: mean distance of the heaviest transitions whose sum stays below ``mu`` of the weight, at least one.
 
@@ -132,7 +132,7 @@ def _mean_distance(weight, total, mu, bandwidth):
     return distance / max(n_taken, 1)
 
 
-@inner
+@compiled
 def _sift_down(heap, root, size):
     """Move the entry at ``root`` down until neither entry below it is larger, in a heap of the first ``size`` entries."""
     entry = heap[root]
