@@ -72,14 +72,19 @@ def choose_factored(copies: Copies, sums: CopySums) -> Choice:
 def choose_whole(copies: Copies, sums: CopySums, in_use: Choice) -> Choice:
     """Choose the division into copies that have all variables of their source, and so can bound values.
 
-    The whole copies of the division in use, if that has :data:`TELLS_APART` times the evidence. Parts of a source explain
-    effects somewhat better than the whole does, as its data weigh more in fewer variables; that does not speak against the
-    whole.
+    The whole copies of the division in use, if that has :data:`TELLS_APART` times the evidence on any variable. Parts of a
+    source explain effects somewhat better than the whole does, as its data weigh more in fewer variables; that does not speak
+    against the whole.
     """
-    scores = scores_of(copies, sums)
-    found = _division(copies, sums, np.where(copies.whole, scores, -np.inf))
-    told_apart = TELLS_APART * scores[found.same_copies()].sum() <= scores[in_use.same_copies()].sum()
-    return whole_part(copies, in_use) if told_apart else found
+    found = _division(copies, sums, np.where(copies.whole, scores_of(copies, sums), -np.inf))
+    told_apart = TELLS_APART * _evidence_by_variable(sums, found) < _evidence_by_variable(sums, in_use)
+    return whole_part(copies, in_use) if told_apart.any() else found
+
+
+def _evidence_by_variable(sums: CopySums, choice: Choice) -> np.ndarray:
+    """What a choice explains of each target variable, in nats, shape (n_target_variables,)."""
+    moves = [(copy, a, used) for a in range(len(sums.n)) for copy, used in choice.moves(a)]
+    return np.sum([sums.gain[move] for move in moves], axis=0) if moves else np.zeros(sums.gain.shape[3])
 
 
 def whole_part(copies: Copies, choice: Choice) -> Choice:
