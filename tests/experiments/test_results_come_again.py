@@ -48,7 +48,13 @@ def test_runs_of_the_suite(file, task, variant, transfer, seed, n_played):
 
 
 @pytest.mark.parametrize(
-    ("pair", "method"), [("cart-pole", "COMBREL"), ("mirrored-car", "COMBREL-factored"), ("point-robot", "random-by-state")]
+    ("pair", "method"),
+    [
+        ("cart-pole", "oracle"),
+        ("cart-pole", "COMBREL"),
+        ("mirrored-car", "COMBREL-factored"),
+        ("point-robot", "random-by-state"),
+    ],
 )
 def test_runs_of_the_benchmark(pair, method, seed=25000):
     sources = {(pair, seed): tuple(source.learn(seed) for source in PAIRS[pair].sources)}

@@ -126,7 +126,9 @@ def test_a_copy_that_leaves_out_variables_of_its_source_bounds_nothing():
     kept, nothing = (whole_part(copies, all_of(*numbers, n_actions=5)) for numbers in ((1, 0, 2), (1, 2)))
     assert kept.same(all_of(0, n_actions=5)) and nothing.copies.shape == nothing.actions.shape == (5, 0)
     target = replace(f.target_task(4, 5), sample_states=np.random.default_rng(0).random((50, 4)))
-    assert ValueBound(copies, target).through(nothing) is None
+    parts = ValueBound(copies, target)
+    assert parts.through(nothing) is None
+    np.testing.assert_array_equal(parts.through(kept), parts.through(all_of(0, n_actions=5)))
 
 
 TWO = f.copies_mapping(2, (0, 2, 1, 3))
